@@ -1,0 +1,61 @@
+"""What a service is: a step function between an inbox and an outbox.
+
+    class Control(Service):
+        role = "control"
+
+        def step(self, t: int, inbox: Inbox) -> Outbox:
+            joints = inbox.latest("joint_states")
+            ...
+            return {"control/joint_torque": command}
+
+A service never touches a socket, a thread or a wall clock. The contract says which topics it reads and writes and when it steps.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Protocol
+
+from palpate_bus.codec import Message
+
+Outbox = Mapping[str, "Message | list[Message]"]
+"""Messages by topic: one, or a list for an event topic. Their arrays must not be changed after the step."""
+
+
+class Inbox(Protocol):
+    """What a service receives at a step, ordered by (stamp, topic, sequence). Messages are decoded when first looked at."""
+
+    def latest(self, topic: str) -> Message | None:
+        """The newest message so far, of this step or of an earlier one; None before the first."""
+
+    def new(self, topic: str) -> Iterable[Message]:
+        """The messages that arrived since the step before, oldest first."""
+
+    def stamp(self, topic: str) -> int | None:
+        """The time [ns] of `latest(topic)`: of the producer's tick in lockstep, of reception in wall-clock mode."""
+
+    def lost(self, role: str) -> bool:
+        """Whether that role's service is known to be gone (its liveliness token vanished)."""
+
+
+class Service(ABC):
+    """Base of every service. `role` names its row in the contract."""
+
+    role: ClassVar[str]
+
+    def start(self) -> Outbox:
+        """Messages to send before the first tick: the latched ones. Called once."""
+        return {}
+
+    @abstractmethod
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Advances to time `t` [ns] and returns what is to be sent.
+
+        A periodic topic of this role needs a message at each of its ticks (t a multiple of the topic's period).
+        Nothing here may depend on wall time, thread timing or an unseeded generator.
+        """
+
+    def finish(self) -> Mapping[str, Any]:
+        """Called once at the end; returns JSON-able facts for the report. Write files and close them here."""
+        return {}

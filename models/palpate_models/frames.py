@@ -1,0 +1,44 @@
+"""Rigid transforms as 4 x 4 homogeneous matrices, in monogram notation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from palpate_models.scenario import Pose
+
+Array = NDArray[np.float64]
+
+
+def matrix(pose: Pose) -> Array:
+    """Homogeneous matrix, shape (4, 4), of a scenario pose (fixed-axis roll, pitch, yaw)."""
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_euler("xyz", pose.rpy_rad).as_matrix()
+    X[:3, 3] = pose.xyz_m
+    return X
+
+
+def inverse(X_AB: Array) -> Array:
+    """X_BA, shape (4, 4)."""
+    X_BA = np.eye(4)
+    X_BA[:3, :3] = X_AB[:3, :3].T
+    X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
+    return X_BA
+
+
+def apply(X_AB: Array, p_B: Array) -> Array:
+    """Points given in B, shape (n, 3), expressed in A."""
+    return np.asarray(p_B @ X_AB[:3, :3].T + X_AB[:3, 3])
+
+
+def look_at(position: Array, target: Array) -> Array:
+    """Pose of a camera's optical frame (z forward, x right, y down) that looks from `position` at `target`, shape (4, 4)."""
+    z = target - position
+    z = z / np.linalg.norm(z)
+    x = np.cross(z, (0.0, 0.0, 1.0))
+    x = x / np.linalg.norm(x)
+    X = np.eye(4)
+    X[:3, :3] = np.column_stack((x, np.cross(z, x), z))
+    X[:3, 3] = position
+    return X

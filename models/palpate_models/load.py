@@ -1,0 +1,105 @@
+"""Scenarios from YAML: by name or file, with `--set a.b=c` overrides, and errors that name file, field, value and what is allowed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from palpate_models.frames import matrix
+from palpate_models.scenario import ExamInput, Scenario
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be used. The message names file, field, value and what is allowed."""
+
+
+def scenario_names() -> tuple[str, ...]:
+    """Names of the scenarios that come with the package."""
+    folder = resources.files("palpate_models").joinpath("scenarios")
+    return tuple(sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".yaml")))
+
+
+def _read(source: str) -> tuple[str, str]:
+    """Text and display name of a scenario given by name or by file."""
+    if source in scenario_names():
+        name = f"{source}.yaml"
+        return resources.files("palpate_models").joinpath("scenarios", name).read_text(encoding="utf-8"), name
+    path = Path(source)
+    if not path.is_file():
+        raise ScenarioError(
+            f"{source}: no such scenario; known are {', '.join(scenario_names())}, or give the path of a YAML file"
+        )
+    return path.read_text(encoding="utf-8"), source
+
+
+def _override(raw: dict[str, Any], setting: str) -> None:
+    """Applies one `a.b=c` to nested mappings; the value is YAML."""
+    field, separator, value = setting.partition("=")
+    if not separator or not field:
+        raise ScenarioError(f"--set {setting}: want field.path=value, e.g. exam.depth_m=0.008")
+    *parents, last = field.split(".")
+    node: Any = raw
+    for parent in parents:
+        if isinstance(node, list):
+            node = node[int(parent)]
+        else:
+            node = node.setdefault(parent, {})
+        if not isinstance(node, dict | list):
+            raise ScenarioError(f"--set {setting}: {parent!r} is a value, not a section")
+    try:
+        parsed = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ScenarioError(f"--set {setting}: {error}") from error
+    if isinstance(node, list):
+        node[int(last)] = parsed
+    else:
+        node[last] = parsed
+
+
+def _explain(name: str, error: ValidationError) -> str:
+    lines = []
+    for item in error.errors():
+        field = ".".join(str(part) for part in item["loc"]) or "scenario"
+        lines.append(f"{name}: {field} = {item['input']!r}: {item['msg']}")
+    return "\n".join(lines)
+
+
+def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = None) -> Scenario:
+    """A scenario by name or YAML file, with overrides `a.b=c` applied in order.
+
+    Raises ScenarioError naming file, field, value and what is allowed.
+    """
+    text, name = _read(source)
+    try:
+        raw = yaml.safe_load(text) or {}
+    except yaml.YAMLError as error:
+        raise ScenarioError(f"{name}: not YAML: {error}") from error
+    if not isinstance(raw, dict):
+        raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
+    raw.setdefault("name", Path(name).stem)
+    for setting in settings:
+        _override(raw, setting)
+    if seed is not None:
+        raw["seed"] = seed
+    try:
+        return Scenario.model_validate(raw)
+    except ValidationError as error:
+        raise ScenarioError(_explain(name, error)) from error
+
+
+def exam_input(scenario: Scenario) -> ExamInput:
+    """What roles that must not know the phantom get."""
+    X_WA = matrix(scenario.phantom.pose.true) @ matrix(scenario.phantom.pose.error)
+    return ExamInput(
+        seed=scenario.seed,
+        X_WA=tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in X_WA),
+        exam=scenario.exam,
+        robot=scenario.robot,
+        camera=scenario.camera,
+        limits=scenario.limits,
+    )

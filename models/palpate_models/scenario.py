@@ -1,0 +1,240 @@
+"""A scenario: everything that a run is made of, as one frozen, validated model. YAML overlays its defaults.
+
+Field names carry their unit. Angles are in radians, lengths in metres, unless the name says otherwise.
+World frame W: origin on the floor under the robot, z up, x towards the table. Abdomen frame A: origin at the umbilicus,
+x to the patient's left, y to the head, z outward.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+
+
+class Pose(_Section):
+    """A pose as translation and roll-pitch-yaw (fixed axes x, y, z)."""
+
+    xyz_m: Vec3 = (0.0, 0.0, 0.0)
+    rpy_rad: Vec3 = (0.0, 0.0, 0.0)
+
+
+class Lesion(_Section):
+    """A stiff area of elliptic outline in the abdomen's xy plane."""
+
+    centre_m: Vec2
+    """Centre, x to the patient's left and y to the head, from the umbilicus."""
+    radii_m: tuple[Positive, Positive] = (0.03, 0.03)
+    """Half axes of the half-contrast outline."""
+    contrast: Annotated[float, Field(gt=0, le=20)] = 4.0
+    """Stiffness at its centre over the stiffness without it."""
+    edge_m: Positive = 0.008
+    """Width of the smooth edge."""
+
+
+class Background(_Section):
+    """Natural variation of a healthy abdomen's stiffness: log-normal, with a Gaussian correlation."""
+
+    cv: Annotated[float, Field(ge=0, le=0.6)] = 0.2
+    """Coefficient of variation."""
+    correlation_m: Annotated[float, Field(ge=0.01, le=0.5)] = 0.05
+    """Correlation length."""
+    margins: Annotated[float, Field(ge=1, le=4)] = 1.5
+    """How much stiffer the wall is at the costal margin and at the pelvis."""
+
+
+class Stiffness(_Section):
+    """Mechanics of the healthy wall (facts: k_w 1.7e5 N/m^3, l = 15 mm; Prony weights after liver)."""
+
+    k_w_n_per_m3: Annotated[float, Field(ge=1e3, le=1e8)] = 1.7e5
+    """Instantaneous Winkler foundation modulus."""
+    length_m: Annotated[float, Field(ge=0.002, le=0.1)] = 0.015
+    """Pasternak length l = sqrt(G / k_w)."""
+    prony_g: tuple[NonNegative, ...] = (0.3, 0.2)
+    """Relaxing fractions of the instantaneous modulus."""
+    prony_tau_s: tuple[Positive, ...] = (1.86, 51.3)
+    """Their time constants."""
+    dashpot_s: Annotated[float, Field(gt=0, le=1)] = 0.05
+    """Dashpot over foundation modulus, C = dashpot_s * k_w."""
+    friction: Annotated[float, Field(ge=0, le=2)] = 0.3
+    """Coulomb friction between indenter and skin."""
+
+    @model_validator(mode="after")
+    def _prony(self) -> Stiffness:
+        if len(self.prony_g) != len(self.prony_tau_s):
+            raise ValueError("prony_g and prony_tau_s need as many entries as each other")
+        if sum(self.prony_g) >= 1:
+            raise ValueError(f"prony_g must sum to less than 1, not {sum(self.prony_g)}")
+        return self
+
+
+class Breathing(_Section):
+    """Abdominal breathing: the wall rises and falls."""
+
+    amplitude_m: Annotated[float, Field(ge=0, le=0.02)] = 0.0
+    """Half of the peak-to-peak excursion; 0 switches it off."""
+    rate_per_min: Annotated[float, Field(ge=4, le=40)] = 15.0
+
+
+class Registration(_Section):
+    """Where the patient lies. Exam input is the true pose composed with the error."""
+
+    true: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
+    """X_WA: abdomen in world."""
+    error: Pose = Pose()
+    """What registration gets wrong, in A."""
+
+
+class Phantom(_Section):
+    """The abdomen. Reaches only tissue and scoring, but for `pose`."""
+
+    kind: Literal["parametric", "mesh"] = "parametric"
+    mesh: str | None = None
+    """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
+    size_m: tuple[Positive, Positive, Positive] = (0.36, 0.46, 0.20)
+    """Width, length and height of the parametric abdomen."""
+    edge_m: Annotated[float, Field(ge=0.0025, le=0.02)] = 0.005
+    """Longest mesh edge in the examined region."""
+    stiffness: Stiffness = Stiffness()
+    background: Background = Background()
+    lesions: tuple[Lesion, ...] = ()
+    breathing: Breathing = Breathing()
+    pose: Registration = Registration()
+
+    @model_validator(mode="after")
+    def _mesh(self) -> Phantom:
+        if (self.kind == "mesh") != (self.mesh is not None):
+            raise ValueError("kind: mesh needs mesh: FILE, and mesh: FILE needs kind: mesh")
+        return self
+
+
+class Pattern(StrEnum):
+    """Coverage pattern."""
+
+    SNAKE = "snake"
+    RASTER = "raster"
+
+
+class Mode(StrEnum):
+    """Indentation while covering."""
+
+    CONTINUOUS = "continuous"
+    POINT = "point"
+
+
+class Exam(_Section):
+    """What is examined, and how."""
+
+    pattern: Pattern = Pattern.SNAKE
+    mode: Mode = Mode.CONTINUOUS
+    depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
+    """Indentation along the inward normal from the perceived rest surface."""
+    spacing_m: Annotated[float, Field(ge=0.004, le=0.05)] = 0.0125
+    """Distance of scan lines, and of points on a line."""
+    speed_mps: Annotated[float, Field(ge=0.005, le=0.1)] = 0.03
+    """Tangential speed in contact."""
+    region_m: tuple[Positive, Positive] = (0.20, 0.20)
+    """Width (x) and height (y) of the examined region about `centre_m`."""
+    centre_m: Vec2 = (0.0, 0.0)
+    """Centre of the region in the abdomen frame."""
+
+
+class Robot(_Section):
+    """Robot, tool and its sensor."""
+
+    indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
+    tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
+    """Mass below the F/T sensor: stand-off and indenter."""
+    base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 0.70
+    """Height of the cubic base."""
+    base_xy_m: Vec2 = (0.0, 0.0)
+    """Where the base stands in world."""
+    base_yaw_rad: float = 0.0
+    """How it is turned about the vertical."""
+    ft_noise_n: NonNegative = 0.05
+    """Standard deviation of the force noise, each axis, each millisecond."""
+    ft_noise_nm: NonNegative = 0.002
+    ft_bias_n: NonNegative = 1.0
+    """Scale of the seeded constant force bias."""
+    ft_bias_nm: NonNegative = 0.05
+    position_noise_rad: NonNegative = 1e-6
+    velocity_noise_radps: NonNegative = 1e-4
+    joint_friction_nm: NonNegative = 0.1
+    """Coulomb friction (lbr_fri_ros2_stack's URDF)."""
+    joint_damping_nms: NonNegative = 10.0
+    """Viscous friction (the same)."""
+
+
+class Camera(_Section):
+    """Kinect-like depth camera on a tripod (Nguyen 2012)."""
+
+    position_m: Vec3 = (0.95, -0.45, 1.85)
+    """Optical centre in world."""
+    look_at_m: Vec3 = (0.56, 0.0, 0.90)
+    width_px: Annotated[int, Field(ge=64, le=1920)] = 640
+    height_px: Annotated[int, Field(ge=48, le=1080)] = 480
+    focal_px: Positive = 585.0
+    noise_scale: NonNegative = 1.0
+    """Multiplies the published noise model; 0 is an ideal camera."""
+    extrinsic_error: Pose = Pose()
+    """Error of the calibrated camera pose, in the camera frame."""
+    frames: Annotated[int, Field(ge=1, le=200)] = 20
+    """Frames fused for a perceived surface."""
+
+
+class Limits(_Section):
+    """Operating limits that we set (no claim of compliance with ISO/TS 15066)."""
+
+    force_working_n: Positive = 15.0
+    """At this force depth yields."""
+    force_soft_stop_n: Positive = 25.0
+    """The exam retreats along the normal."""
+    force_emergency_n: Positive = 40.0
+    """The driver holds safely."""
+    depth_m: Positive = 0.020
+    joint_margin_rad: NonNegative = 0.05
+    speed_mps: Positive = 0.5
+    """Of the tool in free motion."""
+    joint_velocity_scale: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """Fraction of the joint velocity limits used in free motion."""
+
+    @model_validator(mode="after")
+    def _order(self) -> Limits:
+        if not self.force_working_n < self.force_soft_stop_n < self.force_emergency_n:
+            raise ValueError("need force_working_n < force_soft_stop_n < force_emergency_n")
+        return self
+
+
+class Scenario(_Section):
+    """All of a run. `for_role` gives the part that a role may know."""
+
+    name: str = "unnamed"
+    description: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    phantom: Phantom = Phantom()
+    exam: Exam = Exam()
+    robot: Robot = Robot()
+    camera: Camera = Camera()
+    limits: Limits = Limits()
+
+
+class ExamInput(_Section):
+    """What every role but tissue and scoring may know: the scenario without its phantom, with the registered pose."""
+
+    seed: int
+    X_WA: tuple[tuple[float, float, float, float], ...]
+    """Registered pose of the abdomen in world, homogeneous 4 x 4, registration error included."""
+    exam: Exam
+    robot: Robot
+    camera: Camera
+    limits: Limits
