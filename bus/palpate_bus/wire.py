@@ -1,8 +1,8 @@
 """The wire as rmw_zenoh has it in ROS 2 Jazzy: key expressions and the attachment of every message.
 
 A topic's key is `<domain>/<topic>/<DDS type>/<RIHS01 hash>`, for example
-`0/ft/wrench/geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_8dc3de...`. Publisher and subscriber meet only when all four
-agree; `any_type_key` is for noticing peers that differ in nothing but the type or its hash.
+`0/ft/wrench/geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_8dc3de...`. Publisher and subscriber meet only when all
+four agree; `any_type_key` is for noticing peers that differ in nothing but the type or its hash.
 
 The attachment is 33 bytes, as zenoh's serializer writes (int64, int64, 16 bytes) since rmw_zenoh_cpp 0.2.4 (Jazzy):
 
@@ -79,7 +79,7 @@ def ros_type(dds: str) -> str:
 
 
 def message_key(topic: str, type_name: str, domain: int) -> str:
-    """The key expression of any topic of a known message type; slashes around `topic` are dropped, as rmw_zenoh does."""
+    """The key of any topic of a known message type; slashes around `topic` are dropped, as in rmw_zenoh."""
     if not 0 <= domain <= 65535:
         raise WireError(f"domain {domain} is outside 0..65535")
     return str(TopicKey(domain, topic.strip("/"), type_name, type_hash(type_name)))
