@@ -7,6 +7,7 @@ puts into the key.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -82,3 +83,17 @@ def decode(payload: bytes | memoryview, name: str) -> Message:
         return store.deserialize_cdr(payload, name)
     except Exception as error:
         raise CodecError(f"{name}: cannot decode {len(payload)} bytes: {error!r}") from error
+
+
+@cache
+def encoder(name: str) -> Callable[[Message], bytes]:
+    """`encode` for one type, for hot paths."""
+    message_type(name)
+    return lambda message: encode(message, name)
+
+
+@cache
+def decoder(name: str) -> Callable[[bytes], Message]:
+    """`decode` for one type, for hot paths."""
+    message_type(name)
+    return lambda payload: decode(payload, name)

@@ -1,0 +1,276 @@
+"""Conservative synchronisation of one service, without any transport (Chandy and Misra 1979; Bryant 1977).
+
+A `Stepper` holds a service's input buffers and output ports. A message of a periodic topic carries its simulated time in its
+sequence number, (sequence - 1) * period; those of an event topic get theirs from the Advance message that closes a tick.
+So the wire format stays plain ROS 2, and inputs are consumed in (stamp, topic, sequence) order whatever order they arrive in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections import deque
+from collections.abc import Mapping, Sequence
+from time import perf_counter_ns
+
+from palpate_bus import codec
+from palpate_bus.blame import Blame
+from palpate_bus.codec import Message
+from palpate_bus.contract import Contract, Edge, Topic
+from palpate_bus.service import Service
+
+_CHAIN = struct.Struct("<qqq")
+NEVER = -1
+"""The tick of something that has not happened."""
+
+
+class LockstepError(RuntimeError):
+    """The dataflow broke: a gap in a sequence, or a service that does not keep to its contract."""
+
+
+class Received:
+    """A message as bytes, decoded when first looked at."""
+
+    __slots__ = ("message", "payload", "sequence", "stamp")
+
+    def __init__(self, payload: bytes, stamp: int, sequence: int) -> None:
+        self.payload = payload
+        self.stamp = stamp
+        self.sequence = sequence
+        self.message: Message | None = None
+
+
+class InputBuffer:
+    """What a service holds of one topic, and how far the producer has advanced.
+
+    `advanced` is the producer's tick [ns] up to which the topic is known completely; `new` are the messages of the current step.
+    """
+
+    __slots__ = (
+        "_advances", "_last_sequence", "_pending", "_unstamped",
+        "advanced", "decode", "delay", "edge", "grid", "latest", "lost", "new", "period", "topic",
+    )  # fmt: skip
+
+    def __init__(self, topic: Topic, edge: Edge, producer_period: int) -> None:
+        self.topic = topic
+        self.edge = edge
+        self.period = topic.period
+        self.delay = topic.period if edge is Edge.PREVIOUS else 0
+        self.grid = topic.period if topic.periodic else producer_period
+        self.decode = codec.decoder(topic.type)
+        self.advanced = NEVER
+        self.latest: Received | None = None
+        self.new: list[Received] = []
+        self.lost = False
+        self._pending: deque[Received] = deque()
+        self._unstamped: deque[Received] = deque()
+        self._advances: deque[tuple[int, int]] = deque()
+        self._last_sequence = 0
+
+    def need(self, t: int) -> int:
+        """The producer's tick [ns] that must have been reached before the reader may step at `t`; negative for none."""
+        limit = t - self.delay
+        return limit - limit % self.grid if limit >= 0 else NEVER
+
+    def ready(self, t: int) -> bool:
+        """Whether the reader may step at `t` as far as this topic goes."""
+        if self.lost or not self.edge.blocking:
+            return self.lost or self.edge is not Edge.LATCHED or bool(self._pending or self.latest)
+        return self.advanced >= self.need(t)
+
+    def accept(self, sequence: int, payload: bytes) -> None:
+        """Takes a message off the wire. Raises LockstepError when one is missing before it."""
+        if sequence != self._last_sequence + 1:
+            if sequence <= self._last_sequence:
+                raise LockstepError(f"{self.topic.name}: sequence {sequence} came again after {self._last_sequence}")
+            raise LockstepError(
+                f"{self.topic.name}: messages {self._last_sequence + 1}..{sequence - 1} of {self.topic.producer} are missing"
+            )
+        self._last_sequence = sequence
+        if self.topic.periodic:
+            stamp = (sequence - 1) * self.period
+            self._pending.append(Received(payload, stamp, sequence))
+            self.advanced = stamp
+        elif self.topic.latched:
+            self._pending.append(Received(payload, 0, sequence))
+        else:
+            self._unstamped.append(Received(payload, NEVER, sequence))
+            self._settle()
+
+    def advance(self, tick: int, sequence: int) -> None:
+        """The producer has finished `tick`, having sent `sequence` messages of this event topic in all."""
+        self._advances.append((tick, sequence))
+        self._settle()
+
+    def _settle(self) -> None:
+        while self._advances and self._advances[0][1] <= self._last_sequence:
+            tick, sequence = self._advances.popleft()
+            while self._unstamped and self._unstamped[0].sequence <= sequence:
+                received = self._unstamped.popleft()
+                received.stamp = tick
+                self._pending.append(received)
+            self.advanced = tick
+
+    def deliver(self, received: Received) -> None:
+        """Takes a message whose stamp is known (composed run, observers)."""
+        self._pending.append(received)
+        self.advanced = received.stamp
+
+    def take(self, t: int) -> None:
+        """Moves what the reader may see at `t` into `new` and `latest`."""
+        limit = t - self.delay
+        pending = self._pending
+        new = self.new = []
+        while pending and pending[0].stamp <= limit:
+            new.append(pending.popleft())
+        if new:
+            self.latest = new[-1]
+
+
+class TickInbox:
+    """The inbox of one service in lockstep, over its input buffers."""
+
+    __slots__ = ("_blame", "_buffers", "lost_roles")
+
+    def __init__(self, buffers: Mapping[str, InputBuffer], blame: Blame) -> None:
+        self._buffers = buffers
+        self._blame = blame
+        self.lost_roles: set[str] = set()
+
+    def _message(self, buffer: InputBuffer, received: Received) -> Message:
+        if received.message is None:
+            start = perf_counter_ns()
+            received.message = buffer.decode(received.payload)
+            self._blame.decode += perf_counter_ns() - start
+        return received.message
+
+    def latest(self, topic: str) -> Message | None:
+        """The newest message, or None before the first."""
+        buffer = self._buffers[topic]
+        return None if buffer.latest is None else self._message(buffer, buffer.latest)
+
+    def new(self, topic: str) -> list[Message]:
+        """The messages since the step before, oldest first."""
+        buffer = self._buffers[topic]
+        return [self._message(buffer, received) for received in buffer.new]
+
+    def raw(self, topic: str) -> Sequence[Received]:
+        """The messages since the step before, undecoded."""
+        return self._buffers[topic].new
+
+    def stamp(self, topic: str) -> int | None:
+        """The simulated time [ns] of the newest message."""
+        latest = self._buffers[topic].latest
+        return None if latest is None else latest.stamp
+
+    def lost(self, role: str) -> bool:
+        """Whether that role's service is gone."""
+        return role in self.lost_roles
+
+
+class OutputPort:
+    """One topic that a service writes: its sequence and the digest over all that it sent."""
+
+    __slots__ = ("_digest", "encode", "event", "latched", "period", "sequence", "topic")
+
+    def __init__(self, topic: Topic) -> None:
+        self.topic = topic
+        self.period = topic.period
+        self.event = topic.event
+        self.latched = topic.latched
+        self.encode = codec.encoder(topic.type)
+        self.sequence = 0
+        self._digest = hashlib.sha256() if topic.hashed else None
+
+    def pack(self, message: Message, stamp: int) -> bytes:
+        """Encodes and numbers a message, and chains it into the digest."""
+        payload = self.encode(message)
+        self.sequence += 1
+        if self._digest is not None:
+            self._digest.update(_CHAIN.pack(stamp, self.sequence, len(payload)))
+            self._digest.update(payload)
+        return payload
+
+    def digest(self) -> str | None:
+        """Hexadecimal digest, None for a topic that is not hashed."""
+        return None if self._digest is None else self._digest.hexdigest()
+
+
+class Stepper:
+    """Drives one service: buffers in, step, ports out."""
+
+    def __init__(self, service: Service, contract: Contract) -> None:
+        self.service = service
+        self.role = contract.roles[service.role]
+        self.buffers = {
+            topic.name: InputBuffer(topic, edge, contract.roles[topic.producer].period)
+            for topic, edge in contract.inputs(service.role)
+        }
+        self.ports = {topic.name: OutputPort(topic) for topic in contract.outputs(service.role)}
+        self.blame = Blame()
+        self.inbox = TickInbox(self.buffers, self.blame)
+        self._all = tuple(self.buffers.values())
+        self._periodic = tuple(port for port in self.ports.values() if not (port.event or port.latched))
+
+    def start(self) -> list[tuple[OutputPort, bytes]]:
+        """The latched messages, packed. They are numbered and stamped zero."""
+        sent = []
+        for name, message in self.service.start().items():
+            port = self._port(name)
+            if not port.latched:
+                raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
+            sent.append((port, port.pack(message, 0)))
+        missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
+        if missing:
+            raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
+        return sent
+
+    def step(self, t: int) -> list[tuple[OutputPort, bytes]]:
+        """Steps the service at `t` [ns] and returns what it sends, packed, in contract-independent outbox order.
+
+        Raises LockstepError when the service leaves out a periodic message or sends one off its tick.
+        """
+        for buffer in self._all:
+            buffer.take(t)
+        blame = self.blame
+        decoded = blame.decode
+        begin = perf_counter_ns()
+        outbox = self.service.step(t, self.inbox)
+        stepped = perf_counter_ns()
+        blame.compute += stepped - begin - (blame.decode - decoded)
+        sent = []
+        for name, message in outbox.items():
+            port = self._port(name)
+            if port.event:
+                for item in message if isinstance(message, list) else (message,):
+                    sent.append((port, port.pack(item, t)))
+            elif t % port.period:
+                raise LockstepError(f"{self.role.name} sent {name} at {t} ns, which is no tick of its period {port.period} ns")
+            else:
+                sent.append((port, port.pack(message, t)))
+        for port in self._periodic:
+            if not t % port.period and port.sequence != t // port.period + 1:
+                raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+        blame.encode += perf_counter_ns() - stepped
+        blame.steps += 1
+        return sent
+
+    def _port(self, name: str) -> OutputPort:
+        try:
+            return self.ports[name]
+        except KeyError:
+            raise LockstepError(
+                f"{self.role.name} sent {name}, which the contract does not give it; it may send {', '.join(self.ports)}"
+            ) from None
+
+    def digests(self) -> dict[str, str]:
+        """Digest by topic, of the hashed ones."""
+        return {name: digest for name, port in self.ports.items() if (digest := port.digest()) is not None}
+
+
+def run_hash(digests: Mapping[str, str]) -> str:
+    """The run hash: SHA-256 over the sorted (topic, digest) pairs of all services."""
+    chain = hashlib.sha256()
+    for topic, digest in sorted(digests.items()):
+        chain.update(f"{topic} {digest}\n".encode())
+    return chain.hexdigest()
