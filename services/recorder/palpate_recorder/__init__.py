@@ -1,0 +1,1 @@
+"""Recorder: every message of the bus into MCAP, readable by rosbags, Foxglove and ros2 bag."""

@@ -1,0 +1,186 @@
+"""A rosbag2 folder with one MCAP file, written as a stream in bounded memory: bytes in, bytes out, nothing decoded.
+
+Layout: rosbag2's `metadata.yaml` (version 9, ROS 2 Jazzy) next to `<folder>_0.mcap`, profile `ros2`, message encoding
+`cdr`, schema encoding `ros2msg`; see the MCAP specification's well-known profiles and rosbag2_storage's metadata.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mcap.writer import CompressionType, Writer
+
+CHUNK_BYTES = 4 * 1024 * 1024
+"""A chunk is closed at this size, whatever its age: this bounds the memory."""
+
+_INFINITE = {"sec": 9223372036, "nsec": 854775807}
+"""RMW_DURATION_INFINITE, as rosbag2 writes it."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What a reader must know to decode a topic."""
+
+    topic: str
+    """Topic as ROS 2 names it, with its leading slash."""
+    type: str
+    """Message type, e.g. `sensor_msgs/msg/JointState`."""
+    schema: str
+    """Definition of the type and of all that it contains, in the ros2msg format."""
+    type_hash: str
+    """RIHS01 hash of the type."""
+    depth: int = 1
+    """Depth of the history offered."""
+    transient_local: bool = False
+    """Whether late joiners get the last message."""
+
+    @property
+    def qos(self) -> list[dict[str, Any]]:
+        """The offered QoS profile, as rosbag2 9 writes it."""
+        return [
+            {
+                "history": "keep_last",
+                "depth": self.depth,
+                "reliability": "reliable",
+                "durability": "transient_local" if self.transient_local else "volatile",
+                "deadline": dict(_INFINITE),
+                "lifespan": dict(_INFINITE),
+                "liveliness": "automatic",
+                "liveliness_lease_duration": dict(_INFINITE),
+                "avoid_ros_namespace_conventions": False,
+            }
+        ]
+
+
+@dataclass
+class Count:
+    """What was written on one channel."""
+
+    messages: int = 0
+    bytes: int = 0
+    missing: int = 0
+    """Messages that never came, by the gaps in the sequence numbers."""
+    last: int | None = field(default=None, repr=False)
+
+
+class BagWriter:
+    """Writes CDR messages into a rosbag2 folder. An old recording in the folder is replaced.
+
+    Messages are collected in a chunk, which goes to disk when it spans `flush_every` nanoseconds or has `CHUNK_BYTES`,
+    so that a crash loses at most that span: an MCAP file is readable up to its last complete chunk.
+    Not safe for use from several threads at once.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        channels: Iterable[Channel],
+        *,
+        flush_every: int = 1_000_000_000,
+        compression: CompressionType = CompressionType.LZ4,
+    ) -> None:
+        """Opens `folder` (created, parents included) for `channels`. Raises OSError if it cannot be written."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self.path = folder / f"{folder.name}_0.mcap"
+        self.metadata_path = folder / "metadata.yaml"
+        self.metadata_path.unlink(missing_ok=True)
+        self.channels = {channel.topic: channel for channel in channels}
+        self.counts = {topic: Count() for topic in self.channels}
+        self.first_stamp: int | None = None
+        self.last_stamp = 0
+        self._flush_every = flush_every
+        self._flush_at: int | None = None
+        self._stream = self.path.open("wb")
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=compression)
+        self._writer.start(profile="ros2", library="palpate-recorder")
+        self._ids = self._register()
+
+    def _register(self) -> dict[str, int]:
+        """Schemas and channels, all at the start, so that the first chunk has them."""
+        schemas: dict[str, int] = {}
+        ids: dict[str, int] = {}
+        for channel in self.channels.values():
+            if channel.type not in schemas:
+                schemas[channel.type] = self._writer.register_schema(channel.type, "ros2msg", channel.schema.encode())
+            metadata = {
+                "offered_qos_profiles": yaml.safe_dump(channel.qos, sort_keys=False),
+                "topic_type_hash": channel.type_hash,
+            }
+            ids[channel.topic] = self._writer.register_channel(channel.topic, "cdr", schemas[channel.type], metadata)
+        return ids
+
+    def write(self, topic: str, payload: bytes | memoryview, stamp: int, sequence: int) -> None:
+        """Appends one message, stamped `stamp` [ns]. Raises KeyError for a topic that has no channel."""
+        self._writer.add_message(self._ids[topic], stamp, payload, stamp, sequence & 0xFFFFFFFF)
+        count = self.counts[topic]
+        count.messages += 1
+        count.bytes += len(payload)
+        if count.last is not None and sequence > count.last + 1:
+            count.missing += sequence - count.last - 1
+        count.last = sequence
+        if self.first_stamp is None or self._flush_at is None:
+            self.first_stamp = self.last_stamp = stamp
+            self._flush_at = stamp + self._flush_every
+            return
+        if stamp > self.last_stamp:
+            self.last_stamp = stamp
+        elif stamp < self.first_stamp:
+            self.first_stamp = stamp
+        if stamp >= self._flush_at:
+            self.flush()
+            self._flush_at = stamp + self._flush_every
+
+    def flush(self) -> None:
+        """Hands everything written so far to the operating system, so that it survives a crash of this process."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Completes the file with its index and writes `metadata.yaml`. A second call does nothing."""
+        if self._stream.closed:
+            return
+        metadata = self.metadata()
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(metadata, sort_keys=False)})
+        self._writer.finish()
+        self._stream.close()
+        text = yaml.safe_dump({"rosbag2_bagfile_information": metadata}, sort_keys=False)
+        temporary = self.metadata_path.with_suffix(".yaml.part")
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(self.metadata_path)
+
+    def metadata(self) -> dict[str, Any]:
+        """rosbag2's description of what has been written so far."""
+        start = self.first_stamp or 0
+        extent = {
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "duration": {"nanoseconds": self.last_stamp - start},
+            "message_count": sum(count.messages for count in self.counts.values()),
+        }
+        return {
+            "version": 9,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [self.path.name],
+            **extent,
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": channel.topic,
+                        "type": channel.type,
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": channel.qos,
+                        "type_description_hash": channel.type_hash,
+                    },
+                    "message_count": self.counts[channel.topic].messages,
+                }
+                for channel in self.channels.values()
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [{"path": self.path.name, **extent}],
+            "custom_data": None,
+            "ros_distro": "jazzy",
+        }

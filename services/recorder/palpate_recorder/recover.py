@@ -1,0 +1,83 @@
+"""Makes a recording that was cut off by a crash readable by every tool again.
+
+    python -m palpate_recorder.recover DIR/recording_mcap
+
+writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken file, an index and `metadata.yaml`.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import yaml
+from mcap.exceptions import McapError
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Message, Schema
+from mcap.stream_reader import StreamReader
+
+from palpate_recorder.bag import BagWriter, Channel
+
+_BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
+"""What reading across the break raises: a short record, a chunk that does not decompress, a wrong checksum."""
+
+
+def complete_records(path: Path) -> Iterator[object]:
+    """Schemas, channels and messages of an MCAP file, in order, up to its end or to where it breaks."""
+    with path.open("rb") as stream:
+        records = StreamReader(stream, validate_crcs=True).records
+        while True:
+            try:
+                yield next(records)
+            except StopIteration:
+                return
+            except _BROKEN:
+                return
+
+
+def recover(folder: Path) -> Path:
+    """Writes what is complete in the recording `folder` to `<folder>_recovered`; returns that folder.
+
+    Raises FileNotFoundError if `folder` holds no recording, ValueError if not even its first chunk is complete.
+    """
+    path = folder / f"{folder.name}_0.mcap"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no recording there; give the folder that holds the .mcap file")
+    schemas: dict[int, Schema] = {}
+    names: dict[int, Channel] = {}
+    for record in complete_records(path):
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, ChannelRecord) and record.id not in names:
+            names[record.id] = _channel(record, schemas[record.schema_id])
+    if not names:
+        raise ValueError(f"{path}: broken before the end of its first chunk, nothing to recover")
+    bag = BagWriter(folder.with_name(f"{folder.name}_recovered"), names.values())
+    for record in complete_records(path):
+        if isinstance(record, Message):
+            bag.write(names[record.channel_id].topic, record.data, record.log_time, record.sequence)
+    bag.close()
+    return bag.folder
+
+
+def _channel(record: ChannelRecord, schema: Schema) -> Channel:
+    qos = yaml.safe_load(record.metadata["offered_qos_profiles"])[0]
+    return Channel(
+        topic=record.topic,
+        type=schema.name,
+        schema=schema.data.decode(),
+        type_hash=record.metadata["topic_type_hash"],
+        depth=qos["depth"],
+        transient_local=qos["durability"] == "transient_local",
+    )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m palpate_recorder.recover DIR/recording_mcap")
+    try:
+        print(recover(Path(sys.argv[1])))
+    except (OSError, ValueError) as error:
+        sys.exit(str(error))

@@ -1,0 +1,93 @@
+"""The recorder as a service: it observes every topic of its rows in the contract and writes the raw messages.
+
+It steps like any other observer, but its data does not come through the inbox: the runtime hands it each message's
+bytes as they came, so that nothing is decoded and none is skipped.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from palpate_bus import codec
+from palpate_bus.contract import Contract, Topic, contract
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.scenario import Scenario
+
+from palpate_recorder.bag import BagWriter, Channel
+
+FOLDER = "recording_mcap"
+"""Name of the rosbag2 folder within the folder of the run."""
+
+
+def channels(rows: Contract) -> list[Channel]:
+    """The channels of all topics that the contract lets the recorder observe, in contract order."""
+    return [
+        Channel(
+            topic=f"/{topic.name}",
+            type=topic.type,
+            schema=str(codec.store.generate_msgdef(topic.type, ros_version=2)[0]),
+            type_hash=topic.type_hash,
+            depth=rows.qos[topic.qos].depth,
+            transient_local=rows.qos[topic.qos].transient_local,
+        )
+        for topic, _ in rows.inputs("recorder")
+    ]
+
+
+class RecorderService(Service):
+    """Writes every message it is given into `folder`, a rosbag2 folder with one MCAP file."""
+
+    role = "recorder"
+
+    def __init__(self, folder: Path) -> None:
+        """Opens the recording. Raises OSError if the folder cannot be written."""
+        self._bag = BagWriter(folder, channels(contract()))
+        self._names = {topic.name: f"/{topic.name}" for topic, _ in contract().inputs(self.role)}
+        self._unexpected = 0
+
+    def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
+        """Takes one message as it was sent: CDR bytes, simulated time [ns] and sequence number.
+
+        The runtime calls it for every message, in any order of topics. A topic that the contract does not give to the
+        recorder is counted and left out.
+        """
+        name = self._names.get(topic.name)
+        if name is None:
+            self._unexpected += 1
+            return
+        self._bag.write(name, payload, stamp, sequence)
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Nothing to do: messages come by `record`, and are flushed by their own stamps."""
+        return {}
+
+    def finish(self) -> Mapping[str, Any]:
+        """Completes the recording; returns what is in it."""
+        self._bag.close()
+        counts = self._bag.counts
+        return {
+            "folder": self._bag.folder.name,
+            "file_bytes": self._bag.path.stat().st_size,
+            "messages": sum(count.messages for count in counts.values()),
+            "message_bytes": sum(count.bytes for count in counts.values()),
+            "missing": {topic: count.missing for topic, count in counts.items() if count.missing},
+            "unexpected": self._unexpected,
+            "topics": {topic: count.messages for topic, count in counts.items()},
+        }
+
+
+def create(scenario: Scenario) -> RecorderService:
+    """The recorder of a run; the run's folder is in the environment variable PALPATE_OUT.
+
+    Raises ValueError if that is not set. The scenario does not matter: the recorder writes what the bus carries.
+    """
+    del scenario
+    out = os.environ.get("PALPATE_OUT")
+    if not out:
+        raise ValueError(
+            f"PALPATE_OUT is not set; the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder"
+        )
+    return RecorderService(Path(out) / FOLDER)

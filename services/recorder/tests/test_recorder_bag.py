@@ -1,0 +1,202 @@
+"""The recording as others read it: rosbags' Reader, the mcap library with its ROS 2 decoder, and after a crash."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from palpate_bus import codec
+from palpate_bus.contract import contract
+from palpate_bus.messages import JointState, SurfaceMesh
+from palpate_bus.stamps import header
+from palpate_models.scenario import Scenario
+from palpate_recorder.recover import recover
+from palpate_recorder.service import FOLDER, RecorderService, create
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+MS = 1_000_000
+NAMES = [f"lbr_A{i}" for i in range(1, 8)]
+TOPICS = contract().topics
+
+
+def joint_states(t: int) -> bytes:
+    position = np.full(7, t / 1e9)
+    return codec.encode(
+        JointState(header(t), NAMES, position, position + 1, position + 2), "sensor_msgs/msg/JointState"
+    )
+
+
+def surface(t: int) -> bytes:
+    vertices = np.full(9000, t / 1e9, dtype=np.float32)
+    empty = np.empty(0, dtype=np.float32)
+    message = SurfaceMesh(header(t, "world"), vertices, empty, np.arange(18000, dtype=np.uint32) % 3000)
+    return codec.encode(message, "palpation_msgs/msg/SurfaceMesh")
+
+
+def record(service: RecorderService, milliseconds: int) -> None:
+    for i in range(milliseconds):
+        service.record(TOPICS["joint_states"], joint_states(i * MS), i * MS, i)
+        if i % 50 == 0:
+            service.record(TOPICS["sim/surface"], surface(i * MS), i * MS, i // 50)
+
+
+def test_rosbags_reads_back_every_byte(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 2500)
+    facts = service.finish()
+    assert facts["messages"] == 2550
+    assert facts["missing"] == {}
+    with Reader(tmp_path / FOLDER) as reader:
+        assert reader.message_count == 2550
+        assert {connection.topic for connection in reader.connections} == {
+            f"/{topic.name}" for topic, _ in contract().inputs("recorder")
+        }
+        rows = [(c.topic, stamp, bytes(data)) for c, stamp, data in reader.messages()]
+    joints = [(stamp, data) for topic, stamp, data in rows if topic == "/joint_states"]
+    assert joints == [(i * MS, joint_states(i * MS)) for i in range(2500)]
+    meshes = [(stamp, data) for topic, stamp, data in rows if topic == "/sim/surface"]
+    assert meshes == [(i * MS, surface(i * MS)) for i in range(0, 2500, 50)]
+
+
+def test_a_reader_without_our_definitions_decodes_our_types(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 60)
+    service.finish()
+    with AnyReader([tmp_path / FOLDER]) as reader:
+        connection = next(c for c in reader.connections if c.topic == "/sim/surface")
+        _, _, data = list(reader.messages([connection]))[-1]
+        assert reader.deserialize(data, connection.msgtype).vertices[0] == pytest.approx(0.05)
+
+
+def test_the_mcap_library_decodes_all_with_the_schemas_in_the_file(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 120)
+    service.finish()
+    with (tmp_path / FOLDER / f"{FOLDER}_0.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        decoded = list(reader.iter_decoded_messages())
+    joints = [(message, ros) for _, channel, message, ros in decoded if channel.topic == "/joint_states"]
+    assert [message.sequence for message, _ in joints] == list(range(120))
+    assert all(ros.position[0] == message.log_time / 1e9 for message, ros in joints)
+    assert len(decoded) == 123
+
+
+@pytest.mark.parametrize("name", sorted(topic.name for topic, _ in contract().inputs("recorder")))
+def test_every_schema_of_the_contract_parses(tmp_path: Path, name: str) -> None:
+    """The ROS 2 decoder builds a decoder from the schema text alone, for each observed topic."""
+    from mcap.records import Schema
+    from mcap_ros2.decoder import DecoderFactory as Factory
+    from palpate_recorder.service import channels
+
+    channel = next(c for c in channels(contract()) if c.topic == f"/{name}")
+    schema = Schema(id=1, name=channel.type, encoding="ros2msg", data=channel.schema.encode())
+    assert Factory().decoder_for("cdr", schema) is not None
+
+
+def kill(service_folder: Path, to: Path, share: float = 1.0) -> Path:
+    """A copy of what the disk holds of an unfinished recording when its process is killed, cut to `share` of it."""
+    to.mkdir()
+    data = (service_folder / f"{service_folder.name}_0.mcap").read_bytes()
+    (to / f"{to.name}_0.mcap").write_bytes(data[: int(len(data) * share)])
+    return to
+
+
+def test_a_crash_loses_at_most_the_last_simulated_second(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 3900)
+    recovered = recover(kill(tmp_path / FOLDER, tmp_path / "crashed"))
+    with Reader(recovered) as reader:
+        stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
+    assert stamps == [i * MS for i in range(len(stamps))]
+    assert len(stamps) >= 2900
+
+
+def test_a_file_cut_anywhere_is_recovered_up_to_there(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 3900)
+    service.finish()
+    counts = []
+    for share in (0.3, 0.6, 0.9, 1.0):
+        recovered = recover(kill(tmp_path / FOLDER, tmp_path / f"cut_{share}", share))
+        with Reader(recovered) as reader:
+            counts.append(len([None for _ in reader.messages()]))
+            assert counts[-1] == reader.message_count
+    assert 0 < counts[0] < counts[1] < counts[2] < counts[3] == 3978
+
+
+def test_recover_says_what_is_wrong(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no recording there"):
+        recover(tmp_path)
+    service = RecorderService(tmp_path / FOLDER)
+    with pytest.raises(ValueError, match="nothing to recover"):
+        recover(kill(tmp_path / FOLDER, tmp_path / "empty"))
+    service.finish()
+
+
+def test_gaps_in_the_sequence_are_reported(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    for sequence in (0, 1, 5, 6):
+        service.record(TOPICS["joint_states"], joint_states(0), sequence * MS, sequence)
+    assert service.finish()["missing"] == {"/joint_states": 3}
+
+
+def test_memory_stays_bounded_by_the_chunk(tmp_path: Path) -> None:
+    """Large messages go to disk by size, long before a simulated second is over."""
+    service = RecorderService(tmp_path / FOLDER)
+    payload = codec.encode(
+        SurfaceMesh(
+            header(0),
+            np.random.default_rng(0).random(2_000_000, dtype=np.float32),
+            np.empty(0, np.float32),
+            np.empty(0, np.uint32),
+        ),
+        "palpation_msgs/msg/SurfaceMesh",
+    )
+    for i in range(3):
+        service.record(TOPICS["sim/surface"], payload, i, i)
+    assert (tmp_path / FOLDER / f"{FOLDER}_0.mcap").stat().st_size > 2 * len(payload)
+    service.finish()
+
+
+def test_an_empty_recording_is_a_valid_bag(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    assert service.finish()["messages"] == 0
+    with Reader(tmp_path / FOLDER) as reader:
+        assert list(reader.messages()) == []
+
+
+def test_finish_twice_and_a_new_run_in_the_same_folder(tmp_path: Path) -> None:
+    first = RecorderService(tmp_path / FOLDER)
+    record(first, 10)
+    first.finish()
+    first.finish()
+    second = RecorderService(tmp_path / FOLDER)
+    record(second, 5)
+    second.finish()
+    metadata = yaml.safe_load((tmp_path / FOLDER / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert metadata["message_count"] == 6
+    assert metadata["duration"]["nanoseconds"] == 4 * MS
+
+
+def test_an_unknown_topic_is_counted_not_written(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    stranger = TOPICS["joint_states"].model_copy(update={"name": "not/ours"})
+    service.record(stranger, b"\0\1\0\0", 0, 0)
+    facts = service.finish()
+    assert facts["unexpected"] == 1
+    assert facts["messages"] == 0
+
+
+def test_create_reads_the_run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_OUT", str(tmp_path / "run"))
+    create(Scenario()).finish()
+    assert (tmp_path / "run" / FOLDER / "metadata.yaml").is_file()
+    monkeypatch.delenv("PALPATE_OUT")
+    with pytest.raises(ValueError, match="PALPATE_OUT"):
+        create(Scenario())
