@@ -72,7 +72,7 @@ STANDOFF_MASS_FRACTION: Final = 0.6
 
 @dataclass(frozen=True, slots=True)
 class Inertia:
-    """Mass [kg], centre of mass [m] in the link frame, rotational inertia about it [kg m^2] in axes of the link frame."""
+    """Mass [kg], centre of mass [m] in the link frame, inertia about it [kg m^2], axes of the link frame."""
 
     mass: float
     com: Point
@@ -84,7 +84,7 @@ class Inertia:
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """A cylinder from `start` to `end` [m, link frame] with round ends of its radius [m]; a sphere where they coincide."""
+    """A cylinder from `start` to `end` [m, link frame] with round ends of its radius [m]; a sphere if they coincide."""
 
     start: Point
     end: Point
@@ -128,7 +128,7 @@ def _sphere(mass: float, radius: float) -> Inertia:
 
 
 def inertias(robot: Robot) -> dict[str, Inertia]:
-    """Inertia by link: the stand-off is in `ft_sensor`, the sphere in `indenter`, the sensor's body in `lbr_link_ee`."""
+    """Inertia by link: the stand-off is in `ft_sensor`, the sphere in `indenter`, the sensor in `lbr_link_ee`."""
     standoff = STANDOFF_MASS_FRACTION * robot.tool_mass_kg
     tool = (
         _cylinder(FT_SENSOR_MASS_KG, FT_SENSOR_RADIUS_M, FLANGE_TO_FT_M, FLANGE_TO_FT_M / 2),
