@@ -1,0 +1,1 @@
+"""Role camera: a Kinect-like depth camera, by ray casting."""

@@ -1,0 +1,120 @@
+"""Noise of a Kinect's depth image: lateral jitter, axial noise, disparity quantisation, lost grazing pixels.
+
+With z the depth [m] and theta the angle between ray and surface normal (Nguyen, Izadi, Lovell, "Modeling Kinect sensor
+noise for improved 3D reconstruction and tracking", 3DIMPVT 2012):
+
+    sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 + (0.0001 / sqrt z) theta^2 / (pi/2 - theta)^2   [m]
+    sigma_l = 0.8 + 0.035 theta / (pi/2 - theta)                                           [px]
+
+Depth is then rounded to eighths of a pixel of disparity f b / z (Khoshelham, Elberink, "Accuracy and resolution of
+Kinect depth data", Sensors 2012).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_camera.scene import Image, View
+
+Vector = NDArray[np.float32]
+
+BASELINE_M: Final = 0.075
+"""Projector to infrared camera (Khoshelham 2012)."""
+DISPARITY_STEP_PX: Final = 0.125
+"""Resolution of the disparity (Khoshelham 2012; OpenKinect)."""
+RANGE_M: Final = (0.4, 4.5)
+"""Depth outside is invalid: Nguyen's model starts at 0.4 m; the far end is assumed."""
+GRAZING_RAD: Final = (np.deg2rad(70.0), np.deg2rad(85.0))
+"""From the first angle on, pixels get lost, from the second all are (assumed; Nguyen's fit has a pole at 90 deg)."""
+
+
+def axial_sigma(z: Vector, theta: Vector) -> Vector:
+    """Standard deviation of depth [m] at depth `z` [m] and incidence `theta` [rad], shapes alike (Nguyen 2012)."""
+    grazing = theta / (np.pi / 2 - theta)
+    return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(z) * grazing**2, np.float32)
+
+
+def lateral_sigma(theta: Vector) -> Vector:
+    """Standard deviation of the viewing ray in either direction of the image [px] (Nguyen 2012)."""
+    return np.asarray(0.8 + 0.035 * theta / (np.pi / 2 - theta), np.float32)
+
+
+def loss_probability(theta: Vector) -> Vector:
+    """Probability that a pixel has no depth: 0 up to 70 deg of incidence, rising linearly to 1 at 85 deg."""
+    low, high = GRAZING_RAD
+    return np.asarray(np.clip((theta - low) / (high - low), 0, 1), np.float32)
+
+
+@dataclass(slots=True)
+class _Statistics:
+    """What the noise needs to know of a view, at the pixels that hit something (n of them)."""
+
+    view: View
+    pixel: NDArray[np.intp]
+    u: NDArray[np.int32]
+    v: NDArray[np.int32]
+    axial: Vector
+    lateral: Vector
+    grazing: NDArray[np.intp]
+    """Indices into the n at which loss is possible."""
+    loss: Vector
+    """Its probability there."""
+
+
+class KinectNoise:
+    """A noisy depth image of a view, from one seeded stream."""
+
+    def __init__(self, focal_px: float, scale: float, rng: np.random.Generator) -> None:
+        """`scale` multiplies standard deviations, disparity step and (up to 1) probability of loss; 0: no noise."""
+        self._focal_baseline = np.float32(focal_px * BASELINE_M)
+        self._scale = np.float32(scale)
+        self._rng = rng
+        self._known: _Statistics | None = None
+
+    def image(self, view: View) -> Image:
+        """Depth [m] along the optical axis, shape (height, width), float32, NaN where invalid."""
+        s = self._statistics(view)
+        z = self._measure(s) if self._scale > 0 else 1 / view.w.ravel()[s.pixel]
+        z[(z < RANGE_M[0]) | (z > RANGE_M[1])] = np.nan
+        image = np.full(view.w.shape, np.nan, np.float32)
+        image.ravel()[s.pixel] = z
+        return image
+
+    def _measure(self, s: _Statistics) -> Vector:
+        height, width = s.view.w.shape
+        draw = self._rng.standard_normal((3, s.pixel.size), np.float32)
+        du, dv = s.lateral * draw[0], s.lateral * draw[1]
+        whole_u, whole_v = np.rint(du), np.rint(dv)
+        u = np.clip(s.u + whole_u.astype(np.int32), 0, width - 1)
+        v = np.clip(s.v + whole_v.astype(np.int32), 0, height - 1)
+        seen = v * width + u
+        w = s.view.w.ravel()[seen]
+        w += s.view.gu.ravel()[seen] * (du - whole_u)
+        w += s.view.gv.ravel()[seen] * (dv - whole_v)
+        z = 1 / np.maximum(w, np.float32(1e-6))
+        z += s.axial * draw[2]
+        step = self._scale * np.float32(DISPARITY_STEP_PX)
+        disparity = np.maximum(np.rint(self._focal_baseline / np.maximum(z, np.float32(1e-3)) / step), 1) * step
+        z = self._focal_baseline / disparity
+        z[s.grazing[self._rng.random(s.grazing.size, np.float32) < s.loss]] = np.nan
+        return np.asarray(z, np.float32)
+
+    def _statistics(self, view: View) -> _Statistics:
+        if self._known is None or self._known.view is not view:
+            pixel = np.flatnonzero(view.w)
+            v, u = np.divmod(pixel.astype(np.int32), np.int32(view.w.shape[1]))
+            z = np.asarray(1 / view.w.ravel()[pixel], np.float32)
+            theta = np.asarray(np.arccos(np.minimum(view.cos.ravel()[pixel], 1)), np.float32)
+            loss = loss_probability(theta)
+            grazing = np.flatnonzero(loss)
+            theta = np.asarray(
+                np.minimum(theta, GRAZING_RAD[1]), np.float32
+            )  # beyond, all pixels are lost: stay off the pole
+            axial, lateral = self._scale * axial_sigma(z, theta), self._scale * lateral_sigma(theta)
+            loss = np.minimum(self._scale, 1) * loss[grazing]
+            self._known = _Statistics(view, pixel, u, v, axial, lateral, grazing, loss)
+        return self._known

@@ -1,0 +1,64 @@
+"""The pinhole camera: pixel (u, v) looks along ((u - cx)/fx, (v - cy)/fy, 1) of the optical frame C (x right, y down).
+
+Pixel centres have integer coordinates, as in ROS, so the principal point of a w x h image is ((w - 1)/2, (h - 1)/2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.scenario import Camera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole:
+    """Intrinsics in pixels, without distortion."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @classmethod
+    def of(cls, camera: Camera) -> Pinhole:
+        """The intrinsics of a scenario's camera."""
+        focal = camera.focal_px
+        return cls(
+            camera.width_px, camera.height_px, focal, focal, (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
+        )
+
+    @property
+    def matrix(self) -> Array:
+        """K, shape (3, 3), in pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def directions(self) -> Array:
+        """Viewing directions in C with unit z, shape (height, width, 3): a depth times a direction is a point."""
+        directions = np.ones((self.height, self.width, 3))
+        directions[..., 0] = (np.arange(self.width) - self.cx) / self.fx
+        directions[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, np.newaxis]
+        return directions
+
+    def window(self, p_C: Array) -> tuple[slice, slice]:
+        """Rows and columns that hold the image of points in C, shape (n, 3), with a pixel to spare.
+
+        The whole image when a point is at the camera or behind it.
+        """
+        z = p_C[:, 2]
+        if z.min() < 1e-3:
+            return slice(0, self.height), slice(0, self.width)
+        u = self.fx * p_C[:, 0] / z + self.cx
+        v = self.fy * p_C[:, 1] / z + self.cy
+        return _span(v, self.height), _span(u, self.width)
+
+
+def _span(x: Array, size: int) -> slice:
+    low = min(max(int(np.floor(x.min())) - 1, 0), size)
+    high = min(max(int(np.ceil(x.max())) + 2, low), size)
+    return slice(low, high)

@@ -1,0 +1,137 @@
+"""What the camera would see without noise: ray casting of triangle meshes in layers, each cast only when it changed.
+
+A view is kept as inverse depth w = 1/z, which is linear in the pixel coordinates on a plane: at an offset (du, dv) [px]
+from a pixel, the plane seen in it is at w + gu du + gv dv. So a view with w, gu, gv can be looked up between its
+pixels, exactly for a flat facet and without mixing near and far at an edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.frames import apply, inverse
+
+from palpate_camera.open3d_loader import open3d
+from palpate_camera.pinhole import Pinhole
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Triangles = NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Triangles in world."""
+
+    vertices: Array
+    """Positions [m], shape (n, 3)."""
+    triangles: Triangles
+    """Vertex indices, shape (m, 3)."""
+
+
+@dataclass(slots=True)
+class View:
+    """A noise-free view, images of shape (height, width)."""
+
+    w: Image
+    """Inverse depth along the optical axis [1/m]; 0 where nothing is hit."""
+    gu: Image
+    """Change of w per pixel to the right, on the facet that is seen [1/(m px)]."""
+    gv: Image
+    """The same per pixel downwards."""
+    cos: Image
+    """Cosine of the angle between the ray and the facet's normal, in [0, 1]."""
+
+    @classmethod
+    def empty(cls, height: int, width: int) -> View:
+        """A view of nothing."""
+        return cls(*(np.zeros((height, width), np.float32) for _ in range(4)))
+
+    def nearest(self, other: View) -> View:
+        """The view of both scenes: at each pixel, what is nearer."""
+        near = other.w > self.w
+        return View(*(np.where(near, b, a) for a, b in zip(self.images, other.images, strict=True)))
+
+    @property
+    def images(self) -> tuple[Image, Image, Image, Image]:
+        """w, gu, gv, cos."""
+        return self.w, self.gu, self.gv, self.cos
+
+
+class Caster:
+    """Casts a fixed camera's rays."""
+
+    def __init__(self, pinhole: Pinhole, X_WC: Array) -> None:
+        """A camera with true pose `X_WC` (optical frame in world), shape (4, 4)."""
+        self.pinhole = pinhole
+        self._X_CW = inverse(X_WC)
+        self._right = (X_WC[:3, 0] / pinhole.fx).astype(np.float32)
+        self._down = (X_WC[:3, 1] / pinhole.fy).astype(np.float32)
+        directions = pinhole.directions() @ X_WC[:3, :3].T
+        self._rays = np.empty((pinhole.height, pinhole.width, 6), np.float32)
+        self._rays[..., :3] = X_WC[:3, 3]
+        self._rays[..., 3:] = directions
+        self._length = np.linalg.norm(directions, axis=2).astype(np.float32)
+
+    def cast(self, mesh: Mesh) -> View:
+        """The view of one mesh. Rays have unit z in C, so the hit parameter of Open3D is the depth [m]."""
+        view = View.empty(self.pinhole.height, self.pinhole.width)
+        rows, columns = self.pinhole.window(apply(self._X_CW, mesh.vertices))
+        if rows.start == rows.stop or columns.start == columns.stop:
+            return view
+        scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        tensor = open3d.core.Tensor.from_numpy
+        scene.add_triangles(
+            tensor(np.ascontiguousarray(mesh.vertices, np.float32)),
+            tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),
+        )
+        rays = np.ascontiguousarray(self._rays[rows, columns])
+        hits = scene.cast_rays(tensor(rays), nthreads=1)
+        z, normal = hits["t_hit"].numpy(), hits["primitive_normals"].numpy()
+        slope = np.einsum("ijk,ijk->ij", normal, rays[..., 3:])
+        hit = np.isfinite(z) & (slope != 0)
+        z, slope = np.where(hit, z, np.inf), np.where(hit, slope, 1.0)
+        view.w[rows, columns] = w = 1 / z
+        view.gu[rows, columns] = w * (normal @ self._right) / slope
+        view.gv[rows, columns] = w * (normal @ self._down) / slope
+        view.cos[rows, columns] = np.where(hit, np.abs(slope) / self._length[rows, columns], 0)
+        return view
+
+
+class Scene:
+    """Layers of meshes before one camera. A layer is cast anew only when a vertex moved by more than `tolerance_m`."""
+
+    def __init__(self, caster: Caster, tolerance_m: float = 1e-5) -> None:
+        self._caster = caster
+        self._tolerance = tolerance_m
+        self._layers: dict[str, tuple[Mesh, View]] = {}
+        self._merged: View | None = None
+
+    def put(self, name: str, mesh: Mesh) -> None:
+        """Sets a layer's mesh."""
+        old = self._layers.get(name)
+        if old is not None and self._same(old[0], mesh):
+            return
+        self._layers[name] = (mesh, self._caster.cast(mesh))
+        self._merged = None
+
+    def view(self) -> View:
+        """The view of all layers; the same object as long as nothing changed. Raises ValueError without a layer."""
+        if self._merged is None:
+            if not self._layers:
+                raise ValueError("the scene has no layer: put a mesh first")
+            views = [self._layers[name][1] for name in sorted(self._layers)]
+            merged = views[0]
+            for view in views[1:]:
+                merged = merged.nearest(view)
+            self._merged = merged
+        return self._merged
+
+    def _same(self, old: Mesh, new: Mesh) -> bool:
+        return (
+            old.vertices.shape == new.vertices.shape
+            and np.array_equal(old.triangles, new.triangles)
+            and bool(np.abs(old.vertices - new.vertices).max(initial=0.0) <= self._tolerance)
+        )
