@@ -1,0 +1,135 @@
+"""Impedance control of a redundant arm: arrays in, joint torques out. Gravity is the driver's.
+
+Cartesian, with e the pose error and all task quantities in axes of the desired indenter frame D:
+
+    F   = K clip(e) + B (V_d - V) + F_ff,  B_i = 2 zeta_i sqrt(K_i m_i)
+    tau = J^T F + N^T tau_0 + C(q, qd) qd + friction(qd_d)
+
+m_i = 1 / (J M^-1 J^T)_ii is the effective mass along axis i (Khatib 1995, doi 10.1177/027836499501400103); N is the
+dynamically consistent null-space projector (Khatib 1987, doi 10.1109/JRA.1987.1087068). The rotational spring is the
+gradient of 1/2 phi^T K phi, phi the rotation vector, so the springs store energy and never create any.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
+
+from palpate_control.model import DOF, ArmModel
+from palpate_control.reference import Mode, Reference
+from palpate_control.safety import LimitRepulsion, TorqueShaper
+
+Array = NDArray[np.float64]
+
+POSITION_CLIP_M = 0.1
+"""Largest position error that stretches the spring, each axis (facts: CRISP, Mayr JOSS 05194)."""
+ROTATION_CLIP_RAD = 0.5
+JOINT_CLIP_RAD = 0.25
+"""The same for a joint in mode JOINT."""
+NULL_TORQUE_NM = 5.0
+"""Cap of the null-space torque, each joint."""
+JOINT_DAMPING_RATIO = 0.7
+"""Of the joint spring in mode JOINT and of the null-space posture [1]."""
+STICTION_SPEED = 0.02
+"""Joint speed at which half of the Coulomb friction is compensated [rad/s]; keeps the compensation smooth."""
+SINGULAR_MOBILITY = 1e-3
+"""Added to the task mobility [1/kg, 1/(kg m^2)] where it has lost rank."""
+
+
+class ImpedanceController:
+    """The control law with its safety net. One instance an arm: it remembers the torque before, for the rate limit."""
+
+    def __init__(self, model: ArmModel, limit_zone: float = 0.05) -> None:
+        """A controller on `model`, with joint-limit repulsion in the last `limit_zone` [rad]."""
+        self.model = model
+        self._repulsion = LimitRepulsion(model.position_lower, model.position_upper, model.torque_limit, limit_zone)
+        self._shaper = TorqueShaper(model.torque_limit)
+        self._clip = np.array([POSITION_CLIP_M] * 3 + [ROTATION_CLIP_RAD] * 3)
+        self._rotate = np.zeros((6, 6))  # world axes to D's, for linear and angular parts
+        self._error = np.zeros(6)
+        self._rhs = np.zeros((6, 2), order="F")
+
+    def reset(self) -> None:
+        """Starts the rate limit from zero torque: nothing has been commanded of late."""
+        self._shaper.reset()
+
+    def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
+        """Torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s].
+
+        Raises ValueError if `q` or `qd` is not finite or not of shape (7,).
+        """
+        if q.shape != (DOF,) or qd.shape != (DOF,) or not np.isfinite(q.dot(q) + qd.dot(qd)):
+            raise ValueError(f"joint state: q = {q}, qd = {qd}: must be {DOF} finite values each")
+        self.model.update(q, qd)
+        raw = self._cartesian(q, qd, reference) if reference.mode is Mode.CARTESIAN else self._joint(q, qd, reference)
+        push = self._repulsion.torque(q)
+        return self._shaper.shape(raw if push is None else raw + push, self.model.gravity)
+
+    def _friction(self, qd: Array) -> Array:
+        """Torque that overcomes viscous and Coulomb friction at the desired velocity, shape (7,)."""
+        model = self.model
+        return (model.viscous_friction + model.coulomb_friction / (np.abs(qd) + STICTION_SPEED)) * qd
+
+    def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
+        model = self.model
+        stiffness = reference.joint_stiffness
+        damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(stiffness * model.inertia_diagonal(q))
+        error = np.minimum(np.maximum(reference.q - q, -JOINT_CLIP_RAD), JOINT_CLIP_RAD)
+        torque: Array = stiffness * error + damping * (reference.qd - qd) + self._friction(reference.qd)
+        return torque + model.inverse_dynamics(q, qd, reference.qdd)
+
+    def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
+        model, rotate = self.model, self._rotate
+        R_DW = reference.R_WD.T
+        rotate[:3, :3] = R_DW
+        rotate[3:, 3:] = R_DW
+        J = rotate.dot(model.J_W)
+        JM = J.dot(model.mobility)
+        mobility = JM.dot(J.T)
+        V_desired = rotate.dot(reference.V_WD)
+
+        spring = self._spring(reference)
+        damping = 2 * reference.damping_ratio * np.sqrt(reference.stiffness / mobility.diagonal())
+        F = spring + damping * (V_desired - J.dot(qd)) + rotate.dot(reference.F_W)
+
+        posture = self._posture(q, qd, reference)
+        rhs = self._rhs
+        rhs[:, 0] = JM.dot(posture)
+        rhs[:, 1] = V_desired - J.dot(reference.qd)
+        solution = _solve(mobility, rhs)
+        null = posture - J.T.dot(solution[:, 0])
+        excess = np.abs(null).max() / NULL_TORQUE_NM
+        if excess > 1:
+            null /= excess  # scaled as a whole, so that it stays in the null space
+        qd_desired = reference.qd + JM.T.dot(solution[:, 1])
+        qd_desired = np.minimum(np.maximum(qd_desired, -model.velocity_limit), model.velocity_limit)
+        torque: Array = J.T.dot(F) + null + model.coriolis + self._friction(qd_desired)
+        return torque
+
+    def _spring(self, reference: Reference) -> Array:
+        """Force and torque of the Cartesian springs on the indenter, in D's axes, shape (6,)."""
+        model, error, R_WD = self.model, self._error, reference.R_WD
+        R_DI = R_WD.T.dot(model.R_WI)
+        error[:3] = (reference.p_WD - model.p_WI).dot(R_WD)
+        error[3:] = -pin.log3(R_DI)
+        spring: Array = reference.stiffness * np.minimum(np.maximum(error, -self._clip), self._clip)
+        spring[3:] = pin.Jlog3(R_DI).dot(spring[3:])  # d phi = J_l^-1 w with w in D's axes, and J_l^-T = Jlog3
+        return spring
+
+    def _posture(self, q: Array, qd: Array, reference: Reference) -> Array:
+        """Torque towards the posture, before projection, shape (7,)."""
+        stiffness = reference.joint_stiffness
+        damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(stiffness / self.model.mobility.diagonal())
+        torque: Array = stiffness * (reference.q - q) + damping * (reference.qd - qd)
+        return torque
+
+
+def _solve(mobility: Array, rhs: Array) -> Array:
+    """Solution of `mobility x = rhs` by Cholesky, shape of `rhs`; regularised where the arm is singular."""
+    _, solution, info = dposv(mobility, rhs)
+    if info != 0 or not np.isfinite(solution.sum()):
+        _, solution, info = dposv(mobility + SINGULAR_MOBILITY * np.eye(6), rhs)
+    result: Array = solution
+    return result

@@ -1,0 +1,70 @@
+"""The controller's own model of the arm, on pinocchio: kinematics, inertia and Coriolis torques at one state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DOF = 7
+_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+class ArmModel:
+    """Kinematics and dynamics of the arm, evaluated by `update(q, qd)` into its attributes.
+
+    Attributes after `update` (valid until the next):
+        R_WI: rotation of the indenter frame I in world, shape (3, 3).
+        p_WI: origin of I in world [m], shape (3,).
+        J_W: Jacobian of V_WI_W (linear first, then angular, world axes, at I's origin), shape (6, 7).
+        mobility: inverse of the joint-space inertia matrix [1/(kg m^2)], shape (7, 7).
+        gravity: torques that hold the arm against gravity [N m], shape (7,).
+        coriolis: Coriolis and centrifugal torques C(q, qd) qd [N m], shape (7,).
+    """
+
+    R_WI: Array
+    p_WI: Array
+    J_W: Array
+    mobility: Array
+    gravity: Array
+    coriolis: Array
+
+    def __init__(self, urdf: str, frame: str = "indenter") -> None:
+        """Builds the model from URDF text. Raises ValueError if it is no seven-joint arm with a link `frame`."""
+        self._model = pin.buildModelFromXML(urdf)
+        if self._model.nq != DOF or self._model.nv != DOF:
+            raise ValueError(f"robot description has {self._model.nv} joints, the controller wants {DOF}")
+        if not self._model.existFrame(frame):
+            raise ValueError(f"robot description has no link {frame!r}")
+        self._data = self._model.createData()
+        self._frame = self._model.getFrameId(frame)
+        self.position_lower: Array = self._model.lowerPositionLimit.copy()
+        self.position_upper: Array = self._model.upperPositionLimit.copy()
+        self.velocity_limit: Array = self._model.velocityLimit.copy()
+        self.torque_limit: Array = self._model.effortLimit.copy()
+        self.viscous_friction: Array = self._model.damping.copy()
+        self.coulomb_friction: Array = self._model.upperDryFrictionLimit.copy()
+
+    def update(self, q: Array, qd: Array) -> None:
+        """Evaluates the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (7,)."""
+        model, data = self._model, self._data
+        pin.computeMinverse(model, data, q)  # also places the joints and fills data.J
+        pose = pin.updateFramePlacement(model, data, self._frame)
+        self.R_WI = pose.rotation
+        self.p_WI = pose.translation
+        self.J_W = pin.getFrameJacobian(model, data, self._frame, _AXES)
+        self.mobility = data.Minv
+        self.gravity = pin.computeGeneralizedGravity(model, data, q)
+        self.coriolis = pin.nonLinearEffects(model, data, q, qd) - self.gravity
+
+    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Torques without gravity and friction that give accelerations `qdd` [rad/s^2], shape (7,). After `update`."""
+        torque: Array = pin.rnea(self._model, self._data, q, qd, qdd) - self.gravity
+        return torque
+
+    def inertia_diagonal(self, q: Array) -> Array:
+        """Diagonal of the joint-space inertia matrix [kg m^2], shape (7,)."""
+        diagonal: Array = pin.crba(self._model, self._data, q).diagonal()
+        return diagonal

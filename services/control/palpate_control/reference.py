@@ -1,0 +1,198 @@
+"""Set-points and what the controller follows between them: extrapolated by their twist, joined without a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from math import exp
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MAX_EXTRAPOLATION_NS = 30_000_000
+"""Past this age a set-point stands still. One is 10 to 19 ms old in use; one missing message is bridged."""
+SMOOTHING_S = 0.005
+"""Time constant in which the step between two set-points fades."""
+MAX_ACCELERATION = 15.0
+"""Bound on the acceleration read off consecutive joint set-points [rad/s^2]."""
+
+
+class Mode(IntEnum):
+    """What a set-point asks for; values of `palpation_msgs/ImpedanceSetpoint`."""
+
+    CARTESIAN = 0
+    JOINT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """One set-point of the impedance controller. Constructing one checks it; ValueError names the field."""
+
+    mode: Mode
+    stamp: int
+    """Time at which pose and joint position hold [ns]."""
+    R_WD: Array
+    """Desired rotation of the indenter frame in world, shape (3, 3)."""
+    p_WD: Array
+    """Desired origin of the indenter frame in world [m], shape (3,)."""
+    V_WD: Array
+    """Desired twist in world axes, linear [m/s] then angular [rad/s], shape (6,)."""
+    F_W: Array
+    """Feed-forward wrench exerted on the environment, force [N] then torque [N m], world axes, at I, shape (6,)."""
+    stiffness: Array
+    """In axes of the desired frame: translation [N/m], rotation [N m/rad], shape (6,)."""
+    damping_ratio: Array
+    """[1], shape (6,)."""
+    q: Array
+    """JOINT: target; CARTESIAN: null-space posture [rad], shape (7,)."""
+    qd: Array
+    """Velocity of `q` [rad/s], shape (7,)."""
+    joint_stiffness: Array
+    """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
+
+    def __post_init__(self) -> None:
+        for name in ("R_WD", "p_WD", "V_WD", "F_W", "stiffness", "damping_ratio", "q", "qd", "joint_stiffness"):
+            value = getattr(self, name)
+            if not np.isfinite(value).all():
+                raise ValueError(f"set-point: {name} = {value}: must be finite")
+        for name in ("stiffness", "damping_ratio", "joint_stiffness"):
+            value = getattr(self, name)
+            if value.min() < 0:
+                raise ValueError(f"set-point: {name} = {value}: must not be negative")
+        if abs(np.linalg.det(self.R_WD) - 1) > 1e-6:
+            raise ValueError(f"set-point: R_WD has determinant {np.linalg.det(self.R_WD)}: must be a rotation")
+
+
+def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
+    """Rotation matrix, shape (3, 3), of a unit quaternion. Raises ValueError if its norm is off by 1 % or more."""
+    norm = float(np.sqrt(x * x + y * y + z * z + w * w))
+    if not abs(norm - 1) < 0.01:
+        raise ValueError(f"set-point: quaternion ({x}, {y}, {z}, {w}) has norm {norm}: must be 1")
+    rotation: Array = pin.Quaternion(w / norm, x / norm, y / norm, z / norm).toRotationMatrix()
+    return rotation
+
+
+@dataclass(slots=True)
+class Reference:
+    """What the law follows at one tick; fields as in `Setpoint`."""
+
+    mode: Mode
+    R_WD: Array
+    p_WD: Array
+    V_WD: Array
+    F_W: Array
+    stiffness: Array
+    damping_ratio: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    """Acceleration of `q` [rad/s^2], shape (7,); zero in mode CARTESIAN."""
+    joint_stiffness: Array
+
+
+class Extrapolator:
+    """Carries set-points on to the present: pose (+) twist * age, joint position + velocity * age.
+
+    Consecutive set-points rarely meet exactly: their path accelerates. The gap at the change-over (in pose, twist,
+    wrench, joint position and velocity) is added to the new one and fades in `SMOOTHING_S`: neither step nor lag.
+    """
+
+    def __init__(self) -> None:
+        self._current: Setpoint | None = None
+        self._acceleration = np.zeros(7)
+        self._reset_gaps()
+        self._time = 0
+        self._standing = False
+
+    def _reset_gaps(self) -> None:
+        self._gap_p = np.zeros(3)
+        self._gap_R = np.zeros(3)  # rotation vector in world axes
+        self._gap_VF = np.zeros(12)
+        self._gap_joint = np.zeros(14)
+
+    @property
+    def current(self) -> Setpoint | None:
+        """The set-point in use."""
+        return self._current
+
+    def clear(self) -> None:
+        """Forgets the set-point, so that the next one starts afresh."""
+        self._current = None
+        self._acceleration = np.zeros(7)
+        self._reset_gaps()
+        self._standing = False
+
+    def accept(self, setpoint: Setpoint, t: int) -> None:
+        """Takes a new set-point at time `t` [ns]."""
+        old = self._current
+        if old is None or old.mode != setpoint.mode:
+            self.clear()
+            self._current = setpoint
+            return
+        before = self._raw(old, t)
+        spacing = setpoint.stamp - old.stamp
+        joint = setpoint.mode is Mode.JOINT and 0 < spacing <= MAX_EXTRAPOLATION_NS
+        acceleration = (setpoint.qd - old.qd) / (spacing * 1e-9) if joint else np.zeros(7)
+        self._acceleration = np.clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)
+        self._current = setpoint
+        after = self._raw(setpoint, t)
+        self._standing = False
+        self._gap_p += before.p_WD - after.p_WD
+        self._gap_R += pin.log3(before.R_WD @ after.R_WD.T)
+        self._gap_VF[:6] += before.V_WD - after.V_WD
+        self._gap_VF[6:] += before.F_W - after.F_W
+        self._gap_joint[:7] += before.q - after.q
+        self._gap_joint[7:] += before.qd - after.qd
+
+    def _raw(self, setpoint: Setpoint, t: int) -> Reference:
+        """The set-point extrapolated to `t` alone."""
+        age_ns = t - setpoint.stamp
+        standing = age_ns > MAX_EXTRAPOLATION_NS
+        age = min(max(age_ns, -MAX_EXTRAPOLATION_NS), MAX_EXTRAPOLATION_NS) * 1e-9
+        V = setpoint.V_WD
+        acceleration = self._acceleration
+        return Reference(
+            setpoint.mode,
+            pin.exp3(V[3:] * age).dot(setpoint.R_WD),
+            setpoint.p_WD + V[:3] * age,
+            np.zeros(6) if standing else V,
+            setpoint.F_W,
+            setpoint.stiffness,
+            setpoint.damping_ratio,
+            setpoint.q + (setpoint.qd + acceleration * (0.5 * age)) * age,
+            np.zeros(7) if standing else setpoint.qd + acceleration * age,
+            np.zeros(7) if standing else acceleration,
+            setpoint.joint_stiffness,
+        )
+
+    def at(self, t: int) -> Reference:
+        """The reference at time `t` [ns], which does not go back. Raises ValueError before the first set-point."""
+        setpoint = self._current
+        if setpoint is None:
+            raise ValueError("no set-point yet")
+        reference = self._raw(setpoint, t)
+        if not self._standing and t - setpoint.stamp > MAX_EXTRAPOLATION_NS:
+            self._standing = True  # the sender has fallen silent: brake smoothly
+            self._gap_VF[:6] += setpoint.V_WD
+            self._gap_joint[7:] += setpoint.qd
+        fade = exp(-max(t - self._time, 0) * 1e-9 / SMOOTHING_S) if self._time else 1.0
+        self._time = t
+        if setpoint.mode is Mode.JOINT:
+            self._gap_joint *= fade
+            reference.q += self._gap_joint[:7]
+            reference.qd = reference.qd + self._gap_joint[7:]
+            return reference
+        self._gap_p *= fade
+        self._gap_R *= fade
+        self._gap_VF *= fade
+        self._gap_joint *= fade
+        reference.p_WD += self._gap_p
+        reference.R_WD = pin.exp3(self._gap_R).dot(reference.R_WD)
+        reference.V_WD = reference.V_WD + self._gap_VF[:6]
+        reference.F_W = reference.F_W + self._gap_VF[6:]
+        reference.q += self._gap_joint[:7]
+        reference.qd = reference.qd + self._gap_joint[7:]
+        return reference

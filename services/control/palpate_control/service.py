@@ -1,0 +1,126 @@
+"""The control service: joint states and set-points in, joint torques out, at 1 kHz."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from palpate_bus.codec import Message
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import JointTorqueCommand
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_models.lbr import JOINT_NAMES, urdf
+from palpate_models.load import exam_input
+from palpate_models.scenario import Limits, Robot, Scenario
+
+from palpate_control.impedance import ImpedanceController
+from palpate_control.model import DOF, ArmModel
+from palpate_control.reference import Extrapolator, Mode, Setpoint, rotation_from_quaternion
+
+_NAMES = list(JOINT_NAMES)
+
+
+class ControlService(Service):
+    """Follows set-points by impedance control.
+
+    Before the first set-point it commands zero torque, so the driver keeps the arm gravity-compensated. Once a
+    set-point has expired, or joint states are stale or not finite, it sends commands that have expired already: the
+    driver then holds safely by itself, which is better than anything that could be commanded blindly.
+    """
+
+    role: ClassVar[str] = "control"
+
+    def __init__(self, robot: Robot, limits: Limits) -> None:
+        self._controller = ImpedanceController(ArmModel(urdf(robot)), limits.joint_margin_rad)
+        self._reference = Extrapolator()
+        topics = contract().topics
+        self._setpoint_expiry = (topics["planning/setpoint"].expiry_ms or 0) * MS
+        self._joint_states_age = (topics["joint_states"].max_age_ms or 0) * MS
+        self._valid = duration_message((topics["control/joint_torque"].expiry_ms or 0) * MS)
+        self._expired = duration_message(0)
+        self._expires: int | None = None
+        self._facts = {"setpoints": 0, "setpoints_rejected": 0, "joint_states_rejected": 0, "ticks_without_command": 0}
+        self._peak = np.zeros(DOF)
+        self._problem = ""
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """One control tick."""
+        for message in inbox.new("planning/setpoint"):
+            self._accept(message, t)
+        joints = inbox.latest("joint_states")
+        if self._expires is None or joints is None:
+            return self._command(t, np.zeros(DOF), self._valid)
+        received = inbox.stamp("joint_states")
+        if t > self._expires or (received is not None and t - received > self._joint_states_age):
+            return self._cease(t)
+        if joints.name != _NAMES:
+            return self._reject_joints(t, f"joint states name {joints.name}, not {_NAMES}")
+        try:
+            torque = self._controller.torque(
+                np.array(joints.position), np.array(joints.velocity), self._reference.at(t)
+            )
+        except ValueError as error:
+            return self._reject_joints(t, str(error))
+        np.maximum(self._peak, np.abs(torque), out=self._peak)
+        return self._command(t, torque, self._valid)
+
+    def finish(self) -> Mapping[str, Any]:
+        """Counts of set-points and rejections, the last problem, and the largest torque of each joint [N m]."""
+        return {**self._facts, "problem": self._problem, "peak_torque_nm": [round(float(x), 3) for x in self._peak]}
+
+    def _accept(self, message: Message, t: int) -> None:
+        try:
+            setpoint = setpoint_from(message)
+        except ValueError as error:
+            self._facts["setpoints_rejected"] += 1
+            self._problem = f"at {t} ns: {error}"
+            return
+        self._facts["setpoints"] += 1
+        self._reference.accept(setpoint, t)
+        self._expires = setpoint.stamp + min(nanoseconds(message.valid_for), self._setpoint_expiry)
+
+    def _cease(self, t: int) -> Outbox:
+        """Leaves the arm to the driver's safe hold."""
+        self._facts["ticks_without_command"] += 1
+        self._controller.reset()
+        self._reference.clear()
+        return self._command(t, np.zeros(DOF), self._expired)
+
+    def _reject_joints(self, t: int, problem: str) -> Outbox:
+        self._facts["joint_states_rejected"] += 1
+        self._problem = f"at {t} ns: {problem}"
+        return self._cease(t)
+
+    @staticmethod
+    def _command(t: int, torque: np.ndarray[Any, np.dtype[np.float64]], valid_for: Message) -> Outbox:
+        return {"control/joint_torque": JointTorqueCommand(header(t), torque, valid_for)}
+
+
+def setpoint_from(message: Message) -> Setpoint:
+    """The arrays of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field that is not usable."""
+    p, o = message.pose.position, message.pose.orientation
+    v, w = message.twist.linear, message.twist.angular
+    f, m = message.wrench.force, message.wrench.torque
+    if message.mode not in (Mode.CARTESIAN, Mode.JOINT):
+        raise ValueError(f"set-point: mode = {message.mode}: must be {list(map(int, Mode))}")
+    return Setpoint(
+        mode=Mode(message.mode),
+        stamp=nanoseconds(message.header.stamp),
+        R_WD=rotation_from_quaternion(o.x, o.y, o.z, o.w),
+        p_WD=np.array([p.x, p.y, p.z]),
+        V_WD=np.array([v.x, v.y, v.z, w.x, w.y, w.z]),
+        F_W=np.array([f.x, f.y, f.z, m.x, m.y, m.z]),
+        stiffness=np.asarray(message.stiffness, dtype=np.float64),
+        damping_ratio=np.asarray(message.damping_ratio, dtype=np.float64),
+        q=np.asarray(message.joint_position, dtype=np.float64),
+        qd=np.asarray(message.joint_velocity, dtype=np.float64),
+        joint_stiffness=np.asarray(message.joint_stiffness, dtype=np.float64),
+    )
+
+
+def create(scenario: Scenario) -> ControlService:
+    """The service for a scenario, of which it may know the exam input."""
+    known = exam_input(scenario)
+    return ControlService(known.robot, known.limits)
