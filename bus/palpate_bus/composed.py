@@ -1,0 +1,103 @@
+"""Composed lockstep: all services in one process, in the order and with the messages of distributed lockstep.
+
+Every message is encoded once, since the run hash covers its bytes, and decoded by the first reader that looks at it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from palpate_bus.contract import MS, Contract, Topic, contract
+from palpate_bus.lockstep import InputBuffer, OutputPort, Received, Stepper, run_hash
+from palpate_bus.service import Service
+
+Tap = Callable[[Topic, bytes, int, int], None]
+"""Called for every message: topic, payload, stamp [ns], sequence."""
+
+
+class ServiceFailed(RuntimeError):
+    """A service raised. Names the role and the tick; the cause is chained."""
+
+    def __init__(self, role: str, t: int, cause: BaseException) -> None:
+        super().__init__(f"{role} failed at tick {t / 1e9:.3f} s: {cause}")
+        self.role = role
+        self.t = t
+
+
+class Composed:
+    """A run of services in this process.
+
+    run = Composed([RobotService(...), ...])
+    run.run_until(lambda t: run.end_tick)
+    """
+
+    def __init__(self, services: Sequence[Service], rules: Contract | None = None, taps: Sequence[Tap] = ()) -> None:
+        self.contract = rules or contract()
+        by_role = {service.role: service for service in services}
+        order = self.contract.step_order(tuple(role for role in self.contract.roles if role in by_role))
+        workers = [role for role in order if not self.contract.roles[role].observer]
+        observers = [role for role in order if self.contract.roles[role].observer]
+        self.steppers = {role: Stepper(by_role[role], self.contract) for role in (*workers, *observers)}
+        self._taps = tuple(taps)
+        self._readers: dict[str, tuple[InputBuffer, ...]] = {
+            name: tuple(stepper.buffers[name] for stepper in self.steppers.values() if name in stepper.buffers)
+            for name in self.contract.topics
+        }
+        self._schedule = tuple((stepper, stepper.role.period) for stepper in self.steppers.values())
+        self._started = False
+        self.t = 0
+
+    def _send(self, sent: Sequence[tuple[OutputPort, bytes]], t: int) -> None:
+        for port, payload in sent:
+            received = Received(payload, t, port.sequence)
+            for buffer in self._readers[port.topic.name]:
+                buffer.deliver(received)
+            for tap in self._taps:
+                tap(port.topic, payload, t, port.sequence)
+
+    def start(self) -> None:
+        """Sends the latched messages."""
+        for stepper in self.steppers.values():
+            try:
+                self._send(stepper.start(), 0)
+            except Exception as error:
+                raise ServiceFailed(stepper.role.name, 0, error) from error
+        self._started = True
+
+    def tick(self) -> None:
+        """Steps every service whose tick this is, then advances simulated time by a millisecond."""
+        t = self.t
+        for stepper, period in self._schedule:
+            if t % period:
+                continue
+            try:
+                sent = stepper.step(t)
+            except Exception as error:
+                raise ServiceFailed(stepper.role.name, t, error) from error
+            if sent:
+                self._send(sent, t)
+        self.t = t + MS
+
+    def run(self, end: Callable[[], int | None], limit: int) -> int:
+        """Runs up to and including the tick [ns] that `end()` gives once it knows, at most to `limit`; returns the last tick."""
+        if not self._started:
+            self.start()
+        last = limit
+        while self.t <= last:
+            self.tick()
+            decided = end()
+            if decided is not None:
+                last = min(decided, limit)
+        return self.t - MS
+
+    def finish(self) -> dict[str, Mapping[str, Any]]:
+        """Finishes every service; returns what each reports."""
+        return {role: stepper.service.finish() for role, stepper in self.steppers.items()}
+
+    def run_hash(self) -> str:
+        """The run hash."""
+        digests: dict[str, str] = {}
+        for stepper in self.steppers.values():
+            digests.update(stepper.digests())
+        return run_hash(digests)

@@ -1,0 +1,79 @@
+"""The main of every service process.
+
+    from palpate_bus.run import main
+    from palpate_control.service import create
+
+    if __name__ == "__main__":
+        main("control", create)
+
+Environment: PALPATE_SCENARIO (resolved scenario file), PALPATE_RUNTIME (lockstep or wallclock), PALPATE_OUT (results folder),
+ROS_DOMAIN_ID, and what `zenoh_config` reads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from palpate_bus.contract import contract
+from palpate_bus.distributed import LockstepNode, RunAborted
+from palpate_bus.observer import ObserverNode
+from palpate_bus.service import Service
+from palpate_bus.transport import peer_config
+
+EXIT_FAILED = 3
+
+
+def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]) -> None:
+    """Runs the service of `role` to its end and leaves with status 0, or 3 when the run failed or was aborted.
+
+    `load` reads the scenario file named by PALPATE_SCENARIO; `create` makes the service from it.
+    """
+    logging.basicConfig(
+        level=os.environ.get("PALPATE_LOG", "INFO"),
+        format=f"%(asctime)s {role} %(levelname)s %(message)s",
+        stream=sys.stderr,
+    )
+    status = 0
+    session = None
+    try:
+        rules = contract()
+        domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
+        service = create(load(os.environ["PALPATE_SCENARIO"]))
+        session = open_session()
+        node_type = ObserverNode if rules.roles[role].observer else LockstepNode
+        node_type(service, session, rules, domain, role_gid(role)).run()
+    except RunAborted as aborted:
+        logging.getLogger(role).warning("run ended early: %s", aborted)
+        status = EXIT_FAILED
+    except KeyboardInterrupt:
+        status = EXIT_FAILED
+    except Exception:
+        logging.getLogger(role).exception("%s failed", role)
+        status = EXIT_FAILED
+    leave(session, status)
+
+
+def open_session() -> zenoh.Session:
+    """A zenoh session as the environment says."""
+    listen = [e for e in os.environ.get("PALPATE_LISTEN", "").split(",") if e]
+    connect = [e for e in os.environ.get("PALPATE_CONNECT", "").split(",") if e]
+    return zenoh.open(peer_config(listen, connect))
+
+
+def role_gid(role: str) -> bytes:
+    """16 bytes that identify a role's publishers in this process."""
+    return hashlib.sha256(f"{role} {os.getpid()}".encode()).digest()[:16]
+
+
+def leave(session: zenoh.Session | None, status: int) -> None:
+    """Ends the process at once: zenoh's own threads are not waited for."""
+    sys.stderr.flush()
+    sys.stdout.flush()
+    os._exit(status)

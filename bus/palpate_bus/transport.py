@@ -1,0 +1,123 @@
+"""zenoh publishers and subscriptions with rmw_zenoh's attachment, garbage counted and set aside.
+
+No callback computes: a received sample goes into a queue of its own, which the service's thread empties.
+"""
+
+from __future__ import annotations
+
+import json
+from queue import Empty, SimpleQueue
+from time import time_ns
+from typing import Any, NamedTuple
+
+import zenoh
+
+from palpate_bus.contract import Qos
+from palpate_bus.wire import AttachmentWriter, WireError, unpack
+
+HELLO = 0
+"""Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""
+
+
+class Sample(NamedTuple):
+    """What came in on a subscription."""
+
+    sequence: int
+    sent: int
+    """Wall time [ns] at which the sender handed it over."""
+    payload: bytes
+
+
+class Publisher:
+    """Sends on one key with the QoS of the contract."""
+
+    def __init__(self, session: zenoh.Session, key: str, qos: Qos, gid: bytes) -> None:
+        self.key = key
+        options: dict[str, Any] = {
+            "priority": getattr(zenoh.Priority, qos.priority),
+            "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),
+            "express": qos.express,
+            "reliability": getattr(zenoh.Reliability, qos.reliability),
+        }
+        if qos.transient_local:
+            self._publisher: Any = zenoh.ext.declare_advanced_publisher(
+                session, key, cache=zenoh.ext.CacheConfig(qos.depth), publisher_detection=True, **options
+            )
+        else:
+            self._publisher = session.declare_publisher(key, **options)
+        self._pack = AttachmentWriter(gid).pack
+
+    def put(self, payload: bytes, sequence: int) -> None:
+        """Sends a message."""
+        self._publisher.put(payload, attachment=self._pack(sequence, time_ns()))
+
+    def hello(self) -> None:
+        """Sends the empty message that tests the edge."""
+        self.put(b"", HELLO)
+
+    def close(self) -> None:
+        """Undeclares the publisher."""
+        self._publisher.undeclare()
+
+
+class Subscription:
+    """Receives on one key.
+
+    After its hello only the first sender's messages count: bytes without a valid attachment are counted in `garbage`, those of
+    another sender in `foreign`.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, history: bool = False) -> None:
+        """Subscribes. With `history`, what a latched topic sent before is delivered too."""
+        self.key = key
+        self.garbage = 0
+        self.foreign = 0
+        self.heard = False
+        self._gid: bytes | None = None
+        self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
+        if history:
+            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                session, key, handler, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            )
+        else:
+            self._subscriber = session.declare_subscriber(key, handler)
+
+    def get(self, timeout: float | None) -> Sample | None:
+        """The next message; None when `timeout` [s] passes without one. A timeout of 0 does not wait."""
+        while True:
+            try:
+                raw = self._queue.get(timeout=timeout) if timeout else self._queue.get_nowait()
+            except Empty:
+                return None
+            try:
+                sequence, sent, gid = unpack(raw.attachment.to_bytes())
+            except (WireError, AttributeError):
+                self.garbage += 1
+                continue
+            if gid != self._gid:
+                if self._gid is not None:
+                    self.foreign += 1
+                    continue
+                self._gid = gid
+            if sequence == HELLO:
+                self.heard = True
+                continue
+            return Sample(sequence, sent, raw.payload.to_bytes())
+
+    def close(self) -> None:
+        """Undeclares the subscriber."""
+        self._subscriber.undeclare()
+
+
+def peer_config(listen: list[str], connect: list[str]) -> zenoh.Config:
+    """A peer without multicast and gossip that listens and connects where it is told."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5("timestamping/enabled", "true")
+    config.insert_json5("connect/retry", '{"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}')
+    config.insert_json5("listen/endpoints", json.dumps(listen))
+    config.insert_json5("connect/endpoints", json.dumps(connect))
+    return config

@@ -1,0 +1,74 @@
+"""The conductor as a service: it gathers what the report needs. The same in every runtime."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from palpate_bus.messages import Clock
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import nanoseconds, time_message
+
+
+@dataclass
+class Collected:
+    """Messages of a run, oldest first, or the newest where only that counts."""
+
+    exam_states: list[Any] = field(default_factory=list)
+    indentation: list[Any] = field(default_factory=list)
+    samples: list[Any] = field(default_factory=list)
+    status_changes: list[Any] = field(default_factory=list)
+    phantom: Any | None = None
+    surface: Any | None = None
+    targets: Any | None = None
+    stiffness_map: Any | None = None
+    findings: Any | None = None
+
+    @property
+    def exam(self) -> Any | None:
+        """The newest exam state."""
+        return self.exam_states[-1] if self.exam_states else None
+
+    @property
+    def exam_time(self) -> int:
+        """Its simulated time [ns], -1 before the first."""
+        return nanoseconds(self.exam.header.stamp) if self.exam is not None else -1
+
+    @property
+    def end_tick(self) -> int | None:
+        """The simulated time [ns] at which the run ends, None while planning has not decided it."""
+        if self.exam is None or self.exam.end_tick < 0:
+            return None
+        return int(self.exam.end_tick)
+
+
+class Collector(Service):
+    """Role conductor."""
+
+    role = "conductor"
+
+    def __init__(self) -> None:
+        self.collected = Collected()
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Takes everything new and publishes the clock."""
+        c = self.collected
+        c.exam_states.extend(inbox.new("exam/state"))
+        c.indentation.extend(inbox.new("truth/indentation"))
+        c.samples.extend(inbox.new("assessment/samples"))
+        for status in inbox.new("robot/status"):
+            last = c.status_changes[-1] if c.status_changes else None
+            if last is None or (last.mode, last.cause) != (status.mode, status.cause):
+                c.status_changes.append(status)
+        c.phantom = inbox.latest("truth/phantom")
+        c.surface = inbox.latest("perception/surface")
+        c.targets = inbox.latest("perception/targets")
+        c.stiffness_map = inbox.latest("assessment/map")
+        c.findings = inbox.latest("assessment/findings")
+        return {"clock": Clock(time_message(t))}
+
+    def finish(self) -> Mapping[str, Any]:
+        """Nothing to close."""
+        return {"exam_states": len(self.collected.exam_states), "samples": len(self.collected.samples)}
+

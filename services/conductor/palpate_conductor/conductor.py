@@ -1,0 +1,293 @@
+"""The life of a distributed run: hello, grants, watch, end. No data passes through here.
+
+Simulated time may go as far as the conductor grants: at most `WINDOW` beyond the exam state it has seen, so that the end tick,
+which planning announces a second ahead, is never overrun; at most a second beyond what the recorder has written; and, in real
+time, not beyond the wall clock.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from time import monotonic, sleep
+from typing import Any
+
+import zenoh
+from palpate_bus import codec
+from palpate_bus.contract import MS, Contract
+from palpate_bus.lockstep import NEVER, run_hash
+from palpate_bus.messages import RunControl, ServiceReport
+from palpate_bus.observer import ObservedService
+from palpate_bus.stamps import NS
+from palpate_bus.transport import Publisher, Subscription
+from palpate_bus.wire import message_key
+
+from palpate_conductor.collector import Collector
+from palpate_conductor.watchdog import Watchdog
+
+log = logging.getLogger(__name__)
+
+WINDOW = 500 * MS
+"""Simulated time granted beyond the newest exam state; less than the second by which planning announces the end."""
+RECORDER_WINDOW = NS
+AFTER_LOSS = NS
+"""Simulated time that survivors run after a loss, so that the safe reaction is simulated and recorded."""
+POLL_S = 0.01
+REGRANT_S = 0.5
+OBSERVERS_FINISH_S = 60.0
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long the conductor waits [s], by wall clock."""
+
+    start: float = 90.0
+    """For every service to answer on every edge."""
+    soft: float = 5.0
+    """Without a finished tick before it says who blocks."""
+    hard: float = 120.0
+    """Without a finished tick before it ends the run."""
+
+
+@dataclass
+class Outcome:
+    """How a run went."""
+
+    digests: dict[str, str] = field(default_factory=dict)
+    reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    """What each service reported at its end: blame, counters, facts."""
+    first_tick_wall: float = 0.0
+    wall_time_s: float = 0.0
+    last_tick: int = NEVER
+    lost: dict[str, int] = field(default_factory=dict)
+    """Tick [ns] at which each lost service fell silent."""
+    failure: str | None = None
+    """Service and cause, None when the run completed."""
+
+    @property
+    def run_hash(self) -> str | None:
+        """The run hash, None for a run that did not complete."""
+        return None if self.failure else run_hash(self.digests)
+
+
+class RunFailed(RuntimeError):
+    """The run ended early. Names the service and the cause."""
+
+
+class Conductor:
+    """Conducts one distributed lockstep run of `roles` (observers among them)."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        rules: Contract,
+        domain: int,
+        roles: tuple[str, ...],
+        collector: Collector,
+        patience: Patience | None = None,
+        realtime: float | None = None,
+        limit: int | None = None,
+    ) -> None:
+        """`realtime` paces the run at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends."""
+        gid = b"palpate-conductr"
+        self._rules = rules
+        self._workers = tuple(role for role in roles if not rules.roles[role].observer)
+        self._observers = tuple(role for role in roles if rules.roles[role].observer)
+        self._roles = roles
+        self._collector = collector
+        self._observed = ObservedService(collector, session, rules, domain, gid, lossless=True)
+        self._patience = patience or Patience()
+        self._realtime = realtime
+        self._limit = limit
+        key = message_key("palpate/control", "palpation_msgs/msg/RunControl", domain)
+        self._control = Publisher(session, key, rules.qos["event"], gid)
+        self._encode = codec.encoder("palpation_msgs/msg/RunControl")
+        self._decode = codec.decoder("palpation_msgs/msg/ServiceReport")
+        self._reports = {
+            role: Subscription(session, message_key(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport", domain))
+            for role in roles
+        }
+        self._sequence = 0
+        self.watchdog = Watchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
+        self.outcome = Outcome()
+        self.horizon = NEVER
+        self.paused = False
+        self._last = False
+        self._granted_at = 0.0
+        self._started_at = 0.0
+        self._complained = False
+
+    # -- talking to the services
+
+    def _say(self, command: int, tick: int = 0, last: bool = False, role: str = "", reason: str = "") -> None:
+        self._sequence += 1
+        self._control.put(self._encode(RunControl(command, tick, last, role, reason)), self._sequence)
+
+    def _grant(self, tick: int, last: bool = False) -> None:
+        self.horizon = tick
+        self._last = last
+        self._granted_at = monotonic()
+        self._say(RunControl.GRANT, tick, last)
+
+    def abort(self, reason: str) -> None:
+        """Tells every service to stop at once."""
+        self._say(RunControl.ABORT, reason=reason)
+
+    def _heard(self) -> list[tuple[str, Any, dict[str, Any]]]:
+        """New reports: (role, message, detail)."""
+        heard = []
+        for role, subscription in self._reports.items():
+            while (sample := subscription.get(0)) is not None:
+                message = self._decode(sample.payload)
+                self.watchdog.report(role, int(message.tick), message.waiting_for)
+                heard.append((role, message, json.loads(message.detail) if message.detail else {}))
+        return heard
+
+    # -- the run
+
+    def run(
+        self,
+        died: Callable[[], Mapping[str, str]] = dict,
+        tell: Callable[[Conductor], None] = lambda _: None,
+    ) -> Outcome:
+        """Runs to the end. `died` gives the roles whose process is gone, with how; `tell` is called often, for progress.
+
+        Raises RunFailed when the run cannot start; later failures are in the outcome.
+        """
+        self._handshake(died)
+        self._started_at = monotonic()
+        self._grant(WINDOW - MS)
+        try:
+            self._conduct(died, tell)
+            self.outcome.wall_time_s = monotonic() - self._started_at
+            self._end(died)
+        except RunFailed as failure:
+            self.outcome.failure = self.outcome.failure or str(failure)
+            self.outcome.wall_time_s = monotonic() - self._started_at
+            self.abort(str(failure))
+        self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
+        self._observed.drain_and_step()
+        return self.outcome
+
+    def _handshake(self, died: Callable[[], Mapping[str, str]]) -> None:
+        ready: dict[str, list[str]] = {}
+        begin = monotonic()
+        while len(ready) < len(self._roles) or any(ready.values()):
+            self._say(RunControl.HELLO)
+            sleep(0.05)
+            for role, message, detail in self._heard():
+                if message.state == ServiceReport.FAILED:
+                    raise RunFailed(f"{role} failed at start: {detail.get('error')}")
+                ready[role] = detail.get("missing", [])
+            for role, how in died().items():
+                self.abort(f"{role} died at start")
+                raise RunFailed(f"{role} died at start: {how}")
+            if monotonic() - begin > self._patience.start:
+                silent = [role for role in self._roles if role not in ready]
+                deaf = "; ".join(f"{role} hears nothing on {', '.join(keys)}" for role, keys in ready.items() if keys)
+                self.abort("start timed out")
+                raise RunFailed(
+                    f"not ready after {self._patience.start:.0f} s: "
+                    + (f"no answer from {', '.join(silent)}. " if silent else "")
+                    + deaf
+                )
+
+    def _conduct(self, died: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
+        finished: set[str] = set()
+        while not finished >= set(self._workers) - self.outcome.lost.keys():
+            self._observed.drain_and_step()
+            for role, message, detail in self._heard():
+                if message.state == ServiceReport.FINISHED:
+                    finished.add(role)
+                    self._close(role, detail)
+                elif message.state == ServiceReport.FAILED:
+                    self._lose(role, detail.get("error", "unknown error"))
+            for role, how in died().items():
+                if role not in finished:
+                    self._lose(role, how)
+            self._extend()
+            self._watch()
+            tell(self)
+            sleep(POLL_S)
+
+    def _extend(self) -> None:
+        """Grants as much time as may be granted."""
+        if self._last:
+            if monotonic() - self._granted_at > REGRANT_S:
+                self._grant(self.horizon, last=True)
+            return
+        end = self._collector.collected.end_tick
+        if end is None and self._limit is not None and self._collector.collected.exam_time + WINDOW >= self._limit:
+            end = self._limit
+        tick = max(self._collector.collected.exam_time, 0) + WINDOW
+        for role in self._observers:
+            if role == "recorder" and role not in self.outcome.lost:
+                tick = min(tick, self.watchdog.progress[role].tick + RECORDER_WINDOW)
+        if self._realtime is not None:
+            tick = min(tick, int((monotonic() - self._started_at) * self._realtime * NS))
+        tick -= tick % MS
+        if self.paused:
+            self.watchdog.forgive()
+            tick = self.horizon
+        if end is not None and end <= max(tick, self.horizon):
+            if end < self.horizon:
+                raise RunFailed(f"planning announced the end at {end} ns after {self.horizon} ns had been granted")
+            self._grant(end, last=True)
+        elif tick > self.horizon or monotonic() - self._granted_at > REGRANT_S:
+            self._grant(max(tick, self.horizon))
+
+    def step(self, ticks: int = 1) -> None:
+        """Grants single ticks [ms] of a paused run."""
+        self._grant(self.horizon + ticks * MS)
+
+    def _watch(self) -> None:
+        stalled = self.watchdog.stalled_for()
+        if stalled > self._patience.hard:
+            role, sentence = self.watchdog.culprit()
+            raise RunFailed(f"{role} blocks the run for {stalled:.0f} s: {sentence}")
+        if stalled > self._patience.soft and not self._complained:
+            log.warning("no tick for %.0f s: %s", stalled, self.watchdog.culprit()[1])
+        self._complained = stalled > self._patience.soft
+
+    def _lose(self, role: str, how: str) -> None:
+        """Marks a role lost at its last reported tick, and lets the others react."""
+        if role in self.outcome.lost:
+            return
+        tick = max(self.watchdog.progress[role].tick, 0)
+        row = self._rules.roles[role]
+        self.outcome.lost[role] = tick
+        sentence = f"{role} lost at tick {tick / 1e9:.3f} s: {how}"
+        if row.observer:
+            log.warning("%s; the run goes on", sentence)
+            return
+        self.outcome.failure = self.outcome.failure or sentence
+        if row.critical:
+            raise RunFailed(sentence)
+        self._say(RunControl.LOST, tick, role=role, reason=how)
+        reached = max(progress.tick for progress in self.watchdog.progress.values())
+        self._grant(reached - reached % MS + AFTER_LOSS, last=True)
+
+    def _close(self, role: str, detail: dict[str, Any]) -> None:
+        self.outcome.reports[role] = detail
+        self.outcome.digests.update(detail.get("digests", {}))
+
+    def _end(self, died: Callable[[], Mapping[str, str]]) -> None:
+        """Lets the observers take in what is left and close their files."""
+        waiting = set(self._observers) - self.outcome.lost.keys()
+        begin = monotonic()
+        self._say(RunControl.END)
+        while waiting and monotonic() - begin < OBSERVERS_FINISH_S:
+            self._observed.drain_and_step()
+            for role, message, detail in self._heard():
+                if message.state == ServiceReport.FINISHED:
+                    waiting.discard(role)
+                    self._close(role, detail)
+            for role, how in died().items():
+                if role in waiting:
+                    waiting.discard(role)
+                    log.warning("%s died while closing: %s", role, how)
+            sleep(POLL_S)
+        for role in waiting:
+            log.warning("%s did not finish within %.0f s", role, OBSERVERS_FINISH_S)

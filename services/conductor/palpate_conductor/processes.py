@@ -1,0 +1,128 @@
+"""The process list: docker-compose.yml, read for local processes too, so that there is one list."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import yaml
+
+COMPOSE = "docker-compose.yml"
+
+
+class ProcessListError(ValueError):
+    """The compose file cannot be used. Names file, service and field."""
+
+
+@dataclass(frozen=True)
+class ServiceProcess:
+    """A service of the compose file: its role, command and environment."""
+
+    role: str
+    command: tuple[str, ...]
+    environment: Mapping[str, str]
+
+
+def compose_file() -> Path:
+    """The compose file: PALPATE_COMPOSE, else in the current folder, else in the checkout that holds this package.
+
+    Raises ProcessListError when there is none.
+    """
+    named = os.environ.get("PALPATE_COMPOSE")
+    candidates = [Path(named)] if named else [Path.cwd() / COMPOSE, *(p / COMPOSE for p in Path(__file__).resolve().parents)]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise ProcessListError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates[:2]))}. Set PALPATE_COMPOSE")
+
+
+def read_processes(path: Path, roles: tuple[str, ...]) -> dict[str, ServiceProcess]:
+    """The processes of `roles`, in that order. Raises ProcessListError naming what is missing or malformed."""
+    document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    services: dict[str, Any] = document.get("services", {})
+    found = {}
+    for role in roles:
+        service = services.get(role)
+        if service is None:
+            raise ProcessListError(f"{path}: no service {role!r}; it has {', '.join(services)}")
+        command = service.get("command")
+        if not isinstance(command, list) or not all(isinstance(word, str) for word in command):
+            raise ProcessListError(f"{path}: services.{role}.command = {command!r}: want a list of words")
+        environment = service.get("environment") or {}
+        if not isinstance(environment, dict):
+            raise ProcessListError(f"{path}: services.{role}.environment: want a mapping")
+        found[role] = ServiceProcess(role, tuple(command), {k: str(v) for k, v in environment.items()})
+    return found
+
+
+class LocalProcesses:
+    """Service processes on this machine, each with its log file; unix sockets in a folder of their own carry the bus."""
+
+    def __init__(self, out: Path, scenario_files: Mapping[str, Path], extra: Mapping[str, str]) -> None:
+        """`scenario_files` gives the scenario that each role may see."""
+        self._out = out
+        self._scenario_files = scenario_files
+        self._extra = dict(extra)
+        self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
+        self._endpoints: list[str] = []
+        self._logs: list[IO[bytes]] = []
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def endpoint(self, role: str) -> tuple[str, list[str]]:
+        """Where the next role listens, and to whom it connects: to all before it, so that all are linked."""
+        listen = f"unixsock-stream/{self._folder}/{role}"
+        connect = list(self._endpoints)
+        self._endpoints.append(listen)
+        return listen, connect
+
+    def start(self, process: ServiceProcess) -> None:
+        """Starts a service."""
+        listen, connect = self.endpoint(process.role)
+        environment = {
+            **os.environ,
+            **{k: v for k, v in process.environment.items() if not k.startswith("PALPATE_ROUTER")},
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONHASHSEED": "0",
+            "PALPATE_SCENARIO": str(self._scenario_files[process.role]),
+            "PALPATE_OUT": str(self._out),
+            "PALPATE_LISTEN": listen,
+            "PALPATE_CONNECT": ",".join(connect),
+            **self._extra,
+        }
+        log = (self._out / "logs" / f"{process.role}.log").open("wb")
+        self._logs.append(log)
+        command = [sys.executable if process.command[0] == "python" else process.command[0], *process.command[1:]]
+        self.running[process.role] = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+
+    def ended(self) -> dict[str, int]:
+        """Exit status of every process that has ended, by role; negative is a signal's number."""
+        return {role: code for role, child in self.running.items() if (code := child.poll()) is not None}
+
+    def log_tail(self, role: str, lines: int = 15) -> str:
+        """The last lines of a role's log."""
+        text = (self._out / "logs" / f"{role}.log").read_text(encoding="utf-8", errors="replace")
+        return "\n".join(text.splitlines()[-lines:])
+
+    def stop(self, patience_s: float = 5.0) -> None:
+        """Waits for the processes to leave, then ends those that are left; removes the sockets."""
+        for send in (None, signal.SIGTERM, signal.SIGKILL):
+            for child in self.running.values():
+                if send is not None and child.poll() is None:
+                    child.send_signal(send)
+            for child in self.running.values():
+                try:
+                    child.wait(timeout=patience_s)
+                except subprocess.TimeoutExpired:
+                    continue
+        for log in self._logs:
+            log.close()
+        shutil.rmtree(self._folder, ignore_errors=True)

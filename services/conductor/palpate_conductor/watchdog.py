@@ -1,0 +1,77 @@
+"""Who blocks whom: from what every service last said of itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import monotonic
+
+
+@dataclass
+class Progress:
+    """What one service last reported."""
+
+    tick: int = -1
+    """Last finished tick [ns]."""
+    waiting_for: str = ""
+    """Topic it waits for, `grant`, or empty."""
+    reported: float = field(default_factory=monotonic)
+    moved: float = field(default_factory=monotonic)
+    """When it last finished a tick, by the monotonic clock [s]."""
+
+
+class Watchdog:
+    """Keeps the progress of every service and names the one that holds the others up."""
+
+    def __init__(self, roles: tuple[str, ...], producers: dict[str, str]) -> None:
+        """`producers` gives the producing role of each topic."""
+        self.progress = {role: Progress() for role in roles}
+        self._producers = producers
+
+    def report(self, role: str, tick: int, waiting_for: str) -> None:
+        """Takes a report. A role that the run does not have is ignored."""
+        progress = self.progress.get(role)
+        if progress is None:
+            return
+        now = monotonic()
+        progress.reported = now
+        progress.waiting_for = waiting_for
+        if tick > progress.tick:
+            progress.tick = tick
+            progress.moved = now
+
+    def stalled_for(self) -> float:
+        """Seconds since any service finished a tick."""
+        return monotonic() - max(progress.moved for progress in self.progress.values())
+
+    def forgive(self) -> None:
+        """Starts the stall anew: while the run is paused nobody is to blame."""
+        now = monotonic()
+        for progress in self.progress.values():
+            progress.moved = now
+
+    def culprit(self) -> tuple[str, str]:
+        """The role that blocks, and a sentence that says whom.
+
+        Follows who-waits-for-whom from the slowest waiting service to one that waits for nobody; a circle is named as one.
+        """
+        waiting = {
+            role: self._producers[p.waiting_for]
+            for role, p in self.progress.items()
+            if p.waiting_for in self._producers and self._producers[p.waiting_for] in self.progress
+        }
+        if not waiting:
+            role = min(self.progress, key=lambda name: self.progress[name].moved)
+            return role, f"{role} has not finished a tick since {self.progress[role].tick / 1e9:.3f} s; nobody waits for it"
+        role = min(waiting, key=lambda name: self.progress[name].tick)
+        path = [role]
+        while path[-1] in waiting:
+            follower = waiting[path[-1]]
+            if follower in path:
+                return follower, f"circle of waiting: {' -> '.join([*path[path.index(follower):], follower])}"
+            path.append(follower)
+        culprit = path[-1]
+        blocked = sorted(name for name in waiting if name != culprit)
+        return culprit, (
+            f"{culprit} is at {self.progress[culprit].tick / 1e9:.3f} s and waits for nobody; "
+            f"{', '.join(f'{name} (for {self.progress[name].waiting_for})' for name in blocked)} wait"
+        )
