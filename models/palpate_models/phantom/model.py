@@ -1,0 +1,94 @@
+"""The phantom as arrays: rest surface, discrete Laplacian, stiffness with and without lesions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import robust_laplacian
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate_models.phantom.field import background_factor, lesion_field
+from palpate_models.phantom.mesh import boundary_vertices, load_mesh, vertex_normals
+from palpate_models.phantom.parametric import parametric_surface
+from palpate_models.scenario import Phantom
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+_POSTERIOR_M = 0.010
+"""Vertices of a user's mesh this close to its lowest point lie on the table and do not move."""
+
+
+@dataclass(frozen=True)
+class PhantomModel:
+    """A phantom at rest, in the abdomen frame A (origin at the umbilicus, x to the patient's left, y to the head, z outward)."""
+
+    vertices: Array
+    """Vertex positions at rest [m], shape (n, 3), in A."""
+    triangles: IntArray
+    """Vertex indices, shape (m, 3), counter-clockwise seen from outside."""
+    normals: Array
+    """Outward unit vertex normals, shape (n, 3), in A."""
+    areas: Array
+    """Area that belongs to each vertex [m^2], shape (n,)."""
+    laplacian: sparse.csr_array
+    """Positive semi-definite cotangent Laplacian [1], shape (n, n), of the intrinsic Delaunay triangulation: no edge pulls apart."""
+    stiffness: Array
+    """Instantaneous foundation modulus k_w [N/m^3], shape (n,), with lesions."""
+    background: Array
+    """The same without lesions, shape (n,)."""
+    lesion: IntArray
+    """Index of the lesion in whose half-contrast outline the vertex lies, -1 elsewhere, shape (n,)."""
+    fixed: NDArray[np.bool_]
+    """Vertices that do not move: the border of the examined body, and its back on the table; shape (n,)."""
+    breathing: Array
+    """Part of the breathing excursion at each vertex, 1 about the umbilicus, 0 where fixed; shape (n,)."""
+
+
+def quadrant(x: float, y: float) -> str:
+    """The quadrant of a point of the abdomen frame [m]: RUQ, LUQ, RLQ or LLQ. The patient's right is x < 0, lower is y < 0."""
+    return ("R" if x < 0 else "L") + ("L" if y < 0 else "U") + "Q"
+
+
+def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
+    """The phantom of a scenario. The same seed gives the same background, whatever the mesh or its resolution.
+
+    Raises MeshError if a user's mesh cannot be used.
+    """
+    if phantom.mesh is not None:
+        surface = load_mesh(Path(phantom.mesh), phantom.edge_m)
+        vertices, triangles = surface.vertices, surface.triangles
+        normals = vertex_normals(vertices, triangles)
+        fixed = boundary_vertices(len(vertices), triangles)
+        fixed |= vertices[:, 2] < vertices[:, 2].min() + _POSTERIOR_M
+    else:
+        shape = parametric_surface(phantom.size_m, phantom.edge_m)
+        vertices, triangles, normals, fixed = shape.vertices, shape.triangles, shape.normals, shape.fixed
+    laplacian, mass = robust_laplacian.mesh_laplacian(vertices, triangles)
+    laplacian = sparse.csr_array(laplacian)
+    laplacian.sort_indices()
+    half_length = float(np.ptp(vertices[:, 1])) / 2
+    background = phantom.stiffness.k_w_n_per_m3 * background_factor(vertices, phantom.background, half_length, seed)
+    contrast, lesion = lesion_field(vertices[:, :2], phantom.lesions, front=normals[:, 2] > 0)
+    return PhantomModel(
+        vertices=vertices,
+        triangles=triangles,
+        normals=normals,
+        areas=np.asarray(mass.diagonal(), dtype=np.float64),
+        laplacian=laplacian,
+        stiffness=background * contrast,
+        background=background,
+        lesion=lesion,
+        fixed=fixed,
+        breathing=_breathing_profile(vertices, normals, half_length, fixed),
+    )
+
+
+def _breathing_profile(vertices: Array, normals: Array, half_length: float, fixed: NDArray[np.bool_]) -> Array:
+    """Share of the excursion, shape (n,): greatest about the umbilicus, none at the ends, the flanks and the back."""
+    along = np.cos(np.clip(vertices[:, 1] / half_length, -1, 1) * np.pi / 2) ** 2
+    profile = along * np.clip(normals[:, 2], 0, 1) ** 2
+    return np.where(fixed, 0.0, profile)
