@@ -204,7 +204,8 @@ class OutputPort:
 class Stepper:
     """Drives one service: buffers in, step, ports out."""
 
-    def __init__(self, service: Service, contract: Contract) -> None:
+    def __init__(self, service: Service, contract: Contract, strict: bool = True) -> None:
+        """`strict` holds the service to a message on every tick of its periodic topics; observers are never held to it."""
         self.service = service
         self.role = contract.roles[service.role]
         self.buffers = {
@@ -215,7 +216,7 @@ class Stepper:
         self.blame = Blame()
         self.inbox = TickInbox(self.buffers, self.blame)
         self._all = tuple(self.buffers.values())
-        self._strict = not self.role.observer
+        self._strict = strict and not self.role.observer
         self._periodic = tuple(port for port in self.ports.values() if not (port.event or port.latched))
 
     def start(self) -> list[tuple[OutputPort, bytes]]:

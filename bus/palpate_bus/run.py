@@ -25,9 +25,20 @@ from palpate_bus.contract import contract
 from palpate_bus.distributed import LockstepNode, RunAborted
 from palpate_bus.observer import ObserverNode
 from palpate_bus.service import Service
-from palpate_bus.transport import peer_config
+from palpate_bus.transport import declare_alive, peer_config
+from palpate_bus.wallclock import WallClockNode
 
 EXIT_FAILED = 3
+RUNTIMES: dict[str, type[LockstepNode] | type[WallClockNode]] = {"lockstep": LockstepNode, "wallclock": WallClockNode}
+
+
+def runtime() -> str:
+    """The runtime that PALPATE_RUNTIME asks for, lockstep by default. Raises ValueError when it is none of ours."""
+    name = os.environ.get("PALPATE_RUNTIME", "lockstep")
+    if name not in RUNTIMES:
+        raise ValueError(f"PALPATE_RUNTIME={name!r}: want one of {', '.join(RUNTIMES)}")
+    return name
+
 
 
 def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]) -> None:
@@ -47,8 +58,11 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
         service = create(load(os.environ["PALPATE_SCENARIO"]))
         session = open_session()
-        node_type = ObserverNode if rules.roles[role].observer else LockstepNode
-        node_type(service, session, rules, domain, role_gid(role)).run()
+        node_type = ObserverNode if rules.roles[role].observer else RUNTIMES[runtime()]
+        node = node_type(service, session, rules, domain, role_gid(role))
+        token = declare_alive(session, domain, role)
+        node.run()
+        token.undeclare()
     except RunAborted as aborted:
         logging.getLogger(role).warning("run ended early: %s", aborted)
         status = EXIT_FAILED

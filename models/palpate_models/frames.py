@@ -19,6 +19,13 @@ def matrix(pose: Pose) -> Array:
     return X
 
 
+def pose_of(X: Array) -> Pose:
+    """The scenario pose of a homogeneous matrix, shape (4, 4): the inverse of `matrix`."""
+    roll, pitch, yaw = Rotation.from_matrix(X[:3, :3]).as_euler("xyz")
+    x, y, z = X[:3, 3]
+    return Pose(xyz_m=(float(x), float(y), float(z)), rpy_rad=(float(roll), float(pitch), float(yaw)))
+
+
 def inverse(X_AB: Array) -> Array:
     """X_BA, shape (4, 4)."""
     X_BA = np.eye(4)

@@ -7,11 +7,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from palpate_models.frames import matrix
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.frames import matrix, pose_of
+from palpate_models.scenario import ExamInput, Phantom, Registration, Scenario
 
 
 class ScenarioError(ValueError):
@@ -45,10 +46,7 @@ def _override(raw: dict[str, Any], setting: str) -> None:
     *parents, last = field.split(".")
     node: Any = raw
     for parent in parents:
-        if isinstance(node, list):
-            node = node[int(parent)]
-        else:
-            node = node.setdefault(parent, {})
+        node = node[int(parent)] if isinstance(node, list) else node.setdefault(parent, {})
         if not isinstance(node, dict | list):
             raise ScenarioError(f"--set {setting}: {parent!r} is a value, not a section")
     try:
@@ -90,6 +88,20 @@ def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = 
         return Scenario.model_validate(raw)
     except ValidationError as error:
         raise ScenarioError(_explain(name, error)) from error
+
+
+def redacted(scenario: Scenario) -> Scenario:
+    """The scenario without its phantom: all that roles other than tissue and scoring are given.
+
+    Of the phantom only the registered pose is left, with the registration error already in it.
+    """
+    registered = Registration(true=pose_of(np.asarray(exam_input(scenario).X_WA)))
+    return scenario.model_copy(update={"phantom": Phantom(pose=registered)})
+
+
+def dump_scenario(scenario: Scenario) -> str:
+    """The scenario as YAML with every field, which `load_scenario` reads back to an equal one."""
+    return str(yaml.safe_dump(scenario.model_dump(mode="json"), sort_keys=False, allow_unicode=True))
 
 
 def exam_input(scenario: Scenario) -> ExamInput:

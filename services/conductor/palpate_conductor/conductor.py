@@ -11,7 +11,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from time import monotonic, sleep
+from time import monotonic, perf_counter, sleep, time_ns
 from typing import Any
 
 import zenoh
@@ -21,7 +21,7 @@ from palpate_bus.lockstep import NEVER, run_hash
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.observer import ObservedService
 from palpate_bus.stamps import NS
-from palpate_bus.transport import Publisher, Subscription
+from palpate_bus.transport import AliveWatch, Publisher, Subscription
 from palpate_bus.wire import message_key
 
 from palpate_conductor.collector import Collector
@@ -35,6 +35,8 @@ RECORDER_WINDOW = NS
 AFTER_LOSS = NS
 """Simulated time that survivors run after a loss, so that the safe reaction is simulated and recorded."""
 POLL_S = 0.01
+WALLCLOCK_LEAD = 200 * MS
+"""Between the word to start and the common start [ns]."""
 REGRANT_S = 0.5
 OBSERVERS_FINISH_S = 60.0
 
@@ -89,8 +91,9 @@ class Conductor:
         patience: Patience | None = None,
         realtime: float | None = None,
         limit: int | None = None,
+        wallclock: bool = False,
     ) -> None:
-        """`realtime` paces the run at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends."""
+        """`wallclock`: the services run on their own timers, so nothing is granted but the common start and the end. `realtime` paces the run at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends."""
         gid = b"palpate-conductr"
         self._rules = rules
         self._workers = tuple(role for role in roles if not rules.roles[role].observer)
@@ -101,6 +104,8 @@ class Conductor:
         self._patience = patience or Patience()
         self._realtime = realtime
         self._limit = limit
+        self._wallclock = wallclock
+        self._epoch = 0
         key = message_key("palpate/control", "palpation_msgs/msg/RunControl", domain)
         self._control = Publisher(session, key, rules.qos["event"], gid)
         self._encode = codec.encoder("palpation_msgs/msg/RunControl")
@@ -109,6 +114,7 @@ class Conductor:
             role: Subscription(session, message_key(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport", domain))
             for role in roles
         }
+        self._alive = AliveWatch(session, domain)
         self._sequence = 0
         self.watchdog = Watchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = Outcome()
@@ -118,6 +124,12 @@ class Conductor:
         self._granted_at = 0.0
         self._started_at = 0.0
         self._complained = False
+        self.started_at_perf = 0.0
+
+    @property
+    def elapsed_s(self) -> float:
+        """Wall time [s] since the first tick was granted."""
+        return monotonic() - self._started_at if self._started_at else 0.0
 
     # -- talking to the services
 
@@ -158,7 +170,9 @@ class Conductor:
         """
         self._handshake(died)
         self._started_at = monotonic()
-        self._grant(WINDOW - MS)
+        self.started_at_perf = perf_counter()
+        self._epoch = time_ns() + WALLCLOCK_LEAD
+        self._grant(self._epoch if self._wallclock else WINDOW - MS)
         try:
             self._conduct(died, tell)
             self.outcome.wall_time_s = monotonic() - self._started_at
@@ -204,8 +218,8 @@ class Conductor:
                     self._close(role, detail)
                 elif message.state == ServiceReport.FAILED:
                     self._lose(role, detail.get("error", "unknown error"))
-            for role, how in died().items():
-                if role not in finished:
+            for role, how in {**dict.fromkeys(self._alive.gone(), "its connection is gone"), **died()}.items():
+                if role in self._roles and role not in finished:
                     self._lose(role, how)
             self._extend()
             self._watch()
@@ -214,6 +228,9 @@ class Conductor:
 
     def _extend(self) -> None:
         """Grants as much time as may be granted."""
+        if self._wallclock:
+            self._extend_wallclock()
+            return
         if self._last:
             if monotonic() - self._granted_at > REGRANT_S:
                 self._grant(self.horizon, last=True)
@@ -238,11 +255,20 @@ class Conductor:
         elif tick > self.horizon or monotonic() - self._granted_at > REGRANT_S:
             self._grant(max(tick, self.horizon))
 
+    def _extend_wallclock(self) -> None:
+        end = self._collector.collected.end_tick
+        if self._last or (end is None and monotonic() - self._granted_at > REGRANT_S):
+            self._grant(self.horizon, self._last)
+        elif end is not None:
+            self._grant(end, last=True)
+
     def step(self, ticks: int = 1) -> None:
         """Grants single ticks [ms] of a paused run."""
         self._grant(self.horizon + ticks * MS)
 
     def _watch(self) -> None:
+        if self._wallclock:
+            return
         stalled = self.watchdog.stalled_for()
         if stalled > self._patience.hard:
             role, sentence = self.watchdog.culprit()

@@ -1,0 +1,160 @@
+"""Wall clock: one service a process, each on its own timer, freshest sample wins. For hardware, and simulated hardware in real time.
+
+A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
+A late step is counted as an overrun and caught up; when a service is further behind than `RESYNC`, its clock is set anew and
+the jump is counted. Nothing waits for anybody. Expiry protects those who depend on a late sample.
+"""
+
+from __future__ import annotations
+
+import logging
+from time import monotonic_ns, perf_counter_ns, sleep, time_ns
+from typing import Any
+
+import zenoh
+
+from palpate_bus.contract import MS, Contract
+from palpate_bus.distributed import Link, RunAborted
+from palpate_bus.lockstep import NEVER, Received, Stepper
+from palpate_bus.messages import RunControl, ServiceReport
+from palpate_bus.service import Service
+from palpate_bus.transport import Publisher, Subscription
+from palpate_bus.wire import topic_key
+
+log = logging.getLogger(__name__)
+
+RESYNC = 200 * MS
+"""Lag [ns] beyond which a service gives up catching up."""
+HANDSHAKE_POLL_S = 0.02
+
+
+class WallClockNode:
+    """One service on its own timer."""
+
+    def __init__(self, service: Service, session: zenoh.Session, rules: Contract, domain: int, gid: bytes) -> None:
+        self._service = service
+        self._stepper = Stepper(service, rules, strict=False)
+        self._link = Link(session, service.role, rules, domain, gid)
+        self._publishers = {
+            name: Publisher(session, topic_key(port.topic, domain), rules.qos[port.topic.qos], gid)
+            for name, port in self._stepper.ports.items()
+        }
+        self._data = {
+            name: Subscription(session, topic_key(buffer.topic, domain), history=buffer.topic.latched)
+            for name, buffer in self._stepper.buffers.items()
+        }
+        self._sequences = dict.fromkeys(self._data, 0)
+        self.gaps = 0
+        self.overruns = 0
+        self.resyncs = 0
+        self._ages: dict[str, list[int]] = {name: [0, 0, 0] for name in self._data}
+        self._end: int | None = None
+        self._tick = NEVER
+
+    def run(self) -> None:
+        """Runs until the conductor ends the run."""
+        try:
+            epoch = self._await_start()
+            for port, payload in self._stepper.start():
+                self._publishers[port.topic.name].put(payload, port.sequence)
+            self._loop(epoch)
+            self._finish()
+        except RunAborted:
+            self._service.finish()
+            raise
+        except Exception as error:
+            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": f"{type(error).__name__}: {error}"})
+            raise
+
+    def _await_start(self) -> int:
+        """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns]."""
+        while True:
+            message = self._link.poll(HANDSHAKE_POLL_S)
+            for subscription in self._data.values():
+                while subscription.get(0) is not None:
+                    pass
+            if message is None:
+                continue
+            if message.command == RunControl.HELLO:
+                for publisher in self._publishers.values():
+                    publisher.hello()
+                missing = [
+                    name
+                    for name, buffer in self._stepper.buffers.items()
+                    if buffer.edge.blocking and not self._data[name].heard
+                ]
+                self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
+            elif message.command == RunControl.GRANT:
+                return monotonic_ns() + int(message.tick) - time_ns()
+
+    def _obey(self, message: Any) -> None:
+        if message.command == RunControl.LOST:
+            log.warning("%s lost: %s", message.role, message.reason)
+            self._stepper.inbox.lost_roles.add(message.role)
+        elif message.command == RunControl.GRANT and message.last:
+            self._end = int(message.tick)
+
+    def _loop(self, epoch: int) -> None:
+        period = self._stepper.role.period
+        t = 0
+        while self._end is None or t <= self._end:
+            due = epoch + t
+            now = monotonic_ns()
+            if now < due:
+                sleep((due - now) / 1e9)
+            elif now - due > period:
+                self.overruns += 1
+                if now - due > RESYNC:
+                    epoch = now - t
+                    self.resyncs += 1
+            self._receive(t)
+            sent = self._stepper.step(t)
+            start = perf_counter_ns()
+            for port, payload in sent:
+                self._publishers[port.topic.name].put(payload, port.sequence)
+            self._stepper.blame.send += perf_counter_ns() - start
+            self._tick = t
+            while (message := self._link.poll()) is not None:
+                self._obey(message)
+            self._link.progress(t)
+            t += period
+
+    def _receive(self, t: int) -> None:
+        now = time_ns()
+        for name, buffer in self._stepper.buffers.items():
+            data = self._data[name]
+            while (sample := data.get(0)) is not None:
+                last = self._sequences[name]
+                if sample.sequence <= last:
+                    continue
+                if sample.sequence > last + 1:
+                    self.gaps += sample.sequence - last - 1
+                self._sequences[name] = sample.sequence
+                age = self._ages[name]
+                age[0] += 1
+                age[1] += now - sample.sent
+                age[2] = max(age[2], now - sample.sent)
+                buffer.deliver(Received(sample.payload, t - buffer.delay, sample.sequence))
+
+    def _finish(self) -> None:
+        facts = dict(self._service.finish())
+        detail = {
+            "digests": {},
+            "blame": self._stepper.blame.per_step_us(),
+            "garbage": sum(s.garbage for s in self._data.values()) + self._link.garbage,
+            "foreign": sum(s.foreign for s in self._data.values()),
+            "gaps": self.gaps,
+            "overruns": self.overruns,
+            "resyncs": self.resyncs,
+            "age_ms": {
+                name: {"mean": round(total / count / 1e6, 3), "max": round(worst / 1e6, 3)}
+                for name, (count, total, worst) in self._ages.items()
+                if count
+            },
+            "facts": facts,
+        }
+        self._link.report(ServiceReport.FINISHED, self._tick, detail=detail)
+        while True:
+            message = self._link.poll(0.05)
+            if message is not None and message.command == RunControl.END:
+                return

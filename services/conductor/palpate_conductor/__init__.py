@@ -1,0 +1,1 @@
+"""Conducts a run: the `palpate` command, start, pacing, watchdog, scores and report."""

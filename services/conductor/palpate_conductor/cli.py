@@ -1,0 +1,131 @@
+"""The `palpate` command."""
+
+from __future__ import annotations
+
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from palpate_bus.contract import contract
+from palpate_models.load import ScenarioError, load_scenario, scenario_names
+from rich.console import Console
+from rich.table import Table
+
+from palpate_conductor.processes import ProcessListError
+from palpate_conductor.progress import RunDisplay
+from palpate_conductor.run import OBSERVERS, RunFailed, run_composed, run_distributed
+
+EXIT_BAD_INPUT = 2
+EXIT_FAILED = 3
+
+app = typer.Typer(
+    name="palpate",
+    help="Autonomous robotic palpation as a co-simulation of independent processes on an Eclipse zenoh bus.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_show_locals=False,
+)
+
+
+def _fail(console: Console, status: int, message: str) -> NoReturn:
+    console.print(f"[bold red]palpate:[/] {message}", highlight=False, soft_wrap=True)
+    raise typer.Exit(status)
+
+
+RUN_EXAMPLES = """
+[bold]Examples[/]
+
+  palpate run                                   the paper's case: guarding in the right lower quadrant
+
+  palpate run healthy --seed 3 --out results    another scenario, seed and folder
+
+  palpate run --set exam.pattern=raster --set exam.mode=point
+
+  palpate run my.yaml --composed                all services in one process, for sweeps and debugging
+"""
+
+
+@app.command(epilog=RUN_EXAMPLES)
+def run(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "rlq_guarding",
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; by default out/<scenario>-<time>.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
+    composed: Annotated[bool, typer.Option("--composed", help="All services in this process.")] = False,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
+    wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer, as with hardware.")] = False,
+    record: Annotated[bool, typer.Option(help="Write recording.rrd and the MCAP recording.")] = True,
+    settings: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
+) -> None:
+    """Run an examination and write report, map and recordings."""
+    console = Console(stderr=True)
+    try:
+        chosen = load_scenario(scenario, settings or (), seed)
+    except ScenarioError as error:
+        _fail(console, EXIT_BAD_INPUT, str(error))
+    if composed and (realtime or wallclock):
+        _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
+    folder = out or Path("out") / f"{chosen.name}-{datetime.now():%Y%m%d-%H%M%S}"
+    observers = OBSERVERS if record else ()
+    if not quiet:
+        console.print(f"[bold]{chosen.name}[/] seed {chosen.seed}, results in {folder}", highlight=False)
+    from palpate_conductor.results import print_findings, write_results
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with RunDisplay(console, quiet) as display:
+            if composed:
+                result = run_composed(chosen, folder.resolve(), display.tell, observers)
+            else:
+                pace = 1.0 if realtime else None
+                result = run_distributed(chosen, folder.resolve(), display.tell, observers, pace, wallclock)
+    except (ProcessListError, OSError) as error:
+        _fail(console, EXIT_BAD_INPUT, str(error))
+    except RunFailed as error:
+        _fail(console, EXIT_FAILED, str(error))
+    report = write_results(folder, chosen, result)
+    print_findings(Console(), report)
+    if result.failure:
+        _fail(console, EXIT_FAILED, f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+
+
+@app.command()
+def scenarios() -> None:
+    """List the scenarios that come with Palpate."""
+    table = Table("scenario", "lesions", "description", box=None)
+    for name in scenario_names():
+        scenario = load_scenario(name)
+        table.add_row(name, str(len(scenario.phantom.lesions)), scenario.description)
+    Console().print(table)
+
+
+@app.command()
+def topics() -> None:
+    """Show the contract: every topic with type, rate, who writes and who reads it."""
+    table = Table("topic", "type", "producer", "period", "QoS", "hashed", "readers", box=None)
+    for topic in contract().topics.values():
+        period = "latched" if topic.latched else f"{topic.period_ms} ms{' event' if topic.event else ''}"
+        readers = ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking)
+        name = topic.name if topic.visibility == "public" else f"{topic.name} [dim]({topic.visibility})[/]"
+        table.add_row(name, topic.type.replace("/msg/", "/"), topic.producer, period, topic.qos, "yes" if topic.hashed else "", readers)
+    Console(width=max(160, Console().width)).print(table)
+
+
+@app.command()
+def router(
+    listen: Annotated[str, typer.Option(help="Endpoint to listen on.")] = "tcp/127.0.0.1:7447",
+) -> None:
+    """Run a zenoh router for services in containers or on several machines."""
+    from palpate_bus.router import run_router
+
+    run_router([listen])
+
+
+def main() -> None:
+    """Entry point."""
+    try:
+        app()
+    except BrokenPipeError:
+        sys.exit(1)

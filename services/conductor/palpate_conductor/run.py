@@ -1,0 +1,202 @@
+"""One run from scenario to results folder, distributed or composed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import zenoh
+from palpate_bus.composed import Composed, ServiceFailed
+from palpate_bus.contract import contract
+from palpate_bus.observer import RawRecorder
+from palpate_bus.service import Service
+from palpate_bus.stamps import NS
+from palpate_bus.transport import peer_config
+from palpate_models.load import dump_scenario, redacted
+from palpate_models.scenario import Scenario
+
+from palpate_conductor.collector import Collected, Collector
+from palpate_conductor.conductor import Conductor, Patience, RunFailed
+from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
+
+WORKERS = ("robot", "tissue", "control", "planning", "assessment", "camera", "perception")
+OBSERVERS = ("dashboard", "recorder")
+KNOWS_PHANTOM = frozenset({"tissue"})
+SIM_LIMIT = 3600 * NS
+"""A run that nobody has ended by then [ns] is ended."""
+
+
+@dataclass
+class RunResult:
+    """What a run left, in memory."""
+
+    runtime: str
+    collected: Collected
+    run_hash: str | None
+    sim_time_s: float
+    wall_time_s: float
+    start_time_s: float
+    """From the command to the first tick."""
+    blame: dict[str, Any]
+    counters: dict[str, Any]
+    failure: str | None
+    """Service and cause; None when the run completed."""
+    lost: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a user wants to see while a run is on."""
+
+    t: int
+    """Simulated time [ns]."""
+    real_time_factor: float
+    collected: Collected
+
+
+Tell = Callable[[Progress], None]
+
+
+def prepare(scenario: Scenario, out: Path) -> dict[str, Path]:
+    """Makes the results folder and the scenario files; returns the file that each role may see."""
+    (out / "logs").mkdir(parents=True, exist_ok=True)
+    full, exam = out / "scenario.yaml", out / "exam.yaml"
+    full.write_text(dump_scenario(scenario), encoding="utf-8")
+    exam.write_text(dump_scenario(redacted(scenario)), encoding="utf-8")
+    return {role: full if role in KNOWS_PHANTOM else exam for role in (*WORKERS, *OBSERVERS)}
+
+
+def run_distributed(
+    scenario: Scenario,
+    out: Path,
+    tell: Tell,
+    observers: tuple[str, ...] = OBSERVERS,
+    realtime: float | None = None,
+    wallclock: bool = False,
+    patience: Patience | None = None,
+) -> RunResult:
+    """Starts the local processes of the compose file and conducts them to the end."""
+    begin = perf_counter()
+    roles = (*WORKERS, *observers)
+    files = prepare(scenario, out)
+    processes = read_processes(compose_file(), roles)
+    local = LocalProcesses(out, files, {"PALPATE_RUNTIME": "wallclock"} if wallclock else {})
+    collector = Collector()
+    try:
+        listen, connect = local.endpoint("conductor")
+        session = zenoh.open(peer_config([listen], connect))
+        domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
+        conductor = Conductor(
+            session, contract(), domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock=wallclock
+        )
+        for role in roles:
+            local.start(processes[role])
+
+        def died() -> Mapping[str, str]:
+            return {role: _how(code) for role, code in local.ended().items()}
+
+        def report(c: Conductor) -> None:
+            wall = max(c.elapsed_s, 1e-9)
+            t = max(collector.collected.exam_time, 0)
+            tell(Progress(t, t / NS / wall, collector.collected))
+
+        try:
+            outcome = conductor.run(died, report)
+            failure = outcome.failure
+        except RunFailed as error:
+            outcome = conductor.outcome
+            failure = str(error)
+        start_time = conductor.started_at_perf - begin if conductor.started_at_perf else perf_counter() - begin
+    finally:
+        local.stop()
+    return RunResult(
+        runtime="wallclock" if wallclock else "distributed",
+        collected=collector.collected,
+        run_hash=None if wallclock else outcome.run_hash,
+        sim_time_s=max(outcome.last_tick, 0) / NS,
+        wall_time_s=outcome.wall_time_s,
+        start_time_s=start_time,
+        blame={role: detail.get("blame") for role, detail in outcome.reports.items()},
+        counters={
+            role: {key: value for key, value in detail.items() if key not in ("blame", "digests")}
+            for role, detail in outcome.reports.items()
+        },
+        failure=failure,
+        lost=outcome.lost,
+    )
+
+
+def _how(code: int) -> str:
+    return f"killed by signal {-code}" if code < 0 else f"left with status {code}"
+
+
+def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
+    """The services of `roles` in this process, from the entry points `palpate.services`.
+
+    Raises RunFailed naming a role that no installed package provides.
+    """
+    found = {point.name: point for point in entry_points(group="palpate.services")}
+    exam = redacted(scenario)
+    services = []
+    for role in roles:
+        if role not in found:
+            raise RunFailed(f"no installed package provides the service {role!r} (entry point palpate.services)")
+        create: Callable[[Scenario], Service] = found[role].load()
+        services.append(create(scenario if role in KNOWS_PHANTOM else exam))
+    return services
+
+
+def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
+    """Runs all services in this process."""
+    begin = perf_counter()
+    prepare(scenario, out)
+    os.environ["PALPATE_OUT"] = str(out)
+    collector = Collector()
+    observing = load_services(scenario, observers)
+    recorders = [service for service in observing if isinstance(service, RawRecorder)]
+    viewers = [service for service in observing if service not in recorders]
+    run = Composed(
+        [*load_services(scenario, WORKERS), *viewers, collector], taps=[recorder.record for recorder in recorders]
+    )
+    start = perf_counter()
+    failure = None
+    last = 0
+    told = start
+
+    def end() -> int | None:
+        nonlocal told
+        now = perf_counter()
+        if now - told > 0.1:
+            told = now
+            tell(Progress(run.t, run.t / NS / (now - start), collector.collected))
+        return collector.collected.end_tick
+
+    lost: dict[str, int] = {}
+    try:
+        last = run.run(end, SIM_LIMIT)
+    except ServiceFailed as error:
+        failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.__cause__}"
+        lost = {error.role: error.t}
+        last = error.t
+    wall = perf_counter() - start
+    facts = run.finish()
+    for recorder in recorders:
+        if isinstance(recorder, Service):
+            facts[recorder.role] = recorder.finish()
+    return RunResult(
+        runtime="composed",
+        collected=collector.collected,
+        run_hash=None if failure else run.run_hash(),
+        sim_time_s=last / NS,
+        wall_time_s=wall,
+        start_time_s=start - begin,
+        blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
+        counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
+        failure=failure,
+        lost=lost,
+    )
