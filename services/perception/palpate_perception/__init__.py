@@ -1,0 +1,1 @@
+"""Role perception: depth frames to a smooth surface and ordered palpation targets."""

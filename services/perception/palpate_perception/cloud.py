@@ -1,0 +1,135 @@
+"""Steps 1 to 3 of the paper's point-cloud processing: to world, invalid points out, region of interest.
+
+Frames: C is the camera's optical frame (x right, y down, z forward), W world, A the abdomen's registered frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.frames import apply, inverse
+from palpate_models.scenario import Exam
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+Array = NDArray[np.float64]
+
+JUMP: Final = 0.015
+"""Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth: 16 mm at 1.1 m,
+more than a surface seen at 75 deg and less than from the arm to the skin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """n points with the pixels that they come from."""
+
+    p_W: Array
+    """Positions [m] in world, shape (n, 3)."""
+    sigma: Array
+    """Standard deviation along the viewing ray [m], shape (n,)."""
+    pixel: NDArray[np.intp]
+    """Row and column in the fused window, shape (n, 2)."""
+
+    def where(self, keep: NDArray[np.bool_]) -> Cloud:
+        """The points of a mask, shape (n,)."""
+        return Cloud(self.p_W[keep], self.sigma[keep], self.pixel[keep])
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """The region of interest with its margin: an axis-aligned box in A [m]."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, exam: Exam, margin: float, z: tuple[float, float]) -> Box:
+        """The exam's region, wider by `margin` [m] on each side, between the heights `z` [m]."""
+        (cx, cy), (width, height) = exam.centre_m, exam.region_m
+        half_x, half_y = width / 2 + margin, height / 2 + margin
+        return cls((cx - half_x, cy - half_y, z[0]), (cx + half_x, cy + half_y, z[1]))
+
+    @property
+    def corners(self) -> Array:
+        """Corners in A, shape (8, 3)."""
+        grid = np.meshgrid(*zip(self.low, self.high, strict=True), indexing="ij")
+        return np.stack([axis.ravel() for axis in grid], axis=1)
+
+    def holds(self, p_A: Array) -> NDArray[np.bool_]:
+        """Which points in A, shape (n, 3), lie in the box."""
+        return np.asarray(np.all((p_A >= self.low) & (p_A <= self.high), axis=1))
+
+
+def deproject(depth: Array, K: Array, origin: tuple[int, int] = (0, 0)) -> Array:
+    """Points in C [m], shape (height, width, 3), of a depth image [m]; NaN where it is.
+
+    K: intrinsics, shape (3, 3). `origin`: row and column of the image's first pixel in the full image.
+    """
+    rows, columns = np.indices(depth.shape)
+    x = (columns + origin[1] - K[0, 2]) / K[0, 0]
+    y = (rows + origin[0] - K[1, 2]) / K[1, 1]
+    return np.stack((x * depth, y * depth, depth), axis=-1)
+
+
+def project(p_C: Array, K: Array) -> tuple[Array, Array]:
+    """Pixel coordinates u, v, shapes (n,), of points in C, shape (n, 3), in front of the camera."""
+    return K[0, 0] * p_C[:, 0] / p_C[:, 2] + K[0, 2], K[1, 1] * p_C[:, 1] / p_C[:, 2] + K[1, 2]
+
+
+def window(box: Box, X_CA: Array, K: Array, shape: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of the image that can see the box; empty slices when none can.
+
+    The whole image when a corner is behind the camera.
+    """
+    p_C = apply(X_CA, box.corners)
+    if p_C[:, 2].min() < 0.01:
+        return slice(0, shape[0]), slice(0, shape[1])
+    u, v = project(p_C, K)
+    rows, columns = (
+        (min(max(int(np.floor(x.min())), 0), n), min(max(int(np.ceil(x.max())) + 1, 0), n))
+        for x, n in zip((v, u), shape, strict=True)
+    )
+    return slice(*rows), slice(*columns)
+
+
+def to_world(p_C: Array, sigma: Array, X_WC: Array) -> Cloud:
+    """Step 1: organised points in C, shape (height, width, 3), as a cloud in world, invalid points still in."""
+    pixel = np.argwhere(np.ones(sigma.shape, np.bool_))
+    return Cloud(apply(X_WC, p_C.reshape(-1, 3)), sigma.ravel(), pixel)
+
+
+def remove_invalid(cloud: Cloud) -> Cloud:
+    """Step 2: without points that have no depth."""
+    return cloud.where(np.isfinite(cloud.p_W).all(axis=1))
+
+
+def crop(cloud: Cloud, X_WA: Array, box: Box, floor_m: float) -> Cloud:
+    """Step 3: the points in the box and above the height `floor_m` in world (the table's top, with its noise)."""
+    inside = box.holds(apply(inverse(X_WA), cloud.p_W))
+    return cloud.where(np.asarray(inside & (cloud.p_W[:, 2] > floor_m)))
+
+
+def main_sheet(cloud: Cloud, depth: Array, inside: NDArray[np.bool_]) -> Cloud:
+    """Step 3, its end: of the sheets into which depth jumps part the cloud, that with most points `inside`.
+
+    What hovers above the skin (arm, tool, stray pixels) is on other sheets. `depth`: the fused window [m]; `inside`:
+    mask of the points in the region without its margin, shape (n,).
+    """
+    n = len(cloud.p_W)
+    if n == 0:
+        return cloud
+    index = np.full(depth.shape, -1)
+    index[cloud.pixel[:, 0], cloud.pixel[:, 1]] = np.arange(n)
+    pairs = []
+    for a, b, za, zb in (
+        (index[1:], index[:-1], depth[1:], depth[:-1]),
+        (index[:, 1:], index[:, :-1], depth[:, 1:], depth[:, :-1]),
+    ):
+        joined = (a >= 0) & (b >= 0) & (np.abs(za - zb) < JUMP * za)
+        pairs.append((a[joined], b[joined]))
+    a, b = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    _, sheet = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
+    return cloud.where(np.equal(sheet, np.argmax(np.bincount(sheet, weights=inside.astype(np.float64)))))

@@ -1,0 +1,165 @@
+"""From a fused depth image to a surface and palpation targets: the paper's five steps (section III.A), in its order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.frames import apply, inverse
+from palpate_models.scenario import Exam
+from palpate_models.table import TABLE_TOP_M
+
+from palpate_perception import cloud, pattern, surface, visibility
+from palpate_perception.cloud import Array, Box, Cloud
+from palpate_perception.fusion import DepthFusion
+
+MARGIN_M: Final = 0.03
+"""The cloud is cropped this much wider than the region, so that the surface at its edge has data on both sides."""
+MESH_MARGIN_M: Final = 0.025
+"""The surface mesh reaches this much further than the region."""
+MESH_STEP_M: Final = 0.005
+HEIGHT_M: Final = (-0.16, 0.06)
+"""Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""
+TABLE_CLEARANCE_M: Final = 0.02
+"""Points this near to the table's top are the table."""
+MIN_COVERAGE: Final = 0.95
+"""With less of the region in view there are no targets."""
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """What camera_info and tf_static say."""
+
+    K: Array
+    """Shape (3, 3), in pixels."""
+    X_WC: Array
+    """Calibrated pose of the optical frame in world, shape (4, 4)."""
+    shape: tuple[int, int]
+    """Height and width of the full image."""
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """Palpation points in the order in which they are visited."""
+
+    p_W: Array
+    """Positions [m], shape (n, 3)."""
+    n_W: Array
+    """Outward unit normals, shape (n, 3)."""
+    line: NDArray[np.uint32]
+    """Index of the scan line, shape (n,)."""
+
+    @classmethod
+    def none(cls) -> Targets:
+        """No target."""
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.uint32))
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """The perceived surface, in world."""
+
+    p_W: Array
+    """Vertices [m], shape (n, 3)."""
+    n_W: Array
+    """Outward unit normals, shape (n, 3)."""
+    triangles: NDArray[np.uint32]
+    """Counter-clockwise from outside, shape (m, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Perceived:
+    """All that a burst of frames tells."""
+
+    cloud: Cloud
+    mesh: Mesh | None
+    """None when too little was seen."""
+    targets: Targets
+    sigma: float
+    """Standard deviation [m] of the surface in the region, as the fit estimates it (noise; no calibration error)."""
+    frames: int
+    coverage: float
+    """Part of the region of interest that was seen."""
+    message: str
+    """What is wrong, in words; empty when all is well."""
+
+
+class Pipeline:
+    """Perceives one region of interest."""
+
+    def __init__(self, exam: Exam, X_WA: Array) -> None:
+        """`X_WA`: registered pose of the abdomen in world, shape (4, 4)."""
+        self._exam = exam
+        self._X_WA, self._X_AW = X_WA, inverse(X_WA)
+        self._box = Box.of(exam, MARGIN_M, HEIGHT_M)
+        self._region = Box.of(exam, 0.0, HEIGHT_M)
+
+    def fusion(self, camera: Intrinsics) -> DepthFusion:
+        """An empty fusion of the part of the image that sees the region."""
+        X_CA = inverse(camera.X_WC) @ self._X_WA
+        return DepthFusion(cloud.window(self._box, X_CA, camera.K, camera.shape))
+
+    def perceive(self, fusion: DepthFusion, camera: Intrinsics) -> Perceived:
+        """Runs the five steps on the fused frames."""
+        fused = fusion.fused()
+        origin = (fusion.window[0].start, fusion.window[1].start)
+        depth = np.asarray(fused.depth, np.float64)
+
+        organised = cloud.deproject(depth, camera.K, origin)
+        points = cloud.to_world(organised, np.asarray(fused.sigma, np.float64), camera.X_WC)  # 1
+        points = cloud.remove_invalid(points)  # 2
+        points = cloud.crop(points, self._X_WA, self._box, TABLE_TOP_M + TABLE_CLEARANCE_M)  # 3
+        points = cloud.main_sheet(points, depth, self._region.holds(apply(self._X_AW, points.p_W)))
+        p_A = apply(self._X_AW, points.p_W)
+
+        seen = visibility.seen(p_A, self._exam)
+        coverage = float(np.mean(seen))
+        if coverage < MIN_COVERAGE:
+            missing, _ = visibility.cells(self._exam)
+            missing = missing[~seen]
+            missing = np.column_stack((missing, visibility.quadric(p_A, missing)))
+            X_CA = inverse(camera.X_WC) @ self._X_WA
+            why = visibility.explain(missing, len(seen), X_CA, camera.K, depth, origin, camera.shape)
+            message = f"{100 * coverage:.0f} % of the region of interest seen, {100 * MIN_COVERAGE:.0f} % needed: {why}"
+            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
+
+        field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
+        x, y = pattern.lattice(self._exam)
+        nodes, known = pattern.downsample(p_A, x, y)  # 4
+        sequence = pattern.order(len(x), len(y), self._exam.pattern)  # 5
+        p_W, n_W = self._on(field, nodes[sequence])
+        targets = Targets(p_W, n_W, (sequence // len(y)).astype(np.uint32))
+        guessed = int(np.count_nonzero(~known))
+        message = f"{guessed} of {len(nodes)} targets lie in small gaps and are interpolated" if guessed else ""
+        sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2)))
+        return Perceived(points, self._mesh(field, p_A), targets, sigma, fused.frames, coverage, message)
+
+    def _on(self, field: surface.HeightField, xy: Array) -> tuple[Array, Array]:
+        """Positions and normals in world of the surface at `xy` in A, shape (n, 2)."""
+        p_A = np.column_stack((xy, field.height(xy[:, 0], xy[:, 1])))
+        return apply(self._X_WA, p_A), field.normal(xy[:, 0], xy[:, 1]) @ self._X_WA[:3, :3].T
+
+    def _mesh(self, field: surface.HeightField, p_A: Array) -> Mesh:
+        """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
+        (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
+        x = pattern.stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        y = pattern.stations(cy, height + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        nodes, known = pattern.downsample(p_A, x, y)
+        keep = _grown(known.reshape(len(x), len(y)), 2).ravel()
+        index = np.arange(len(nodes)).reshape(len(x), len(y))
+        a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+        triangles = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
+        triangles = triangles[keep[triangles].all(axis=1)]
+        new = np.cumsum(keep) - 1
+        p_W, n_W = self._on(field, nodes[keep])
+        return Mesh(p_W, n_W, new[triangles].astype(np.uint32))
+
+
+def _grown(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
+    """A mask of the grid, wider by some cells in each direction."""
+    for _ in range(cells):
+        padded = np.pad(mask, 1)
+        mask = padded[1:-1, 1:-1] | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+    return mask

@@ -1,0 +1,136 @@
+"""A smooth surface through a noisy point cloud: a height field z(x, y) in A by penalised cubic splines.
+
+    minimise  sum_i w_i (z_i - s(x_i, y_i))^2 + lambda E(s),   E = int s_xxx^2 + 3 s_xxy^2 + 3 s_xyy^2 + s_yyy^2
+
+with s a tensor product of cubic B-splines (C^2), w_i = 1/sigma_i^2 and Tukey's biweight against stray points. E does
+not see quadratics, so curvature is not smoothed away. On evenly spread data of density rho (sum of w per m^2) the fit
+passes a wave of length L with gain 1 / (1 + lambda (2 pi / L)^6 / rho) (Eilers & Marx 1996; Wahba 1990), so lambda is
+set by the length at which the gain is one half, which does not depend on noise or range.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
+
+Array = NDArray[np.float64]
+
+CUTOFF_M: Final = 0.04
+"""Wave length that passes with half its amplitude: wider waves are shape, narrower ones noise."""
+KNOTS_PER_CUTOFF: Final = 3
+DEGREE: Final = 3
+TUKEY: Final = 4.685
+"""Tukey's biweight for 95 % efficiency."""
+ROUNDS: Final = 3
+
+
+class Axis:
+    """Cubic B-splines on one axis, with knots evenly spread over [low, high] [m]."""
+
+    def __init__(self, low: float, high: float, spacing: float) -> None:
+        self.low, self.high = low, high
+        pieces = max(int(np.ceil((high - low) / spacing)), 1)
+        self.step = (high - low) / pieces
+        self.knots = low + self.step * np.arange(-DEGREE, pieces + DEGREE + 1)
+        self.size = pieces + DEGREE
+        self._splines = BSpline(self.knots, np.eye(self.size), DEGREE)
+
+    def values(self, x: Array, derivative: int = 0) -> Array:
+        """Basis functions (or a derivative) at `x` [m], shape (n, size)."""
+        clipped = np.clip(x, self.low, self.high)
+        return np.asarray(self._splines(clipped, nu=derivative), np.float64)
+
+    def local(self, x: Array) -> tuple[Array, NDArray[np.intp]]:
+        """The DEGREE + 1 basis functions that are not zero at `x`, and their indices, shapes (n, DEGREE + 1)."""
+        rows = BSpline.design_matrix(np.clip(x, self.low, self.high), self.knots, DEGREE)
+        return rows.data.reshape(-1, DEGREE + 1), rows.indices.reshape(-1, DEGREE + 1).astype(np.intp)
+
+    def gram(self, derivative: int) -> Array:
+        """Int b_i^(d) b_j^(d) dx, shape (size, size), exact by Gauss-Legendre quadrature."""
+        node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
+        left = self.knots[DEGREE : -DEGREE - 1]
+        x = (left[:, np.newaxis] + self.step * (node + 1) / 2).ravel()
+        b = self.values(x, derivative)
+        return np.asarray(b.T @ (np.tile(weight * self.step / 2, len(left))[:, np.newaxis] * b))
+
+
+@dataclass(frozen=True, slots=True)
+class HeightField:
+    """A fitted surface z = s(x, y) in A, with its covariance."""
+
+    x: Axis
+    y: Axis
+    coefficients: Array
+    """Shape (x.size, y.size)."""
+    factor: Any
+    """Cholesky factor of the normal matrix."""
+    scale: float
+    """Standard deviation of the residuals over the one assumed."""
+
+    def height(self, x: Array, y: Array) -> Array:
+        """Z [m] at points, shapes (n,). Outside the fitted rectangle: the value at its nearest point."""
+        return self._evaluate(x, y, 0, 0)
+
+    def normal(self, x: Array, y: Array) -> Array:
+        """Outward (towards +z) unit normals in A, shape (n, 3)."""
+        n = np.stack((-self._evaluate(x, y, 1, 0), -self._evaluate(x, y, 0, 1), np.ones(len(x))), axis=1)
+        return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True))
+
+    def sigma(self, x: Array, y: Array) -> Array:
+        """Standard deviation [m] of the height at points, shape (n,): the posterior of the smoothing spline (Wahba)."""
+        rows = np.einsum("ni,nj->nij", self.x.values(x), self.y.values(y)).reshape(len(x), -1)
+        return np.asarray(self.scale * np.sqrt(np.einsum("nm,mn->n", rows, cho_solve(self.factor, rows.T))))
+
+    def _evaluate(self, x: Array, y: Array, nu_x: int, nu_y: int) -> Array:
+        return np.asarray(
+            np.einsum("ni,ij,nj->n", self.x.values(x, nu_x), self.coefficients, self.y.values(y, nu_y), optimize=True)
+        )
+
+
+def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, float]) -> HeightField:
+    """Fits points in A, shape (n, 3), of standard deviation `sigma` [m], shape (n,), over the rectangle low to high.
+
+    Raises ValueError when there are fewer than ten points.
+    """
+    if len(p) < 10:
+        raise ValueError(f"surface fit: {len(p)} points, want at least 10")
+    x, y = (Axis(a, b, CUTOFF_M / KNOTS_PER_CUTOFF) for a, b in zip(low, high, strict=True))
+    rows = _rows(x, y, p)
+    weight = 1 / sigma**2
+    area = (high[0] - low[0]) * (high[1] - low[1])
+    penalty = _energy(x, y) * (CUTOFF_M / (2 * np.pi)) ** 6 / area
+    level = float(np.median(p[:, 2]))
+    scale, robust = 1.0, np.ones(len(p))
+    for _ in range(ROUNDS):
+        w = weight * robust
+        weighted = rows.multiply(w[:, np.newaxis]).tocsr()
+        normal = (rows.T @ weighted).toarray() + w.sum() * penalty
+        # Corners that no datum constrains: a ridge of 1e-9 keeps the matrix definite, without a visible effect.
+        normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal) / len(normal)
+        factor = cho_factor(normal)
+        c = cho_solve(factor, weighted.T @ (p[:, 2] - level))
+        residual = (p[:, 2] - level - rows @ c) / sigma
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+        robust = np.clip(1 - (residual / (TUKEY * scale)) ** 2, 0, None) ** 2
+    return HeightField(x, y, c.reshape(x.size, y.size) + level, factor, scale)  # B-splines sum to one
+
+
+def _rows(x: Axis, y: Axis, p: Array) -> csr_array[Any]:
+    """Tensor-product basis at the points, sparse, shape (n, x.size * y.size)."""
+    (bx, ix), (by, iy) = x.local(p[:, 0]), y.local(p[:, 1])
+    data = np.einsum("ni,nj->nij", bx, by).ravel()
+    column = (ix[:, :, np.newaxis] * y.size + iy[:, np.newaxis, :]).ravel()
+    start = np.arange(len(p) + 1) * (DEGREE + 1) ** 2
+    return csr_array((data, column, start), shape=(len(p), x.size * y.size))
+
+
+def _energy(x: Axis, y: Axis) -> Array:
+    """Matrix of E, shape (x.size * y.size, the same)."""
+    gx, gy = ([axis.gram(d) for d in range(4)] for axis in (x, y))
+    return np.asarray(sum(k * np.kron(gx[3 - d], gy[d]) for d, k in enumerate((1.0, 3.0, 3.0, 1.0))))
