@@ -197,13 +197,17 @@ def _arm_joint(i: int, robot: Robot) -> str:
     return _joint(JOINT_NAMES[i], "revolute", LINK_NAMES[i], LINK_NAMES[i + 1], JOINT_ORIGIN[i], extra=extra)
 
 
-def urdf(robot: Robot) -> str:
-    """The robot as URDF text: link `world` (W), the base fixed to it, the arm, the tool. It refers to no file."""
+def urdf(robot: Robot, *, geometry: bool = True) -> str:
+    """The robot as URDF text: link `world` (W), the base fixed to it, the arm, the tool. It refers to no file.
+
+    `geometry=False` leaves out visual and collision shapes.
+    """
     inertia, shapes = inertias(robot), capsules(robot)
     parts = ['<robot name="lbr">', '<link name="world"/>']
     for link in LINK_NAMES:
-        geometry = "".join(_geometry("visual", c) + _geometry("collision", c) for c in shapes[link])
-        parts.append(f'<link name="{link}">{_inertial(inertia[link])}{geometry}</link>')
+        seen = shapes[link] if geometry else ()
+        primitives = "".join(_geometry(tag, capsule) for tag in ("visual", "collision") for capsule in seen)
+        parts.append(f'<link name="{link}">{_inertial(inertia[link])}{primitives}</link>')
     base = (*robot.base_xy_m, robot.base_height_m)
     parts.append(_joint("lbr_base", "fixed", "world", LINK_NAMES[0], base, (0.0, 0.0, robot.base_yaw_rad)))
     parts += [_arm_joint(i, robot) for i in range(7)]

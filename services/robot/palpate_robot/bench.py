@@ -1,0 +1,85 @@
+"""What a step costs: `python -m palpate_robot.bench`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from palpate_bus.codec import Message, message_type
+from palpate_bus.service import Inbox
+from palpate_bus.stamps import duration_message, header
+from palpate_models import lbr
+from palpate_models.scenario import Scenario
+
+from palpate_robot.plant import Plant
+from palpate_robot.service import create
+
+_MS = 1_000_000
+_ROUNDS = 7
+
+
+class _Fed(Inbox):
+    """An inbox with a fresh command and contact wrench at every tick."""
+
+    def __init__(self) -> None:
+        self.messages: dict[str, Message] = {}
+
+    def latest(self, topic: str) -> Message | None:
+        return self.messages.get(topic)
+
+    def new(self, topic: str) -> Sequence[Message]:
+        return ()
+
+    def stamp(self, topic: str) -> int | None:
+        return None
+
+    def lost(self, role: str) -> bool:
+        return False
+
+
+def _best_us(run: Callable[[], None], count: int) -> float:
+    """Microseconds a call: the median round of several, each of `count` calls."""
+    rounds = []
+    for _ in range(_ROUNDS):
+        begin = perf_counter()
+        for _ in range(count):
+            run()
+        rounds.append((perf_counter() - begin) / count * 1e6)
+    return float(np.median(rounds))
+
+
+def measure(steps: int = 2000) -> dict[str, float]:
+    """Microseconds a millisecond step: of the plant alone, and of the whole service, under command and in contact."""
+    scenario = Scenario()
+    plant = Plant(scenario.robot)
+    force, moment = np.array([0.0, 0.0, 2.5]), np.zeros(3)
+
+    def plant_step() -> None:
+        plant.step(plant.gravity_torque(), force, moment)
+
+    service = create(scenario)
+    inbox = _Fed()
+    command: Any = message_type("palpation_msgs/msg/JointTorqueCommand")
+    wrench: Any = message_type("geometry_msgs/msg/WrenchStamped")
+    parts: Any = message_type("geometry_msgs/msg/Wrench")
+    vector: Any = message_type("geometry_msgs/msg/Vector3")
+    inbox.messages["sim/contact_wrench"] = wrench(
+        header(0, "world"), parts(vector(0.0, 0.0, 2.5), vector(0.0, 0.0, 0.0))
+    )
+    tick = 0
+    torque = np.zeros(7)
+
+    def service_step() -> None:
+        nonlocal tick
+        inbox.messages["control/joint_torque"] = command(header(tick), torque, duration_message(50 * _MS))
+        tick += _MS
+        service.step(tick, inbox)
+
+    return {"plant_step_us": _best_us(plant_step, steps), "service_step_us": _best_us(service_step, steps)}
+
+
+if __name__ == "__main__":
+    print(json.dumps({"joints": len(lbr.JOINT_NAMES), **measure()}, indent=2))

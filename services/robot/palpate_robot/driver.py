@@ -1,0 +1,166 @@
+"""The driver's contract: which torque the joints get, and when the driver stops obeying and holds safely by itself.
+
+A driver is IDLE until its first valid command, then ACTIVE. On an expired or invalid command, a lost commander, a
+broken limit or a stop request it goes to SAFE_HOLD and stays there until released. IDLE and SAFE_HOLD carry gravity and
+damp the joints, without any stiffness: tissue that is pressed pushes the arm away, so the force on it falls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from palpate_models import lbr
+from palpate_models.frames import Array
+
+HOLD_DAMPING: Final = np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])
+"""Joint damping in a hold [N m s/rad] [A]: about 300 N s/m at the tool. It stops a scan at 30 mm/s within a millimetre,
+and breathing at 8 mm/s against the held tool adds less than 3 N."""
+_LIMITS: Final = tuple(
+    zip(
+        lbr.JOINT_NAMES,
+        lbr.POSITION_LIMIT.tolist(),
+        lbr.VELOCITY_LIMIT.tolist(),
+        lbr.TORQUE_LIMIT.tolist(),
+        strict=True,
+    )
+)
+_ZERO: Final = np.zeros(7)
+_ZERO.setflags(write=False)
+
+
+class Mode(IntEnum):
+    """Values of `palpation_msgs/RobotStatus.mode`."""
+
+    IDLE = 0
+    ACTIVE = 1
+    SAFE_HOLD = 2
+
+
+class Cause(IntEnum):
+    """Values of `palpation_msgs/RobotStatus.cause`."""
+
+    NONE = 0
+    COMMAND_EXPIRED = 1
+    COMMANDER_LOST = 2
+    POSITION_LIMIT = 3
+    VELOCITY_LIMIT = 4
+    TORQUE_LIMIT = 5
+    INVALID_COMMAND = 6
+    FORCE_LIMIT = 7
+    STOP_REQUESTED = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Joint torques without gravity [N m], when they were sent [ns], and when they expire [ns]."""
+
+    torque: Array
+    stamp: int
+    expires: int
+
+
+class Driver:
+    """Decides what the joints get. All arrays are of shape (7,), order lbr_A1..lbr_A7."""
+
+    def __init__(self, force_emergency_n: float) -> None:
+        """`force_emergency_n` is the external force at the tool [N] above which the driver holds."""
+        self._force_emergency = force_emergency_n
+        self.mode = Mode.IDLE
+        self.cause = Cause.NONE
+        self.reason = ""
+        self.rejected = 0
+        """Invalid commands since start."""
+        self.holds: list[tuple[int, Cause, str]] = []
+        """Every safe hold so far: when [ns], cause, reason."""
+        self._since = -1
+        self._judged: Command | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether a safe hold is latched."""
+        return self.mode is Mode.SAFE_HOLD
+
+    def hold(self, t: int, cause: Cause, reason: str) -> None:
+        """Latches a safe hold at `t` [ns]. The first cause stands until the release."""
+        if not self.held:
+            self.mode, self.cause, self.reason = Mode.SAFE_HOLD, cause, reason
+            self.holds.append((t, cause, reason))
+
+    def release(self, t: int) -> None:
+        """Leaves a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a broken limit holds again."""
+        if self.mode is Mode.SAFE_HOLD:
+            self.mode, self.cause, self.reason = Mode.IDLE, Cause.NONE, ""
+            self._since = t
+
+    def update(
+        self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool
+    ) -> Array:
+        """Joint torques at `t` [ns] without gravity [N m]; zero outside ACTIVE, where `damping` is to act instead.
+
+        Takes measured positions [rad] and velocities [rad/s], the gravity torques [N m], the external force at the tool
+        [N], the newest command, and whether the commander is known to be lost.
+        """
+        if self.held:
+            return _ZERO
+        if lost:
+            self.hold(t, Cause.COMMANDER_LOST, "the service of role control, which commands, is gone")
+        elif force > self._force_emergency:
+            limit = self._force_emergency
+            self.hold(t, Cause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
+        else:
+            self._check_joints(t, q, v)
+        if command is not None and command.stamp > self._since and not self.held:
+            self._take(t, command, gravity)
+        return command.torque if command is not None and self.mode is Mode.ACTIVE else _ZERO
+
+    def damping(self, v: Array, gravity: Array) -> Array:
+        """Joint damping that the driver adds now [N m s/rad]; in a hold as much as the torque limits leave room for."""
+        if self.mode is Mode.ACTIVE:
+            return _ZERO
+        room = lbr.TORQUE_LIMIT - np.abs(gravity)
+        return np.asarray(np.minimum(HOLD_DAMPING, np.maximum(room, 0.0) / np.maximum(np.abs(v), 1e-9)))
+
+    def _check_joints(self, t: int, q: Array, v: Array) -> None:
+        for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, q.tolist(), v.tolist(), strict=True):
+            if not -q_max <= q_i <= q_max:
+                self.hold(t, Cause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limit +-{q_max:.4f} rad")
+            elif not -v_max <= v_i <= v_max:
+                self.hold(t, Cause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
+
+    def _take(self, t: int, command: Command, gravity: Array) -> None:
+        """Judges a command: obey it, ignore it (already expired while IDLE), or hold."""
+        if t > command.expires:
+            if self.mode is Mode.ACTIVE:
+                late = (t - command.expires) / 1e6
+                self.hold(t, Cause.COMMAND_EXPIRED, f"the last command expired {late:.0f} ms ago, none came after it")
+            return
+        if command is not self._judged:
+            self._judged = command
+            self._judge(t, command, gravity)
+        if self.mode is Mode.IDLE:
+            self.mode = Mode.ACTIVE
+
+    def _judge(self, t: int, command: Command, gravity: Array) -> None:
+        shape = np.shape(command.torque)
+        if shape != (7,):
+            self._reject(t, Cause.INVALID_COMMAND, f"a torque command of shape {shape}, want (7,)")
+            return
+        for (joint, _, _, limit), torque, weight in zip(
+            _LIMITS, command.torque.tolist(), gravity.tolist(), strict=True
+        ):
+            if torque - torque != 0.0:  # NaN or infinite
+                self._reject(
+                    t, Cause.INVALID_COMMAND, f"a torque command of {torque} N m for {joint}, want a finite one"
+                )
+                return
+            if not -limit <= torque + weight <= limit:
+                text = f"{joint} commanded {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
+                self._reject(t, Cause.TORQUE_LIMIT, text)
+                return
+
+    def _reject(self, t: int, cause: Cause, reason: str) -> None:
+        self.rejected += 1
+        self.hold(t, cause, reason)

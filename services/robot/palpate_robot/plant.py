@@ -1,0 +1,185 @@
+"""The robot's physics in DART: rigid-body dynamics with joint friction, end stops, and contact with table and base.
+
+DART integrates semi-implicitly at 1 ms: accelerations by articulated bodies with the viscous damping taken implicitly,
+Coulomb friction, end stops and contacts as constraints on the velocity, then positions with the new velocity.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import dartpy as dart
+import numpy as np
+from palpate_models import lbr
+from palpate_models.frames import Array
+from palpate_models.scenario import Robot
+from palpate_models.table import boxes
+
+DT: Final = 1e-3
+"""Step [s]."""
+GRAVITY: Final = 9.81
+"""[m/s^2], along -z of world."""
+END_STOP_MARGIN_RAD: Final = 0.03
+"""How far behind the position limit the mechanical end stop is [A]; the driver acts at the limit."""
+_FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
+"""Links that stand on or turn over the base and so have no collision shapes."""
+
+
+def _isometry(X: Array) -> Any:
+    return dart.math.Isometry3(X)
+
+
+def _along(start: Array, end: Array) -> Array:
+    """Pose, shape (4, 4), half-way from start to end with z along that direction."""
+    z = (end - start) / np.linalg.norm(end - start)
+    x = np.cross((0.0, 1.0, 0.0), z) if abs(z[1]) < 0.9 else np.cross((1.0, 0.0, 0.0), z)
+    x /= np.linalg.norm(x)
+    X = np.eye(4)
+    X[:3, :3] = np.column_stack((x, np.cross(z, x), z))
+    X[:3, 3] = (start + end) / 2
+    return X
+
+
+def _collide(body: Any, shape: Any, X: Array) -> None:
+    node = body.createShapeNode(shape)
+    node.createCollisionAspect()
+    node.createDynamicsAspect()
+    node.setRelativeTransform(_isometry(X))
+
+
+def _load_arm(robot: Robot) -> Any:
+    """The arm as a DART skeleton without shapes. DART's loader wants a file, by its absolute path."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder).resolve() / "lbr.urdf"
+        path.write_text(lbr.urdf(robot, geometry=False), encoding="utf-8")
+        arm = dart.utils.DartLoader().parseSkeleton(str(path))
+    if arm is None or arm.getNumDofs() != len(lbr.JOINT_NAMES):
+        raise RuntimeError("DART could not load the robot's URDF with its seven joints")
+    return arm
+
+
+def _environment(robot: Robot) -> Any:
+    """Table and base as one immobile skeleton."""
+    skeleton = dart.dynamics.Skeleton("environment")
+    _, body = skeleton.createWeldJointAndBodyNodePair()
+    for box in boxes(robot):
+        _collide(body, dart.dynamics.BoxShape(box.size), box.X_WB)
+    skeleton.setMobile(False)
+    return skeleton
+
+
+class Plant:
+    """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
+
+    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME) -> None:
+        """Starts at rest at joint positions `q` [rad]."""
+        self._arm = _load_arm(robot)
+        self._dofs = tuple(self._arm.getDof(i) for i in range(7))
+        for joint, stop in zip(self._arm.getJoints()[1:8], lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD, strict=True):
+            joint.setPositionLowerLimit(0, -stop)
+            joint.setPositionUpperLimit(0, stop)
+            joint.setVelocityLowerLimit(0, -np.inf)  # nothing physical stops at a speed: the driver watches it
+            joint.setVelocityUpperLimit(0, np.inf)
+            joint.setLimitEnforcement(True)
+        for link, capsules in lbr.capsules(robot).items():
+            for capsule in () if link in _FIXED_LINKS else capsules:
+                self._add_capsule(self._arm.getBodyNode(link), capsule)
+        self._world = dart.simulation.World()
+        self._world.setTimeStep(DT)
+        self._world.setGravity([0.0, 0.0, -GRAVITY])
+        # DART's own detector knows capsules and boxes exactly and is the cheapest here; FCL has no capsules.
+        self._world.getConstraintSolver().setCollisionDetector(dart.collision.DARTCollisionDetector())
+        self._world.addSkeleton(self._arm)
+        self._world.addSkeleton(_environment(robot))
+        self._links = {link: self._arm.getBodyNode(link) for link in lbr.LINK_NAMES}
+        self._sensor = self._links["ft_sensor"]
+        self._indenter = self._links["indenter"]
+        self._viscous = robot.joint_damping_nms
+        self._damping = np.zeros(7)
+        self._origin = np.zeros(3)
+        self.reset(q)
+
+    @staticmethod
+    def _add_capsule(body: Any, capsule: lbr.Capsule) -> None:
+        start, end = np.array(capsule.start), np.array(capsule.end)
+        length = float(np.linalg.norm(end - start))
+        if length > 0:
+            _collide(body, dart.dynamics.CapsuleShape(capsule.radius, length), _along(start, end))
+        else:
+            X = np.eye(4)
+            X[:3, 3] = start
+            _collide(body, dart.dynamics.SphereShape(capsule.radius), X)
+
+    def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
+        """Puts the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
+        self._arm.setPositions(np.asarray(q, dtype=float))
+        self._arm.setVelocities(np.zeros(7) if v is None else np.asarray(v, dtype=float))
+        self._arm.setForces(self.gravity_torque())
+        self._arm.computeForwardDynamics()  # so that the sensor reads the tool's weight before the first step
+
+    def set_damping(self, damping: Array) -> None:
+        """Viscous joint damping of the driver [N m s/rad] on top of the friction's, taken implicitly, shape (7,)."""
+        if not np.array_equal(damping, self._damping):
+            self._damping = damping.copy()
+            for dof, value in zip(self._dofs, damping.tolist(), strict=True):
+                dof.setDampingCoefficient(self._viscous + value)
+
+    def step(self, torque: Array, force_W: Array, moment_W: Array) -> None:
+        """Advances 1 ms under joint torques (gravity not compensated) and a wrench on the indenter.
+
+        The wrench, shapes (3,), acts at the sphere's centre, in world axes, and is held over the step.
+        """
+        self._arm.setForces(torque)
+        self._indenter.addExtForce(force_W, self._origin, False, True)
+        self._indenter.addExtTorque(moment_W, False)
+        self._world.step()  # clears torques and external forces
+
+    def positions(self) -> Array:
+        """Joint positions [rad], a fresh array of shape (7,)."""
+        return np.asarray(self._arm.getPositions())
+
+    def velocities(self) -> Array:
+        """Joint velocities [rad/s], a fresh array of shape (7,)."""
+        return np.asarray(self._arm.getVelocities())
+
+    def gravity_torque(self) -> Array:
+        """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""
+        return np.asarray(self._arm.getGravityForces())
+
+    def accelerations(self) -> Array:
+        """Joint accelerations of the last step [rad/s^2], shape (7,)."""
+        return np.asarray(self._arm.getAccelerations())
+
+    def kinetic_energy(self) -> float:
+        """[J]."""
+        return float(self._arm.computeKineticEnergy())
+
+    def sensor_wrench(self) -> Array:
+        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m], shape (6,).
+
+        At the sensor's origin, in its axes, averaged over the last step: contact, weight and inertia of the tool.
+        It is minus the wrench that the joint above `ft_sensor` transmits (Featherstone's f_i), constraints included.
+        """
+        moment_force = self._sensor.getBodyForce()
+        return -np.concatenate((moment_force[3:], moment_force[:3]))
+
+    def tool_pose(self) -> tuple[Array, Any]:
+        """Position p_WI [m], shape (3,), and orientation (DART quaternion) of the indenter in world."""
+        X_WI = self._indenter.getWorldTransform()
+        return X_WI.translation(), X_WI.quaternion()
+
+    def tool_twist(self) -> tuple[Array, Array]:
+        """Linear velocity [m/s] of the sphere's centre and angular velocity [rad/s], world axes, shapes (3,)."""
+        return self._indenter.getLinearVelocity(), self._indenter.getAngularVelocity()
+
+    def link_pose(self, link: str) -> tuple[Array, Any]:
+        """Position [m], shape (3,), and orientation (DART quaternion) of a link of `lbr.LINK_NAMES` in world."""
+        X_WL = self._links[link].getWorldTransform()
+        return X_WL.translation(), X_WL.quaternion()
+
+    def contacts(self) -> int:
+        """Number of contact points with table or base in the last step."""
+        return int(self._world.getLastCollisionResult().getNumContacts())

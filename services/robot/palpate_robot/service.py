@@ -1,0 +1,199 @@
+"""The robot on the bus: driver, plant and sensor in one step of a millisecond."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+from zlib import crc32
+
+import numpy as np
+from palpate_bus.codec import Message, message_type
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import NS, nanoseconds
+from palpate_models import lbr
+from palpate_models.frames import Array
+from palpate_models.load import exam_input
+from palpate_models.scenario import ExamInput, Scenario
+
+from palpate_robot.driver import Cause, Command, Driver, Mode
+from palpate_robot.ft_sensor import FtSensor
+from palpate_robot.plant import DT, GRAVITY, Plant
+
+_Time: Any = message_type("builtin_interfaces/msg/Time")
+_Header: Any = message_type("std_msgs/msg/Header")
+_String: Any = message_type("std_msgs/msg/String")
+_JointState: Any = message_type("sensor_msgs/msg/JointState")
+_Point: Any = message_type("geometry_msgs/msg/Point")
+_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
+_Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
+_Pose: Any = message_type("geometry_msgs/msg/Pose")
+_Twist: Any = message_type("geometry_msgs/msg/Twist")
+_Wrench: Any = message_type("geometry_msgs/msg/Wrench")
+_WrenchStamped: Any = message_type("geometry_msgs/msg/WrenchStamped")
+_Transform: Any = message_type("geometry_msgs/msg/Transform")
+_TransformStamped: Any = message_type("geometry_msgs/msg/TransformStamped")
+_TFMessage: Any = message_type("tf2_msgs/msg/TFMessage")
+_ToolState: Any = message_type("palpation_msgs/msg/ToolState")
+_RobotStatus: Any = message_type("palpation_msgs/msg/RobotStatus")
+_Request: Any = message_type("palpation_msgs/msg/OperatorRequest")
+
+_TICK = round(DT * NS)
+_STATUS_PERIOD = 10 * _TICK
+_LINKS_PERIOD = 50 * _TICK
+_MOST_STEPS = 50
+"""Steps of the plant that one tick may catch up with, in wall-clock mode after an overrun."""
+_NOISE_BLOCK = 1024
+_NAMES = list(lbr.JOINT_NAMES)
+
+
+class RobotService(Service):
+    """LBR iiwa 7 R800 with F/T sensor and spherical indenter, simulated."""
+
+    role: ClassVar[str] = "robot"
+
+    def __init__(self, exam: ExamInput) -> None:
+        """Starts at `lbr.HOME`, at rest."""
+        robot = exam.robot
+        streams = np.random.SeedSequence([exam.seed, crc32(b"robot")]).spawn(2)
+        joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+        self._robot = robot
+        self._plant = Plant(robot)
+        self._sensor = FtSensor(robot, ft_rng)
+        self._driver = Driver(exam.limits.force_emergency_n)
+        self._rng = joint_rng
+        self._deviation = np.repeat((robot.position_noise_rad, robot.velocity_noise_radps), 7)
+        self._noise: Array = np.empty((0, 14))
+        self._row = 0
+        self._weight = robot.tool_mass_kg * GRAVITY
+        self._t: int | None = None
+        self._command: Command | None = None
+        self._command_message: Message | None = None
+        self._force_W = np.zeros(3)
+        self._moment_W = np.zeros(3)
+        self._q = self._plant.positions()
+        self._v = self._plant.velocities()
+        self._applied = np.zeros(7)
+        self._external_force = 0.0
+        self._peak_force = 0.0
+
+    def start(self) -> Outbox:
+        """The robot's description."""
+        return {"robot_description": _String(lbr.urdf(self._robot))}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Moves the plant to `t` under what arrived up to the tick before, and measures."""
+        self._obey_operator(t, inbox)
+        self._drive(t, inbox)
+        stamp = _Time(t // NS, t % NS)
+        outbox: dict[str, Message] = {"joint_states": self._joint_state(stamp)}
+        p_WI, q_WI = self._plant.tool_pose()
+        w, x, y, z = q_WI.w(), q_WI.x(), q_WI.y(), q_WI.z()
+        outbox["ft/wrench"] = self._wrench(stamp, (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
+        outbox["sim/tool_state"] = self._tool_state(stamp, p_WI, _Quaternion(x, y, z, w))
+        if not t % _STATUS_PERIOD:
+            outbox["robot/status"] = self._status(stamp)
+        if not t % _LINKS_PERIOD:
+            outbox["sim/link_poses"] = self._link_poses(stamp)
+        return outbox
+
+    def finish(self) -> Mapping[str, Any]:
+        """Safe holds, rejected commands, and the largest external force that the sensor saw."""
+        driver = self._driver
+        return {
+            "mode": driver.mode.name,
+            "holds": [{"t_s": t / NS, "cause": cause.name, "reason": reason} for t, cause, reason in driver.holds],
+            "commands_rejected": driver.rejected,
+            "peak_external_force_N": self._peak_force,
+        }
+
+    def _obey_operator(self, t: int, inbox: Inbox) -> None:
+        for message in inbox.new("operator/request"):
+            if message.request == _Request.STOP:
+                self._driver.hold(t, Cause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
+            elif message.request == _Request.RELEASE:
+                self._driver.release(t)
+
+    def _drive(self, t: int, inbox: Inbox) -> None:
+        """Driver, then plant, up to `t`. The first tick is the state at the start."""
+        plant, driver = self._plant, self._driver
+        steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
+        self._t = t
+        command = self._newest_command(inbox)
+        self._read_contact(inbox)
+        for _ in range(steps):
+            gravity = plant.gravity_torque()
+            torque = driver.update(
+                t, self._q, self._v, gravity, self._external_force, command, lost=inbox.lost("control")
+            )
+            damping = driver.damping(self._v, gravity)
+            plant.set_damping(damping)
+            plant.step(gravity + torque, self._force_W, self._moment_W)
+            self._q, self._v = plant.positions(), plant.velocities()
+            self._applied = torque if driver.mode is Mode.ACTIVE else -damping * self._v
+
+    def _newest_command(self, inbox: Inbox) -> Command | None:
+        message = inbox.latest("control/joint_torque")
+        if message is not None and message is not self._command_message:
+            stamp = nanoseconds(message.header.stamp)
+            self._command = Command(message.torque, stamp, stamp + nanoseconds(message.valid_for))
+            self._command_message = message
+        return self._command
+
+    def _read_contact(self, inbox: Inbox) -> None:
+        """The tissue's wrench; none before its first message, and none once the tissue is gone."""
+        message = inbox.latest("sim/contact_wrench")
+        force, moment = self._force_W, self._moment_W
+        if message is None or inbox.lost("tissue"):
+            force[:] = moment[:] = 0.0
+            return
+        wrench = message.wrench
+        force[0], force[1], force[2] = wrench.force.x, wrench.force.y, wrench.force.z
+        moment[0], moment[1], moment[2] = wrench.torque.x, wrench.torque.y, wrench.torque.z
+
+    def _joint_state(self, stamp: Message) -> Message:
+        if self._row == len(self._noise):
+            self._noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, 14))
+            self._row = 0
+        noise = self._noise[self._row]
+        self._row += 1
+        return _JointState(_Header(stamp, ""), _NAMES, self._q + noise[:7], self._v + noise[7:], self._applied.copy())
+
+    def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
+        """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
+        fx, fy, fz, mx, my, mz = self._sensor.read(self._plant.sensor_wrench()).tolist()
+        weight = self._weight
+        external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
+        self._external_force = external**0.5
+        self._peak_force = max(self._peak_force, self._external_force)
+        return _WrenchStamped(_Header(stamp, "ft_sensor"), _Wrench(_Vector3(fx, fy, fz), _Vector3(mx, my, mz)))
+
+    def _tool_state(self, stamp: Message, p_WI: Array, rotation: Message) -> Message:
+        linear, angular = self._plant.tool_twist()
+        pose = _Pose(_Point(*p_WI.tolist()), rotation)
+        twist = _Twist(_Vector3(*linear.tolist()), _Vector3(*angular.tolist()))
+        return _ToolState(_Header(stamp, "world"), pose, twist, self._robot.indenter_radius_m)
+
+    def _status(self, stamp: Message) -> Message:
+        driver = self._driver
+        return _RobotStatus(
+            _Header(stamp, ""),
+            int(driver.mode),
+            int(driver.cause),
+            driver.reason,
+            self._applied.copy(),
+            driver.rejected,
+        )
+
+    def _link_poses(self, stamp: Message) -> Message:
+        transforms = []
+        for link in lbr.LINK_NAMES:
+            p, q = self._plant.link_pose(link)
+            rotation = _Quaternion(q.x(), q.y(), q.z(), q.w())
+            pose = _Transform(_Vector3(*p.tolist()), rotation)
+            transforms.append(_TransformStamped(_Header(stamp, "world"), link, pose))
+        return _TFMessage(transforms)
+
+
+def create(scenario: Scenario) -> RobotService:
+    """The robot of a scenario; it gets no phantom."""
+    return RobotService(exam_input(scenario))
