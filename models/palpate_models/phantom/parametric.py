@@ -31,7 +31,7 @@ ILIAC_RISE_M = 0.005
 """The iliac crests stand out."""
 EXAMINED_HALF_M = 0.106
 """Half width and length of the finely meshed region: 0.10 m and a margin."""
-_GROWTH = 0.2
+_GROWTH = 0.23
 """Growth of the edge length with distance from the examined region."""
 
 

@@ -1,0 +1,1 @@
+"""The soft abdomen: role `tissue`. See the README for its equations."""

@@ -1,0 +1,96 @@
+"""The matrices of the tissue, and the bound within which its explicit step is stable and passive."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
+
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Stiffness
+
+Array = NDArray[np.float64]
+
+STEP_LIMIT = 1.8
+"""Largest dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps and more."""
+MOST_SUBSTEPS = 64
+
+
+class StabilityError(ValueError):
+    """Tissue that this scheme cannot simulate at a bearable cost."""
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """`C u' + K u = f` on the vertices, with fixed vertices left out."""
+
+    stiffness: sparse.csr_array
+    """K = diag(k_w A) + L[G], instantaneous [N/m], shape (n, n); rows and columns of fixed vertices are empty."""
+    damping: Array
+    """Diagonal of C [N s/m], shape (n,)."""
+    rate: float
+    """Largest eigenvalue of C^-1 K [1/s]."""
+    gershgorin: float
+    """Its bound max_i (K_ii + sum_j |K_ij|) / C_i [1/s]."""
+
+    def substeps(self, dt: float) -> int:
+        """How many equal explicit steps a period `dt` [s] must be cut into, so that each is stable and passive.
+
+        Raises StabilityError if they are too many.
+        """
+        count = max(1, math.ceil(dt * self.rate / STEP_LIMIT))
+        if count > MOST_SUBSTEPS:
+            raise StabilityError(
+                f"tissue: {count} sub-steps a period of {dt * 1e3:g} ms would be needed (dt * rate = {dt * self.rate:.3g}, "
+                f"limit {STEP_LIMIT}), at most {MOST_SUBSTEPS} are allowed: use a coarser mesh (phantom.edge_m), a shorter "
+                "phantom.stiffness.length_m or a larger phantom.stiffness.dashpot_s"
+            )
+        return count
+
+
+def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
+    """The matrices of a phantom.
+
+    Pasternak's G = k_w l^2 varies with k_w. An edge between two vertices carries the harmonic mean of their G, as between cells of
+    a finite-volume scheme: the same shear flows through both halves. Fixed vertices keep u = 0.
+    """
+    free = ~model.fixed
+    edges = sparse.coo_array(model.laplacian)
+    i, j, weight = edges.coords[0], edges.coords[1], -edges.data
+    keep = (i != j) & (free[i] | free[j])
+    i, j, weight = i[keep], j[keep], weight[keep]
+    shear = model.stiffness * stiffness.length_m**2
+    carried = weight * 2 * shear[i] * shear[j] / (shear[i] + shear[j])
+    n = len(model.vertices)
+    diagonal = model.stiffness * model.areas + np.bincount(i, carried, n)
+    inner = free[i] & free[j]
+    index = np.flatnonzero(free)
+    matrix = sparse.csr_array(
+        (
+            np.concatenate((diagonal[index], -carried[inner])),
+            (np.concatenate((index, i[inner])), np.concatenate((index, j[inner]))),
+        ),
+        shape=(n, n),
+    )
+    matrix.sort_indices()
+    damping = stiffness.dashpot_s * model.stiffness * model.areas
+    return Mechanics(matrix, damping, _largest_rate(matrix, damping), _gershgorin(matrix, damping))
+
+
+def _gershgorin(matrix: sparse.csr_array, damping: Array) -> float:
+    return float((abs(matrix).sum(axis=1) / damping).max())
+
+
+def _largest_rate(matrix: sparse.csr_array, damping: Array) -> float:
+    """Largest eigenvalue of C^-1 K by Lanczos, with a margin for what it may miss; Gershgorin's bound if it does not converge."""
+    scale = sparse.diags_array(1 / np.sqrt(damping))
+    try:
+        start = 1 + np.arange(len(damping)) % 7 / 7.0  # a fixed start, so that runs repeat
+        largest = eigsh(scale @ matrix @ scale, k=1, which="LA", v0=start, tol=1e-3, return_eigenvectors=False)[0]
+    except ArpackNoConvergence:
+        return _gershgorin(matrix, damping)
+    return float(min(1.01 * largest, _gershgorin(matrix, damping)))

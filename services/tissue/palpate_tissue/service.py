@@ -1,0 +1,167 @@
+"""The tissue service: the indenter's pose in, the wrench on it and the deformed surface out, at 1 kHz."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_bus.codec import Message, message_type
+from palpate_bus.contract import contract
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import NS, header
+from palpate_models.frames import matrix
+from palpate_models.phantom import build_phantom
+from palpate_models.scenario import Phantom, Scenario
+from scipy.spatial.transform import Rotation
+
+from palpate_tissue.surface import Surface
+from palpate_tissue.tissue import Tissue
+
+Array = NDArray[np.float64]
+
+_IndentationTruth: Any = message_type("palpation_msgs/msg/IndentationTruth")
+_PhantomTruth: Any = message_type("palpation_msgs/msg/PhantomTruth")
+_Point: Any = message_type("geometry_msgs/msg/Point")
+_Pose: Any = message_type("geometry_msgs/msg/Pose")
+_Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
+_SurfaceMesh: Any = message_type("palpation_msgs/msg/SurfaceMesh")
+_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
+_Wrench: Any = message_type("geometry_msgs/msg/Wrench")
+_WrenchStamped: Any = message_type("geometry_msgs/msg/WrenchStamped")
+
+_OUT_OF_REACH_M = -3.0
+"""Depth before the first tool state: the lower end of the contract's range."""
+
+_log = logging.getLogger("palpate.tissue")
+
+
+class TissueService(Service):
+    """The soft abdomen. Before the first tool state it exerts nothing; between two it holds the newest."""
+
+    role: ClassVar[str] = "tissue"
+
+    def __init__(self, phantom: Phantom, seed: int) -> None:
+        self._model = build_phantom(phantom, seed)
+        rules = contract()
+        period = rules.roles[self.role].period
+        self._tissue = Tissue(self._model, phantom.stiffness, phantom.breathing, period / NS)
+        self._surface = Surface(self._model)
+        self._surface_period = rules.topics["sim/surface"].period
+        self._truth_period = rules.topics["truth/indentation"].period
+        self._X_WA = matrix(phantom.pose.true)
+        self._R_AW = np.ascontiguousarray(self._X_WA[:3, :3].T)
+        self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
+        self._p_WA = self._X_WA[:3, 3].copy()
+        self._triangles = self._model.triangles.astype(np.uint32).ravel()
+        self._peak_n = 0.0
+        self._contact_steps = 0
+        self._onsets = 0
+        self._touching = False
+
+    def start(self) -> Outbox:
+        """The truth about the phantom, latched; logs the stability bound."""
+        mechanics, model = self._tissue.mechanics, self._model
+        _log.info(
+            "%d vertices; explicit step: dt * rate = %.2f (Gershgorin %.2f), passive below 2; %d sub-step(s) of a period",
+            len(model.vertices),
+            self._tissue.dt * mechanics.rate,
+            self._tissue.dt * mechanics.gershgorin,
+            self._tissue.substeps,
+        )
+        surface = _SurfaceMesh(header(0, "abdomen"), _flat(model.vertices), _flat(model.normals), self._triangles)
+        x, y, z, w = Rotation.from_matrix(self._R_WA).as_quat().tolist()
+        return {
+            "truth/phantom": _PhantomTruth(
+                surface,
+                model.stiffness.copy(),
+                model.background.copy(),
+                model.lesion.copy(),
+                _Pose(_Point(*self._p_WA.tolist()), _Quaternion(x, y, z, w)),
+            )
+        }
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """One millisecond of tissue."""
+        tool = inbox.latest("sim/tool_state")
+        if tool is None:
+            self._tissue.idle(t / NS)
+            force_W = torque_W = np.zeros(3)
+        else:
+            position, linear, angular = tool.pose.position, tool.twist.linear, tool.twist.angular
+            motion_W = np.array(
+                (
+                    (position.x, position.y, position.z),
+                    (linear.x, linear.y, linear.z),
+                    (angular.x, angular.y, angular.z),
+                )
+            )
+            motion_W[0] -= self._p_WA
+            p_A, v_A, w_A = motion_W @ self._R_WA
+            force_A, torque_A = self._tissue.step(t / NS, p_A, v_A, float(tool.radius), w_A)
+            force_W, torque_W = self._R_WA @ force_A, self._R_WA @ torque_A
+            self._count(force_W)
+        wrench = _Wrench(_Vector3(*force_W.tolist()), _Vector3(*torque_W.tolist()))
+        outbox: dict[str, Message | list[Message]] = {"sim/contact_wrench": _WrenchStamped(header(t, "world"), wrench)}
+        if t % self._surface_period == 0:
+            outbox["sim/surface"] = self._surface_message(t)
+        if t % self._truth_period == 0:
+            outbox["truth/indentation"] = self._truth(t, tool, force_W)
+        return outbox
+
+    def finish(self) -> Mapping[str, Any]:
+        """Facts about the mesh, its stability bound and the contact."""
+        mechanics, tissue = self._tissue.mechanics, self._tissue
+        return {
+            "vertices": len(self._model.vertices),
+            "stability_dt_rate": round(tissue.dt * mechanics.rate, 4),
+            "substeps": tissue.substeps,
+            "peak_force_n": round(self._peak_n, 4),
+            "contact_steps": self._contact_steps,
+            "contact_onsets": self._onsets,
+        }
+
+    def _count(self, force_W: Array) -> None:
+        touching = len(self._tissue.contacts) > 0
+        if touching:
+            self._contact_steps += 1
+            self._onsets += not self._touching
+            self._peak_n = max(self._peak_n, float(np.dot(force_W, force_W)) ** 0.5)
+        self._touching = touching
+
+    def _surface_message(self, t: int) -> Message:
+        vertices_A = self._tissue.deformed_vertices
+        normals_A = self._surface.normals(vertices_A)
+        vertices_W = vertices_A @ self._R_AW + self._p_WA
+        return _SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_A @ self._R_AW), self._triangles)
+
+    def _truth(self, t: int, tool: Message | None, force_W: Array) -> Message:
+        if tool is None:
+            return _IndentationTruth(header(t, "world"), _OUT_OF_REACH_M, 0.0, 0.0, 0, _Point(0.0, 0.0, 0.0), 0.0)
+        position = tool.pose.position
+        p_A = self._R_AW @ (np.array((position.x, position.y, position.z)) - self._p_WA)
+        under = self._surface.nearest(p_A, self._tissue.excursion(t / NS))
+        normal_W = self._R_WA @ under.normal
+        normal_force = float(force_W @ normal_W)
+        tangential = float(np.linalg.norm(force_W - normal_force * normal_W))
+        point_W = self._R_WA @ under.position + self._p_WA
+        return _IndentationTruth(
+            header(t, "world"),
+            float(tool.radius) - under.height,
+            max(normal_force, 0.0),
+            tangential,
+            len(self._tissue.contacts),
+            _Point(*point_W.tolist()),
+            under.stiffness,
+        )
+
+
+def _flat(array: Array) -> NDArray[np.float32]:
+    return array.astype(np.float32).ravel()
+
+
+def create(scenario: Scenario) -> TissueService:
+    """The tissue of a scenario; with scoring, the one role that may look at its phantom."""
+    return TissueService(scenario.phantom, scenario.seed)
