@@ -124,7 +124,7 @@ class TissueService(Service):
         }
 
     def _count(self, force_W: Array) -> None:
-        touching = len(self._tissue.contacts) > 0
+        touching = self._tissue.touching
         if touching:
             self._contact_steps += 1
             self._onsets += not self._touching
@@ -133,7 +133,7 @@ class TissueService(Service):
 
     def _surface_message(self, t: int) -> Message:
         vertices_A = self._tissue.deformed_vertices
-        normals_A = self._surface.normals(vertices_A)
+        normals_A = self._surface.normals(self._tissue.inward)
         vertices_W = vertices_A @ self._R_AW + self._p_WA
         return _SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_A @ self._R_AW), self._triangles)
 

@@ -25,7 +25,7 @@ from palpate_tissue.mechanics import assemble
 
 Array = NDArray[np.float64]
 
-_SKIN_M = 0.005
+_SKIN_M = 0.0025
 """Contact candidates are gathered anew when the sphere has moved this far."""
 _REACH_M = 0.030
 """Least depth of the sphere's centre below the rest surface at which its candidates are still complete."""
@@ -35,17 +35,21 @@ _RIM = 0.2
 
 @dataclass
 class _Candidates:
-    """Vertices that the sphere might touch while its centre stays near `origin`; m of them."""
+    """Vertices that the sphere might hold while its centre stays near `origin`; m of them.
 
-    origin: Array  # [m], shape (3,)
+    `project @ (q, 1, R^2 - q^2)` for q = p - origin gives how far the centre is below each vertex, along its inward normal [m], and
+    then R^2 - |p - X|^2 [m^2]. `collect` sums what belongs to each vertex: outward normal, position from origin [m], and one.
+    """
+
+    origin: list[float]  # [m], in A
     reach: float  # [m] how far the centre may go from origin
+    radius: float  # [m] of the sphere
     index: NDArray[np.intp]  # vertices, shape (m,)
-    normal_position: Array  # outward normal and position relative to origin [m], shape (m, 6)
-    project: Array  # stacked normals and doubled positions, shape (2 m, 3)
-    height: Array  # position along the own normal [m], shape (m,)
-    square: Array  # squared distance from origin [m^2], shape (m,)
+    project: Array  # shape (2 m, 5)
+    collect: Array  # shape (m, 7)
     breathing: Array  # share of the breathing excursion, shape (m,)
     gain: Array  # C / h [N/m], shape (m,)
+    weights: Array  # working memory, shape (4, m)
 
 
 class Tissue:
@@ -89,14 +93,10 @@ class Tissue:
         self._free = free
         self._tree = cKDTree(model.vertices[free])
         self._candidates: _Candidates | None = None
-        self._radius = 0.0
-        self._deepest = 0.0
         self._at: list[float] | None = None
         self._moved = False
-        self.contacts: NDArray[np.intp] = np.empty(0, dtype=np.intp)
-        """Vertices in contact after the step, shape (k,)."""
-        self.pressures: Array = np.empty(0)
-        """Their contact forces f >= 0 along their inward normals [N], shape (k,)."""
+        self.touching = False
+        """Whether the sphere holds a vertex after the step."""
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
@@ -111,9 +111,7 @@ class Tissue:
         end = p_A.tolist()
         if not math.isfinite(sum(end)):
             raise ValueError(f"tissue: the indenter's position is not finite: {end}")
-        start = self._at or end
-        if math.dist(start, end) > _SKIN_M:
-            start = end
+        start = self._at or end  # where the sphere was a period ago
         self._at = end
         velocity = v_A.tolist()
         spin = w_A.tolist() if w_A is not None else None
@@ -142,10 +140,10 @@ class Tissue:
         """One explicit step; returns force and torque on the sphere."""
         self._excursion = excursion
         near = self._candidates
-        if near is None or radius != self._radius or math.dist(p, near.origin) > near.reach:
+        if near is None or radius != near.radius or math.dist(p, near.origin) > near.reach:
             near = self._gather(p, radius)
         self._relax()
-        wrench = self._contact(near, p, velocity, spin, radius) if len(near.index) else self._no_contact()
+        wrench = self._contact(near, p, velocity, spin) if len(near.index) else self._no_contact()
         self._remember()
         return wrench
 
@@ -154,9 +152,12 @@ class Tissue:
         if not self._moved:
             return
         u, strain = self.displacement, self._strain
-        strain[:] = u
-        for branch in self.branches:
-            strain -= branch
+        if self.branches:
+            np.subtract(u, self.branches[0], out=strain)
+            for branch in self.branches[1:]:
+                strain -= branch
+        else:
+            strain[:] = u
         _sparsetools.csr_matvec(*self._advance, strain, u)
 
     def _remember(self) -> None:
@@ -168,111 +169,119 @@ class Tissue:
             daxpy(self.displacement, branch, a=feed)
 
     def _contact(
-        self,
-        near: _Candidates,
-        p: list[float],
-        velocity: list[float],
-        spin: list[float] | None,
-        radius: float,
+        self, near: _Candidates, p: list[float], velocity: list[float], spin: list[float] | None
     ) -> tuple[float, float, float, float, float, float]:
         """Holds the vertices under the sphere on it, and returns what that takes."""
-        q = np.array(p)
-        q -= near.origin
         m = len(near.index)
-        projected = near.project @ q
-        below = near.height - projected[:m]  # how far the centre is below each vertex at rest, along the inward normal
-        root = projected[m:] - near.square
-        root += below * below
-        root += radius * radius - q @ q  # R^2 - lateral distance^2
-        under = (root > (_RIM * radius) ** 2).nonzero()[0]
-        if not len(under):
-            return self._no_contact()
-        below = below[under]
-        half = np.sqrt(root[under])
+        qx, qy, qz = p[0] - near.origin[0], p[1] - near.origin[1], p[2] - near.origin[2]
+        free = near.radius * near.radius - (qx * qx + qy * qy + qz * qz)
+        projected = near.project.dot((qx, qy, qz, 1.0, free))
+        below, square = projected[:m], projected[m:]
+        weights = near.weights
+        f, steep, f_below, f_hold = weights
+        square += np.multiply(below, below, out=steep)  # R^2 - lateral distance^2
+        rim = (_RIM * near.radius) ** 2
+        under = square > rim
+        half = np.sqrt(np.maximum(square, rim, out=square), out=square)
         rest_hold = below + half
-        hold = rest_hold + self._excursion * near.breathing[under] if self._excursion else rest_hold
-        u = self.displacement
-        gap = hold - u[near.index[under]]
-        held = (gap > 0).nonzero()[0]
-        if not len(held):
+        u = self.displacement.take(near.index)
+        hold = rest_hold + self._excursion * near.breathing if self._excursion else rest_hold
+        gap = np.subtract(hold, u, out=f)
+        gap *= under
+        np.maximum(gap, 0.0, out=gap)
+        u += gap
+        gap *= near.gain  # which makes it f
+        # Force on the sphere, f (n + lateral / half), and f-weighted point and normal, as weighted sums of n, x and 1.
+        np.divide(f, half, out=steep)
+        np.multiply(steep, below, out=f_below)
+        np.multiply(f, rest_hold, out=f_hold)
+        on_f, on_steep, on_below, on_hold = weights.dot(near.collect).tolist()
+        load, g = on_f[6], on_steep[6]
+        if load <= 0:
             return self._no_contact()
-        chosen = under[held]
-        vertices = near.index[chosen]
-        f = near.gain[chosen] * gap[held]
-        u[vertices] = hold = hold[held]
-        self.contacts, self.pressures = vertices, f
-        self._moved = True
-        self._deepest = float(hold.max())
-        # Force on the sphere f (n + lateral / half), and f-weighted contact point and normal, as weighted sums of n and x.
-        below, half = below[held], half[held]
-        weights = np.empty((4, len(held)))
-        steep = np.divide(f, half, out=weights[1])
-        np.multiply(steep, below, out=weights[0])
-        weights[0] += f
-        weights[2] = f
-        np.multiply(f, rest_hold[held], out=weights[3])
-        sums = (weights @ near.normal_position[chosen]).tolist()
-        g = float(steep.sum())
-        load = float(f.sum())
-        qx, qy, qz = q.tolist()
-        a, b, c, d = sums
-        fx, fy, fz = a[0] + g * qx - b[3], a[1] + g * qy - b[4], a[2] + g * qz - b[5]
-        rx, ry, rz = (c[3] - d[0]) / load - qx, (c[4] - d[1]) / load - qy, (c[5] - d[2]) / load - qz
-        nx, ny, nz = c[:3]
-        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        self.displacement[near.index] = u
+        self.touching = self._moved = True
+        nx, ny, nz = on_f[:3]
+        fx = nx + on_below[0] + g * qx - on_steep[3]
+        fy = ny + on_below[1] + g * qy - on_steep[4]
+        fz = nz + on_below[2] + g * qz - on_steep[5]
+        rx = (on_f[3] - on_hold[0]) / load - qx
+        ry = (on_f[4] - on_hold[1]) / load - qy
+        rz = (on_f[5] - on_hold[2]) / load - qz
         vx, vy, vz = velocity
         if spin is not None:
             wx, wy, wz = spin
             vx, vy, vz = vx + wy * rz - wz * ry, vy + wz * rx - wx * rz, vz + wx * ry - wy * rx
-        tx, ty, tz = self.friction.step(self._h, (vx, vy, vz), (nx / length, ny / length, nz / length), length)
+        normal_load = math.sqrt(nx * nx + ny * ny + nz * nz)
+        normal = (nx / normal_load, ny / normal_load, nz / normal_load)
+        tx, ty, tz = self.friction.step(self._h, (vx, vy, vz), normal, normal_load)
         return (fx + tx, fy + ty, fz + tz, ry * tz - rz * ty, rz * tx - rx * tz, rx * ty - ry * tx)
 
     def _no_contact(self) -> tuple[float, float, float, float, float, float]:
-        if len(self.contacts):
-            self.contacts, self.pressures = self.contacts[:0], self.pressures[:0]
+        if self.touching:
+            self.touching = False
             self.friction.release()
-        self._deepest = 0.0
         return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def _gather(self, p: list[float], radius: float) -> _Candidates:
-        """The vertices that a sphere near `p` might touch, found by the tree."""
+        """The vertices that a sphere near `p` might hold, found by the tree."""
         model = self.model
-        ball = math.hypot(radius, max(_REACH_M, self._deepest + 0.01)) + self._amplitude + _SKIN_M
+        old = self._candidates
+        deepest = float(self.displacement[old.index].max(initial=0.0)) if old is not None else 0.0
+        ball = math.hypot(radius, max(_REACH_M, deepest + 0.01)) + self._amplitude + _SKIN_M
         distance, nearest = self._tree.query(p)
         reach = max(_SKIN_M, float(distance) - ball)
         index = self._free[np.sort(np.asarray(self._tree.query_ball_point(p, ball), dtype=np.intp))]
-        index = index[
-            model.normals[index] @ model.normals[self._free[nearest]] > 0
-        ]  # not the far side of something thin
-        origin = np.array(p)
-        normals = model.normals[index]
-        positions = model.vertices[index] - origin
-        self._radius = radius
+        normals, positions = model.normals[index], model.vertices[index] - p
+        height = (normals * positions).sum(axis=1)
+        lateral = np.linalg.norm(positions - height[:, None] * normals, axis=1)
+        facing = normals @ model.normals[self._free[nearest]] > 0  # not the far side of something thin
+        keep = (lateral < radius + _SKIN_M) & facing
+        index, normals, positions, height = index[keep], normals[keep], positions[keep], height[keep]
+        zero, one = np.zeros(len(index)), np.ones(len(index))
+        square = (positions * positions).sum(axis=1)
         self._candidates = _Candidates(
-            origin=origin,
+            origin=list(p),
             reach=reach,
+            radius=radius,
             index=index,
-            normal_position=np.hstack((normals, positions)),
-            project=np.vstack((normals, 2 * positions)),
-            height=(normals * positions).sum(axis=1),
-            square=(positions * positions).sum(axis=1),
+            project=np.vstack(
+                (np.column_stack((-normals, height, zero)), np.column_stack((2 * positions, -square, one)))
+            ),
+            collect=np.column_stack((normals, positions, one)),
             breathing=model.breathing[index],
             gain=self._gain[index],
+            weights=np.zeros((4, len(index))),
         )
         return self._candidates
 
     @property
-    def rest_vertices(self) -> Array:
-        """Surface without load [m], breathing included, shape (n, 3), in A."""
-        return self.model.vertices + (self._excursion * self.model.breathing)[:, None] * self.model.normals
+    def contacts(self) -> NDArray[np.intp]:
+        """Vertices in contact after the step, shape (k,)."""
+        near = self._candidates
+        if near is None or not self.touching:
+            return np.empty(0, dtype=np.intp)
+        return near.index[near.weights[0] > 0]
+
+    @property
+    def contact_forces(self) -> Array:
+        """Their contact forces f > 0 along their inward normals [N], shape (k,)."""
+        near = self._candidates
+        if near is None or not self.touching:
+            return np.empty(0)
+        return near.weights[0][near.weights[0] > 0]
+
+    @property
+    def inward(self) -> Array:
+        """How far each vertex is from its place at rest [m] along its inward normal, breathing included, shape (n,)."""
+        if self._excursion:
+            return self.displacement - self._excursion * self.model.breathing
+        return self.displacement
 
     @property
     def deformed_vertices(self) -> Array:
         """Surface as it is now [m], shape (n, 3), in A."""
-        return (
-            self.model.vertices
-            + (self._excursion * self.model.breathing - self.displacement)[:, None] * self.model.normals
-        )
+        return self.model.vertices - self.inward[:, None] * self.model.normals
 
     def energy(self) -> float:
         """Elastic energy [J] stored in the springs, the Maxwell branches' included."""
