@@ -103,7 +103,7 @@ def to_world(p_C: Array, sigma: Array, X_WC: Array) -> Cloud:
 
 def remove_invalid(cloud: Cloud) -> Cloud:
     """Step 2: without points that have no depth."""
-    return cloud.where(np.isfinite(cloud.p_W).all(axis=1))
+    return cloud.where(np.asarray(np.isfinite(cloud.p_W).all(axis=1), np.bool_))
 
 
 def crop(cloud: Cloud, X_WA: Array, box: Box, floor_m: float) -> Cloud:
@@ -132,4 +132,5 @@ def main_sheet(cloud: Cloud, depth: Array, inside: NDArray[np.bool_]) -> Cloud:
         pairs.append((a[joined], b[joined]))
     a, b = (np.concatenate(side) for side in zip(*pairs, strict=True))
     _, sheet = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
-    return cloud.where(np.equal(sheet, np.argmax(np.bincount(sheet, weights=inside.astype(np.float64)))))
+    best = np.argmax(np.bincount(sheet, weights=inside.astype(np.float64)))
+    return cloud.where(np.asarray(sheet == best, np.bool_))

@@ -55,6 +55,17 @@ class DepthFusion:
         """How many frames are in."""
         return len(self._frames)
 
+    def motion(self, depth: Image, pixel: NDArray[np.intp]) -> float:
+        """Standard deviation [m] over the frames of their mean offset from `depth` at `pixel` (rows, columns), shape (n, 2).
+
+        Noise averages out over thousands of pixels, so what is left is a surface that moves, as in breathing.
+        """
+        row, column = pixel[:, 0], pixel[:, 1]
+        offset = np.stack([frame[row, column] for frame in self._frames]) - depth[row, column]
+        kept = np.isfinite(offset)
+        mean = np.where(kept, offset, 0).sum(axis=1, dtype=np.float64) / np.maximum(kept.sum(axis=1), 1)
+        return float(np.std(mean))
+
     def fused(self) -> FusedDepth:
         """The fused window. Raises ValueError when no frame is in."""
         if not self._frames:

@@ -24,6 +24,8 @@ HEIGHT_M: Final = (-0.16, 0.06)
 """Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""
 TABLE_CLEARANCE_M: Final = 0.02
 """Points this near to the table's top are the table."""
+MOTION_M: Final = 5e-4
+"""A standard deviation over the frames above this is worth a remark: noise alone gives less than a tenth of it."""
 MIN_COVERAGE: Final = 0.95
 """With less of the region in view there are no targets."""
 
@@ -131,9 +133,10 @@ class Pipeline:
         sequence = pattern.order(len(x), len(y), self._exam.pattern)  # 5
         p_W, n_W = self._on(field, nodes[sequence])
         targets = Targets(p_W, n_W, (sequence // len(y)).astype(np.uint32))
-        guessed = int(np.count_nonzero(~known))
-        message = f"{guessed} of {len(nodes)} targets lie in small gaps and are interpolated" if guessed else ""
-        sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2)))
+        region = points.pixel[self._region.holds(p_A)]
+        motion = fusion.motion(fused.depth, region)
+        sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
+        message = _remarks(int(np.count_nonzero(~known)), len(nodes), motion)
         return Perceived(points, self._mesh(field, p_A), targets, sigma, fused.frames, coverage, message)
 
     def _on(self, field: surface.HeightField, xy: Array) -> tuple[Array, Array]:
@@ -155,6 +158,18 @@ class Pipeline:
         new = np.cumsum(keep) - 1
         p_W, n_W = self._on(field, nodes[keep])
         return Mesh(p_W, n_W, new[triangles].astype(np.uint32))
+
+
+def _remarks(guessed: int, nodes: int, motion: float) -> str:
+    """What to know about good targets; empty when all is well."""
+    remarks = []
+    if guessed:
+        remarks.append(f"{guessed} of {nodes} targets lie in small gaps and are interpolated")
+    if motion > MOTION_M:
+        remarks.append(
+            f"the surface moved while it was seen, by {1e3 * motion:.1f} mm (standard deviation): breathing?"
+        )
+    return "; ".join(remarks)
 
 
 def _grown(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:

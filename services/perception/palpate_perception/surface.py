@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import coo_array, csr_array, kron
 
 Array = NDArray[np.float64]
 
-CUTOFF_M: Final = 0.04
+CUTOFF_M: Final = 0.03
 """Wave length that passes with half its amplitude: wider waves are shape, narrower ones noise."""
 KNOTS_PER_CUTOFF: Final = 3
 DEGREE: Final = 3
@@ -68,8 +68,8 @@ class HeightField:
     y: Axis
     coefficients: Array
     """Shape (x.size, y.size)."""
-    factor: Any
-    """Cholesky factor of the normal matrix."""
+    factor: Array
+    """Cholesky factor of the normal matrix, lower band."""
     scale: float
     """Standard deviation of the residuals over the one assumed."""
 
@@ -85,7 +85,9 @@ class HeightField:
     def sigma(self, x: Array, y: Array) -> Array:
         """Standard deviation [m] of the height at points, shape (n,): the posterior of the smoothing spline (Wahba)."""
         rows = np.einsum("ni,nj->nij", self.x.values(x), self.y.values(y)).reshape(len(x), -1)
-        return np.asarray(self.scale * np.sqrt(np.einsum("nm,mn->n", rows, cho_solve(self.factor, rows.T))))
+        return np.asarray(
+            self.scale * np.sqrt(np.einsum("nm,mn->n", rows, cho_solve_banded((self.factor, True), rows.T)))
+        )
 
     def _evaluate(self, x: Array, y: Array, nu_x: int, nu_y: int) -> Array:
         return np.asarray(
@@ -102,22 +104,23 @@ def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, flo
         raise ValueError(f"surface fit: {len(p)} points, want at least 10")
     x, y = (Axis(a, b, CUTOFF_M / KNOTS_PER_CUTOFF) for a, b in zip(low, high, strict=True))
     rows = _rows(x, y, p)
+    width = DEGREE * (y.size + 1)  # half band width of the normal matrix: neighbours in x are y.size apart
     weight = 1 / sigma**2
     area = (high[0] - low[0]) * (high[1] - low[1])
-    penalty = _energy(x, y) * (CUTOFF_M / (2 * np.pi)) ** 6 / area
+    penalty = _band(_energy(x, y), width) * (CUTOFF_M / (2 * np.pi)) ** 6 / area
     level = float(np.median(p[:, 2]))
     scale, robust = 1.0, np.ones(len(p))
     for _ in range(ROUNDS):
         w = weight * robust
         weighted = rows.multiply(w[:, np.newaxis]).tocsr()
-        normal = (rows.T @ weighted).toarray() + w.sum() * penalty
+        normal = _band(rows.T @ weighted, width) + w.sum() * penalty
         # Corners that no datum constrains: a ridge of 1e-9 keeps the matrix definite, without a visible effect.
-        normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal) / len(normal)
-        factor = cho_factor(normal)
-        c = cho_solve(factor, weighted.T @ (p[:, 2] - level))
+        normal[0] += 1e-9 * normal[0].mean()
+        factor = cholesky_banded(normal, lower=True)
+        c = cho_solve_banded((factor, True), weighted.T @ (p[:, 2] - level))
         residual = (p[:, 2] - level - rows @ c) / sigma
         scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
-        robust = np.clip(1 - (residual / (TUKEY * scale)) ** 2, 0, None) ** 2
+        robust = np.clip(1 - (residual / (TUKEY * max(scale, 1.0))) ** 2, 0, None) ** 2
     return HeightField(x, y, c.reshape(x.size, y.size) + level, factor, scale)  # B-splines sum to one
 
 
@@ -130,7 +133,17 @@ def _rows(x: Axis, y: Axis, p: Array) -> csr_array[Any]:
     return csr_array((data, column, start), shape=(len(p), x.size * y.size))
 
 
-def _energy(x: Axis, y: Axis) -> Array:
-    """Matrix of E, shape (x.size * y.size, the same)."""
-    gx, gy = ([axis.gram(d) for d in range(4)] for axis in (x, y))
-    return np.asarray(sum(k * np.kron(gx[3 - d], gy[d]) for d, k in enumerate((1.0, 3.0, 3.0, 1.0))))
+def _energy(x: Axis, y: Axis) -> Any:
+    """Matrix of E, sparse, shape (x.size * y.size, the same)."""
+    gx, gy = ([csr_array(axis.gram(d)) for d in range(4)] for axis in (x, y))
+    return sum(k * kron(gx[3 - d], gy[d]) for d, k in enumerate((1.0, 3.0, 3.0, 1.0)))
+
+
+def _band(matrix: Any, width: int) -> Array:
+    """Lower band of a symmetric sparse matrix as LAPACK wants it: entry (i, j) at [i - j, j], shape (width + 1, n)."""
+    entries = coo_array(matrix)
+    row, column = entries.coords
+    lower = (row >= column) & (row - column <= width)  # beyond the band the Gram matrices hold rounding errors only
+    band = np.zeros((width + 1, entries.shape[0]))
+    np.add.at(band, (row[lower] - column[lower], column[lower]), entries.data[lower])
+    return band

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.frames import apply
+from palpate_models.frames import apply, inverse
 from palpate_models.scenario import Exam
 
 from palpate_perception.cloud import Array, project
@@ -15,6 +15,10 @@ CELL_M: Final = 0.01
 """Edge of the cells in which coverage is counted: five pixels of a Kinect at 1.1 m."""
 CLEARANCE_M: Final = 0.025
 """What is nearer than the expected surface by more hides it; what is farther by more is not the abdomen."""
+
+
+CREST_M: Final = 0.03
+"""The abdomen is no higher than this in A, whose origin is the umbilicus: what stands higher is something else."""
 
 
 def cells(exam: Exam) -> tuple[Array, tuple[int, int]]:
@@ -56,7 +60,13 @@ def quadric(p_A: Array, xy: Array) -> Array:
 
 
 def explain(
-    missing: Array, total: int, X_CA: Array, K: Array, depth: Array, origin: tuple[int, int], image: tuple[int, int]
+    missing: Array,
+    total: int,
+    X_CA: Array,
+    K: Array,
+    depth: Array,
+    origin: tuple[int, int],
+    image: tuple[int, int],
 ) -> str:
     """Why cells were not seen, in words, most frequent first; empty when none is missing.
 
@@ -75,15 +85,19 @@ def explain(
     measured = np.full(len(missing), np.nan)
     measured[held] = depth[row[held], column[held]]
     nearer = p_C[:, 2] - measured
-    hidden, beyond = inside & (nearer > CLEARANCE_M), inside & (nearer < -CLEARANCE_M)
+    behind, beyond = inside & (nearer > CLEARANCE_M), inside & (nearer < -CLEARANCE_M)
+    before_it = apply(inverse(X_CA), p_C * (measured / p_C[:, 2])[:, np.newaxis])  # what is seen instead, in A
+    itself = behind & (before_it[:, 2] < CREST_M)
+    hidden = behind & ~itself
     none = inside & np.isnan(measured)
     before = float(np.max(nearer[hidden], initial=0.0))
     reasons = (
         (hidden, f"view blocked: something, likely the arm, stands up to {before:.2f} m before the surface"),
+        (itself, "hidden behind the abdomen itself: place the camera higher"),
         (~inside, "outside the image: turn the camera towards the region"),
         (none, "no depth there: seen at too grazing an angle or out of range"),
         (beyond, "no abdomen there: the surface lies deeper, the region reaches past its edge"),
-        (inside & ~hidden & ~beyond & ~none, "cut off by a jump in depth"),
+        (inside & ~behind & ~beyond & ~none, "seen by too few pixels, or cut off by a jump in depth"),
     )
     counted = [(int(np.count_nonzero(mask)), words) for mask, words in reasons]
     parts = [
