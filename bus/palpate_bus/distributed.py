@@ -19,6 +19,7 @@ from palpate_bus.contract import Contract, Edge
 from palpate_bus.lockstep import NEVER, InputBuffer, Received, Stepper
 from palpate_bus.messages import Advance, RunControl, ServiceReport
 from palpate_bus.service import Service
+from palpate_bus.spool import CHUNK_TYPE, Spool, recording
 from palpate_bus.transport import Publisher, Sample, Subscription
 from palpate_bus.wire import message_key, topic_key
 
@@ -98,13 +99,10 @@ class LockstepNode:
             for name, port in self._stepper.ports.items()
         }
         self._data = {
-            name: Subscription(session, topic_key(buffer.topic, domain))
-            for name, buffer in self._stepper.buffers.items()
+            name: Subscription(session, topic_key(buffer.topic, domain)) for name, buffer in self._stepper.buffers.items()
         }
         advance_type = "palpation_msgs/msg/Advance"
-        producers = sorted(
-            {b.topic.producer for b in self._stepper.buffers.values() if b.edge.blocking and not b.topic.periodic}
-        )
+        producers = sorted({b.topic.producer for b in self._stepper.buffers.values() if b.edge.blocking and not b.topic.periodic})
         self._advances = {
             producer: Subscription(session, message_key(f"palpate/advance/{producer}", advance_type, domain))
             for producer in producers
@@ -116,6 +114,11 @@ class LockstepNode:
             if self._own_events
             else None
         )
+        self._spool = Spool(service.role, tuple(self._stepper.ports)) if recording() else None
+        self._chunks = Publisher(
+            session, message_key(f"palpate/record/{service.role}", CHUNK_TYPE, domain), rules.qos["event"], gid
+        )
+        self._chunk_sequence = 0
         self._decode_advance = codec.decoder(advance_type)
         self._encode_advance = codec.encoder(advance_type)
         self._advance_sequence = 0
@@ -131,6 +134,8 @@ class LockstepNode:
             self._handshake()
             for port, payload in self._stepper.start():
                 self._publishers[port.topic.name].put(payload, port.sequence)
+                if self._spool is not None:
+                    self._spool.add(port.topic.name, payload, 0, port.sequence)
             self._loop()
             self._report_end()
         except RunAborted:
@@ -153,6 +158,7 @@ class LockstepNode:
             if message.command == RunControl.HELLO:
                 for publisher in self._publishers.values():
                     publisher.hello()
+                self._chunks.hello()
                 if self._advance_publisher is not None:
                     self._advance_publisher.hello()
                 missing = [s.key.split("/RIHS01")[0] for s in inputs if not s.heard]
@@ -174,7 +180,7 @@ class LockstepNode:
     def _loop(self) -> None:
         t = 0
         period = self._role.period
-        stepper, publishers, blocking = self._stepper, self._publishers, self._blocking
+        stepper, publishers, blocking, spool = self._stepper, self._publishers, self._blocking, self._spool
         while True:
             if t > self._horizon and not self._await_horizon(t):
                 return
@@ -191,12 +197,22 @@ class LockstepNode:
                 self._advance_sequence += 1
                 sequences = [stepper.ports[name].sequence for name in self._own_events]
                 self._advance_publisher.put(self._encode_advance(_advance(t, sequences)), self._advance_sequence)
+            if spool is not None:
+                for port, payload in sent:
+                    spool.add(port.topic.name, payload, t, port.sequence)
+                self._pass_on(spool.chunk(t))
             stepper.blame.send += perf_counter_ns() - start
             self._tick = t
             self._link.progress(t)
             while (message := self._link.poll()) is not None:
                 self._obey(message)
             t += period
+
+    def _pass_on(self, chunk: bytes | None) -> None:
+        """Sends a chunk to the recorder."""
+        if chunk is not None:
+            self._chunk_sequence += 1
+            self._chunks.put(chunk, self._chunk_sequence)
 
     def _await_horizon(self, t: int) -> bool:
         """Waits until tick `t` is granted; False when the run ends before it."""
@@ -250,6 +266,8 @@ class LockstepNode:
 
     def _report_end(self) -> None:
         """Reports digests, blame and the service's own facts, and waits for the conductor's receipt."""
+        if self._spool is not None:
+            self._pass_on(self._spool.chunk(self._tick, final=True))
         facts = dict(self._service.finish())
         subscriptions = (*self._data.values(), *self._advances.values())
         detail = {

@@ -249,8 +249,8 @@ class Stepper:
         for name, message in outbox.items():
             port = self._port(name)
             if port.event:
-                for item in message if isinstance(message, list) else (message,):
-                    sent.append((port, port.pack(item, t)))
+                items = message if isinstance(message, list) else (message,)
+                sent.extend([(port, port.pack(item, t)) for item in items])
             elif t % port.period:
                 raise LockstepError(f"{self.role.name} sent {name} at {t} ns, which is no tick of its period {port.period} ns")
             else:

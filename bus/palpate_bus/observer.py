@@ -1,14 +1,13 @@
 """An observer's process: outside the barrier, it takes what comes and never slows a producer.
 
-A service with a `record` method (`RawRecorder`) is given every message as bytes, undecoded, and reports how far it has come, so
-that the conductor can hold the run back rather than lose a message. Any other observer sees the latest.
+It sees the latest of the periodic topics, and every message of the others. A recorder is driven by `recording`.
 """
 
 from __future__ import annotations
 
 import logging
 from time import sleep
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import zenoh
 
@@ -28,20 +27,12 @@ RING = 64
 FIFO = 1 << 17
 
 
-@runtime_checkable
-class RawRecorder(Protocol):
-    """An observer that wants bytes."""
-
-    def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
-        """Takes one message: its row, CDR bytes, simulated stamp [ns] and sequence number."""
-
-
 class _Feed:
     """One observed topic."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, key: str, lossless: bool) -> None:
         self.topic = topic
-        channel = zenoh.handlers.FifoChannel(FIFO) if lossless else zenoh.handlers.RingChannel(RING)
+        channel: Any = zenoh.handlers.FifoChannel(FIFO) if lossless else zenoh.handlers.RingChannel(RING)
         if topic.latched:
             self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
                 session, key, channel, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
@@ -81,8 +72,6 @@ class ObservedService:
     ) -> None:
         """`lossless` keeps every message of every topic, not just the latest of the periodic ones."""
         self.stepper = Stepper(service, rules)
-        self._recorder = service if isinstance(service, RawRecorder) else None
-        lossless = lossless or self._recorder is not None
         self.feeds = [
             _Feed(session, buffer.topic, topic_key(buffer.topic, domain), lossless or not buffer.topic.periodic)
             for buffer in self.stepper.buffers.values()
@@ -119,10 +108,7 @@ class ObservedService:
             buffer = self.stepper.buffers[topic.name]
             for sequence, payload in received:
                 stamp = (sequence - 1) * topic.period if topic.periodic else max(self.now, 0)
-                if self._recorder is not None:
-                    self._recorder.record(topic, payload, stamp, sequence)
-                else:
-                    buffer.deliver(Received(payload, stamp, sequence))
+                buffer.deliver(Received(payload, stamp, sequence))
         return busy
 
     def counters(self) -> dict[str, object]:
@@ -140,7 +126,6 @@ class ObserverNode:
         self._service = service
         self._link = Link(session, service.role, rules, domain, gid)
         self._observed = ObservedService(service, session, rules, domain, gid)
-        self._lossless = isinstance(service, RawRecorder)
 
     def run(self) -> None:
         """Observes until the conductor ends the run."""
@@ -174,9 +159,4 @@ class ObserverNode:
         for publisher in self._observed.publishers.values():
             publisher.hello()
         self._observed.drain_and_step()
-        missing = [
-            feed.topic.name
-            for feed in self._observed.feeds
-            if self._lossless and not feed.heard and feed.topic.producer != "conductor"
-        ]
-        self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
+        self._link.report(ServiceReport.READY, NEVER, detail={"missing": []})

@@ -21,15 +21,26 @@ from typing import Any
 
 import zenoh
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import Contract, contract
 from palpate_bus.distributed import LockstepNode, RunAborted
 from palpate_bus.observer import ObserverNode
+from palpate_bus.recording import RawRecorder, RecorderNode
 from palpate_bus.service import Service
-from palpate_bus.transport import declare_alive, peer_config
+from palpate_bus.transport import declare_alive
 from palpate_bus.wallclock import WallClockNode
+from palpate_bus.zenoh_config import close_session, open_session
 
 EXIT_FAILED = 3
 RUNTIMES: dict[str, type[LockstepNode] | type[WallClockNode]] = {"lockstep": LockstepNode, "wallclock": WallClockNode}
+
+
+def node_type(
+    service: Service, rules: Contract
+) -> type[LockstepNode] | type[WallClockNode] | type[ObserverNode] | type[RecorderNode]:
+    """What drives a service in this process."""
+    if not rules.roles[service.role].observer:
+        return RUNTIMES[runtime()]
+    return RecorderNode if isinstance(service, RawRecorder) else ObserverNode
 
 
 def runtime() -> str:
@@ -38,7 +49,6 @@ def runtime() -> str:
     if name not in RUNTIMES:
         raise ValueError(f"PALPATE_RUNTIME={name!r}: want one of {', '.join(RUNTIMES)}")
     return name
-
 
 
 def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]) -> None:
@@ -58,9 +68,8 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
         service = create(load(os.environ["PALPATE_SCENARIO"]))
         session = open_session()
-        node_type = ObserverNode if rules.roles[role].observer else RUNTIMES[runtime()]
-        node = node_type(service, session, rules, domain, role_gid(role))
-        token = declare_alive(session, domain, role)
+        node = node_type(service, rules)(service, session, rules, domain, role_gid(role))
+        token: Any = declare_alive(session, domain, role)
         node.run()
         token.undeclare()
     except RunAborted as aborted:
@@ -74,20 +83,15 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
     leave(session, status)
 
 
-def open_session() -> zenoh.Session:
-    """A zenoh session as the environment says."""
-    listen = [e for e in os.environ.get("PALPATE_LISTEN", "").split(",") if e]
-    connect = [e for e in os.environ.get("PALPATE_CONNECT", "").split(",") if e]
-    return zenoh.open(peer_config(listen, connect))
-
-
 def role_gid(role: str) -> bytes:
     """16 bytes that identify a role's publishers in this process."""
     return hashlib.sha256(f"{role} {os.getpid()}".encode()).digest()[:16]
 
 
 def leave(session: zenoh.Session | None, status: int) -> None:
-    """Ends the process at once: zenoh's own threads are not waited for."""
+    """Closes the session and ends the process: zenoh's own threads are not waited for."""
+    if session is not None:
+        close_session(session)
     sys.stderr.flush()
     sys.stdout.flush()
     os._exit(status)

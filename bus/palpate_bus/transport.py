@@ -5,7 +5,6 @@ No callback computes: a received sample goes into a queue of its own, which the 
 
 from __future__ import annotations
 
-import json
 from queue import Empty, SimpleQueue
 from time import time_ns
 from typing import Any, NamedTuple
@@ -91,7 +90,8 @@ class Subscription:
             except Empty:
                 return None
             try:
-                sequence, sent, gid = unpack(raw.attachment.to_bytes())
+                attachment: Any = raw.attachment
+                sequence, sent, gid = unpack(attachment.to_bytes())
             except (WireError, AttributeError):
                 self.garbage += 1
                 continue
@@ -138,16 +138,3 @@ class AliveWatch:
             else:
                 self._gone.discard(role)
         return frozenset(self._gone)
-
-
-def peer_config(listen: list[str], connect: list[str]) -> zenoh.Config:
-    """A peer without multicast and gossip that listens and connects where it is told."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"peer"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("scouting/gossip/enabled", "false")
-    config.insert_json5("timestamping/enabled", "true")
-    config.insert_json5("connect/retry", '{"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}')
-    config.insert_json5("listen/endpoints", json.dumps(listen))
-    config.insert_json5("connect/endpoints", json.dumps(connect))
-    return config

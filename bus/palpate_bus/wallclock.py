@@ -1,4 +1,4 @@
-"""Wall clock: one service a process, each on its own timer, freshest sample wins. For hardware, and simulated hardware in real time.
+"""Wall clock: one service a process, each on its own timer, freshest sample wins: for hardware, real or simulated in real time.
 
 A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
 A late step is counted as an overrun and caught up; when a service is further behind than `RESYNC`, its clock is set anew and
@@ -79,9 +79,7 @@ class WallClockNode:
                 for publisher in self._publishers.values():
                     publisher.hello()
                 missing = [
-                    name
-                    for name, buffer in self._stepper.buffers.items()
-                    if buffer.edge.blocking and not self._data[name].heard
+                    name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
                 ]
                 self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
             elif message.command == RunControl.GRANT:

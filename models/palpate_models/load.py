@@ -1,4 +1,4 @@
-"""Scenarios from YAML: by name or file, with `--set a.b=c` overrides, and errors that name file, field, value and what is allowed."""
+"""Scenarios from YAML, by name or file, with `--set a.b=c`. Errors name file, field, value and what is allowed."""
 
 from __future__ import annotations
 

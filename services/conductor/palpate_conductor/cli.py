@@ -15,7 +15,8 @@ from rich.table import Table
 
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
-from palpate_conductor.run import OBSERVERS, RunFailed, run_composed, run_distributed
+from palpate_conductor.conductor import RunFailed
+from palpate_conductor.run import OBSERVERS, run_composed, run_distributed
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
@@ -49,14 +50,18 @@ RUN_EXAMPLES = """
 
 @app.command(epilog=RUN_EXAMPLES)
 def run(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "rlq_guarding",
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")
+    ] = "rlq_guarding",
     out: Annotated[Path | None, typer.Option(help="Folder for the results; by default out/<scenario>-<time>.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     composed: Annotated[bool, typer.Option("--composed", help="All services in this process.")] = False,
     realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
     wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer, as with hardware.")] = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd and the MCAP recording.")] = True,
-    settings: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
 ) -> None:
     """Run an examination and write report, map and recordings."""
@@ -71,8 +76,6 @@ def run(
     observers = OBSERVERS if record else ()
     if not quiet:
         console.print(f"[bold]{chosen.name}[/] seed {chosen.seed}, results in {folder}", highlight=False)
-    from palpate_conductor.results import print_findings, write_results
-
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with RunDisplay(console, quiet) as display:
@@ -109,7 +112,15 @@ def topics() -> None:
         period = "latched" if topic.latched else f"{topic.period_ms} ms{' event' if topic.event else ''}"
         readers = ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking)
         name = topic.name if topic.visibility == "public" else f"{topic.name} [dim]({topic.visibility})[/]"
-        table.add_row(name, topic.type.replace("/msg/", "/"), topic.producer, period, topic.qos, "yes" if topic.hashed else "", readers)
+        table.add_row(
+            name,
+            topic.type.replace("/msg/", "/"),
+            topic.producer,
+            period,
+            topic.qos,
+            "yes" if topic.hashed else "",
+            readers,
+        )
     Console(width=max(160, Console().width)).print(table)
 
 
@@ -118,8 +129,6 @@ def router(
     listen: Annotated[str, typer.Option(help="Endpoint to listen on.")] = "tcp/127.0.0.1:7447",
 ) -> None:
     """Run a zenoh router for services in containers or on several machines."""
-    from palpate_bus.router import run_router
-
     run_router([listen])
 
 

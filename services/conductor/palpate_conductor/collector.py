@@ -71,4 +71,3 @@ class Collector(Service):
     def finish(self) -> Mapping[str, Any]:
         """Nothing to close."""
         return {"exam_states": len(self.collected.exam_states), "samples": len(self.collected.samples)}
-

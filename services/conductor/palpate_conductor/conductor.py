@@ -93,7 +93,11 @@ class Conductor:
         limit: int | None = None,
         wallclock: bool = False,
     ) -> None:
-        """`wallclock`: the services run on their own timers, so nothing is granted but the common start and the end. `realtime` paces the run at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends."""
+        """Prepares a run.
+
+        `realtime` paces it at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends.
+        With `wallclock` the services run on their own timers, and nothing is granted but the common start and the end.
+        """
         gid = b"palpate-conductr"
         self._rules = rules
         self._workers = tuple(role for role in roles if not rules.roles[role].observer)

@@ -14,8 +14,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import yaml
+from palpate_bus.zenoh_config import mesh
 
 COMPOSE = "docker-compose.yml"
+BARRIER = ("robot", "control", "tissue")
+"""The roles of the 1 kHz loop: they talk over zenoh's low-latency transport (see palpate_bus.zenoh_config)."""
 
 
 class ProcessListError(ValueError):
@@ -66,26 +69,19 @@ def read_processes(path: Path, roles: tuple[str, ...]) -> dict[str, ServiceProce
 class LocalProcesses:
     """Service processes on this machine, each with its log file; unix sockets in a folder of their own carry the bus."""
 
-    def __init__(self, out: Path, scenario_files: Mapping[str, Path], extra: Mapping[str, str]) -> None:
+    def __init__(self, roles: tuple[str, ...], out: Path, scenario_files: Mapping[str, Path], extra: Mapping[str, str]) -> None:
         """`scenario_files` gives the scenario that each role may see."""
         self._out = out
         self._scenario_files = scenario_files
         self._extra = dict(extra)
         self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
-        self._endpoints: list[str] = []
+        self.bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
+        """How each role, and the conductor, joins the bus."""
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, subprocess.Popen[bytes]] = {}
 
-    def endpoint(self, role: str) -> tuple[str, list[str]]:
-        """Where the next role listens, and to whom it connects: to all before it, so that all are linked."""
-        listen = f"unixsock-stream/{self._folder}/{role}"
-        connect = list(self._endpoints)
-        self._endpoints.append(listen)
-        return listen, connect
-
     def start(self, process: ServiceProcess) -> None:
         """Starts a service."""
-        listen, connect = self.endpoint(process.role)
         environment = {
             **os.environ,
             **{k: v for k, v in process.environment.items() if not k.startswith("PALPATE_ROUTER")},
@@ -94,8 +90,7 @@ class LocalProcesses:
             "PYTHONHASHSEED": "0",
             "PALPATE_SCENARIO": str(self._scenario_files[process.role]),
             "PALPATE_OUT": str(self._out),
-            "PALPATE_LISTEN": listen,
-            "PALPATE_CONNECT": ",".join(connect),
+            **self.bus[process.role].to_env(),
             **self._extra,
         }
         log = (self._out / "logs" / f"{process.role}.log").open("wb")

@@ -59,4 +59,6 @@ class RunDisplay:
         if exam.phase != self._phase:
             self._phase = exam.phase
             if not self._quiet:
-                self._console.print(f"[dim]{progress.t / NS:8.2f} s[/dim]  {PHASES[exam.phase]:<9} {exam.message}", highlight=False)
+                self._console.print(
+                    f"[dim]{progress.t / NS:8.2f} s[/dim]  {PHASES[exam.phase]:<9} {exam.message}", highlight=False
+                )

@@ -10,13 +10,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import zenoh
 from palpate_bus.composed import Composed, ServiceFailed
 from palpate_bus.contract import contract
-from palpate_bus.observer import RawRecorder
+from palpate_bus.recording import RawRecorder
 from palpate_bus.service import Service
 from palpate_bus.stamps import NS
-from palpate_bus.transport import peer_config
+from palpate_bus.zenoh_config import close_session, open_session
 from palpate_models.load import dump_scenario, redacted
 from palpate_models.scenario import Scenario
 
@@ -85,15 +84,16 @@ def run_distributed(
     roles = (*WORKERS, *observers)
     files = prepare(scenario, out)
     processes = read_processes(compose_file(), roles)
-    local = LocalProcesses(out, files, {"PALPATE_RUNTIME": "wallclock"} if wallclock else {})
+    extra = {
+        "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
+        "PALPATE_RECORD": str(int("recorder" in observers)),
+    }
+    local = LocalProcesses(roles, out, files, extra)
     collector = Collector()
     try:
-        listen, connect = local.endpoint("conductor")
-        session = zenoh.open(peer_config([listen], connect))
+        session = open_session(local.bus["conductor"])
         domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
-        conductor = Conductor(
-            session, contract(), domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock=wallclock
-        )
+        conductor = Conductor(session, contract(), domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock=wallclock)
         for role in roles:
             local.start(processes[role])
 
@@ -112,6 +112,7 @@ def run_distributed(
             outcome = conductor.outcome
             failure = str(error)
         start_time = conductor.started_at_perf - begin if conductor.started_at_perf else perf_counter() - begin
+        close_session(session)
     finally:
         local.stop()
     return RunResult(
@@ -160,9 +161,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
-    run = Composed(
-        [*load_services(scenario, WORKERS), *viewers, collector], taps=[recorder.record for recorder in recorders]
-    )
+    run = Composed([*load_services(scenario, WORKERS), *viewers, collector], taps=[recorder.record for recorder in recorders])
     start = perf_counter()
     failure = None
     last = 0

@@ -61,13 +61,16 @@ class Watchdog:
         }
         if not waiting:
             role = min(self.progress, key=lambda name: self.progress[name].moved)
-            return role, f"{role} has not finished a tick since {self.progress[role].tick / 1e9:.3f} s; nobody waits for it"
+            return (
+                role,
+                f"{role} has not finished a tick since {self.progress[role].tick / 1e9:.3f} s; nobody waits for it",
+            )
         role = min(waiting, key=lambda name: self.progress[name].tick)
         path = [role]
         while path[-1] in waiting:
             follower = waiting[path[-1]]
             if follower in path:
-                return follower, f"circle of waiting: {' -> '.join([*path[path.index(follower):], follower])}"
+                return follower, f"circle of waiting: {' -> '.join([*path[path.index(follower) :], follower])}"
             path.append(follower)
         culprit = path[-1]
         blocked = sorted(name for name in waiting if name != culprit)

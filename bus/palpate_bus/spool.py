@@ -1,0 +1,93 @@
+"""Recording without a second stream of every message: a service collects what it sent and passes it on in chunks.
+
+At 1 kHz a subscriber of every topic would cost each producer another send a message and the recorder a wake-up each. A chunk
+every 50 simulated milliseconds carries the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from palpate_bus import codec
+from palpate_bus.contract import MS
+from palpate_bus.messages import RecordChunk
+
+CHUNK_TYPE = "palpation_msgs/msg/RecordChunk"
+CHUNK_PERIOD = 50 * MS
+CHUNK_BYTES = 1 << 22
+
+_encode = codec.encoder(CHUNK_TYPE)
+_decode = codec.decoder(CHUNK_TYPE)
+
+
+def recording() -> bool:
+    """Whether this run has a recorder (PALPATE_RECORD)."""
+    return os.environ.get("PALPATE_RECORD", "0") == "1"
+
+
+class Recorded(NamedTuple):
+    """One message out of a chunk."""
+
+    topic: str
+    payload: bytes
+    stamp: int
+    sequence: int
+
+
+class Spool:
+    """Collects the messages of one role."""
+
+    def __init__(self, role: str, topics: tuple[str, ...]) -> None:
+        self._role = role
+        self._topics = topics
+        self._index = {name: index for index, name in enumerate(topics)}
+        self._entries: list[tuple[int, int, int, int]] = []
+        self._data: list[bytes] = []
+        self._bytes = 0
+        self._next = CHUNK_PERIOD
+
+    def add(self, topic: str, payload: bytes, stamp: int, sequence: int) -> None:
+        """Takes a message that was sent."""
+        self._entries.append((self._index[topic], stamp, sequence, len(payload)))
+        self._data.append(payload)
+        self._bytes += len(payload)
+
+    def chunk(self, t: int, final: bool = False) -> bytes | None:
+        """The chunk due at tick `t` [ns] in CDR, None when none is due."""
+        if not (final or t >= self._next or self._bytes > CHUNK_BYTES):
+            return None
+        self._next = t + CHUNK_PERIOD
+        columns: Any = np.array(self._entries, np.int64).reshape(-1, 4)
+        message = RecordChunk(
+            self._role,
+            t,
+            list(self._topics),
+            columns[:, 0].astype(np.uint16),
+            np.ascontiguousarray(columns[:, 1]),
+            columns[:, 2].astype(np.uint32),
+            columns[:, 3].astype(np.uint32),
+            np.frombuffer(b"".join(self._data), np.uint8),
+        )
+        self._entries.clear()
+        self._data.clear()
+        self._bytes = 0
+        return _encode(message)
+
+
+def unpack_chunk(payload: bytes) -> tuple[int, Iterator[Recorded]]:
+    """The tick [ns] that a chunk covers, and its messages. Raises CodecError when it is none."""
+    chunk = _decode(payload)
+    data = chunk.data.tobytes()
+
+    def messages() -> Iterator[Recorded]:
+        begin = 0
+        rows = zip(chunk.topic.tolist(), chunk.stamp.tolist(), chunk.sequence.tolist(), chunk.length.tolist(), strict=True)
+        for topic, stamp, sequence, length in rows:
+            yield Recorded(chunk.topics[topic], data[begin : begin + length], stamp, sequence)
+            begin += length
+
+    return int(chunk.tick), messages()
