@@ -55,10 +55,10 @@ def measure(steps: int = 2000) -> dict[str, float]:
     """Microseconds a millisecond step: of the plant alone, and of the whole service, under command and in contact."""
     scenario = Scenario()
     plant = Plant(scenario.robot)
-    force, moment = np.array([0.0, 0.0, 2.5]), np.zeros(3)
+    force, moment, none = np.array([0.0, 0.0, 2.5]), np.zeros(3), np.zeros(7)
 
     def plant_step() -> None:
-        plant.step(plant.gravity_torque(), force, moment)
+        plant.step(plant.gravity_torque(), force, moment, none)
 
     service = create(scenario)
     inbox = _Fed()
@@ -66,9 +66,7 @@ def measure(steps: int = 2000) -> dict[str, float]:
     wrench: Any = message_type("geometry_msgs/msg/WrenchStamped")
     parts: Any = message_type("geometry_msgs/msg/Wrench")
     vector: Any = message_type("geometry_msgs/msg/Vector3")
-    inbox.messages["sim/contact_wrench"] = wrench(
-        header(0, "world"), parts(vector(0.0, 0.0, 2.5), vector(0.0, 0.0, 0.0))
-    )
+    inbox.messages["sim/contact_wrench"] = wrench(header(0, "world"), parts(vector(0.0, 0.0, 2.5), vector(0.0, 0.0, 0.0)))
     tick = 0
     torque = np.zeros(7)
 

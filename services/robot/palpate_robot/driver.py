@@ -95,9 +95,7 @@ class Driver:
             self.mode, self.cause, self.reason = Mode.IDLE, Cause.NONE, ""
             self._since = t
 
-    def update(
-        self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool
-    ) -> Array:
+    def update(self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool) -> Array:
         """Joint torques at `t` [ns] without gravity [N m]; zero outside ACTIVE, where `damping` is to act instead.
 
         Takes measured positions [rad] and velocities [rad/s], the gravity torques [N m], the external force at the tool
@@ -148,13 +146,9 @@ class Driver:
         if shape != (7,):
             self._reject(t, Cause.INVALID_COMMAND, f"a torque command of shape {shape}, want (7,)")
             return
-        for (joint, _, _, limit), torque, weight in zip(
-            _LIMITS, command.torque.tolist(), gravity.tolist(), strict=True
-        ):
+        for (joint, _, _, limit), torque, weight in zip(_LIMITS, command.torque.tolist(), gravity.tolist(), strict=True):
             if torque - torque != 0.0:  # NaN or infinite
-                self._reject(
-                    t, Cause.INVALID_COMMAND, f"a torque command of {torque} N m for {joint}, want a finite one"
-                )
+                self._reject(t, Cause.INVALID_COMMAND, f"a torque command of {torque} N m for {joint}, want a finite one")
                 return
             if not -limit <= torque + weight <= limit:
                 text = f"{joint} commanded {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"

@@ -1,7 +1,13 @@
 """The robot's physics in DART: rigid-body dynamics with joint friction, end stops, and contact with table and base.
 
-DART integrates semi-implicitly at 1 ms: accelerations by articulated bodies with the viscous damping taken implicitly,
-Coulomb friction, end stops and contacts as constraints on the velocity, then positions with the new velocity.
+DART integrates semi-implicitly at 1 ms: accelerations by articulated bodies with the joint damping taken implicitly, end
+stops and contacts as constraints on the velocity, then positions with the new velocity.
+
+    (M + dt D(v)) a = tau - h(q, v) - D(v) v + J' F,    D(v) = d + f / max(|v|, v_stick),    v += dt a,    q += dt v
+
+with viscous damping d and Coulomb friction f of each joint. So friction, too, is implicit and can neither chatter nor add
+energy. DART's own Coulomb constraint is not used: it stops a joint with the inertia M instead of M + dt D, which makes
+0.1 N m of friction on A7 (5e-4 kg m^2, 10 N m s/rad) stick up to 2.1 N m.
 """
 
 from __future__ import annotations
@@ -24,6 +30,8 @@ GRAVITY: Final = 9.81
 """[m/s^2], along -z of world."""
 END_STOP_MARGIN_RAD: Final = 0.03
 """How far behind the position limit the mechanical end stop is [A]; the driver acts at the limit."""
+STICK_RADPS: Final = 1e-3
+"""Below this speed friction is viscous: a joint under less than its friction creeps slower than this [A]."""
 _FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
 """Links that stand on or turn over the base and so have no collision shapes."""
 
@@ -77,13 +85,14 @@ class Plant:
     def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME) -> None:
         """Starts at rest at joint positions `q` [rad]."""
         self._arm = _load_arm(robot)
-        self._dofs = tuple(self._arm.getDof(i) for i in range(7))
+        self._set_damping = tuple(self._arm.getDof(i).setDampingCoefficient for i in range(7))
         for joint, stop in zip(self._arm.getJoints()[1:8], lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD, strict=True):
             joint.setPositionLowerLimit(0, -stop)
             joint.setPositionUpperLimit(0, stop)
             joint.setVelocityLowerLimit(0, -np.inf)  # nothing physical stops at a speed: the driver watches it
             joint.setVelocityUpperLimit(0, np.inf)
             joint.setLimitEnforcement(True)
+            joint.setCoulombFriction(0, 0.0)
         for link, capsules in lbr.capsules(robot).items():
             for capsule in () if link in _FIXED_LINKS else capsules:
                 self._add_capsule(self._arm.getBodyNode(link), capsule)
@@ -98,8 +107,13 @@ class Plant:
         self._sensor = self._links["ft_sensor"]
         self._indenter = self._links["indenter"]
         self._viscous = robot.joint_damping_nms
-        self._damping = np.zeros(7)
+        self._coulomb = robot.joint_friction_nm
+        self._damping = np.empty(7)
         self._origin = np.zeros(3)
+        self.q: Array
+        """Joint positions [rad], a fresh array at every step."""
+        self.v: Array
+        """Joint velocities [rad/s], a fresh array at every step."""
         self.reset(q)
 
     @staticmethod
@@ -119,31 +133,26 @@ class Plant:
         self._arm.setVelocities(np.zeros(7) if v is None else np.asarray(v, dtype=float))
         self._arm.setForces(self.gravity_torque())
         self._arm.computeForwardDynamics()  # so that the sensor reads the tool's weight before the first step
+        self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
 
-    def set_damping(self, damping: Array) -> None:
-        """Viscous joint damping of the driver [N m s/rad] on top of the friction's, taken implicitly, shape (7,)."""
-        if not np.array_equal(damping, self._damping):
-            self._damping = damping.copy()
-            for dof, value in zip(self._dofs, damping.tolist(), strict=True):
-                dof.setDampingCoefficient(self._viscous + value)
+    def step(self, torque: Array, force_W: Array, moment_W: Array, damping: Array) -> None:
+        """Advances 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
-    def step(self, torque: Array, force_W: Array, moment_W: Array) -> None:
-        """Advances 1 ms under joint torques (gravity not compensated) and a wrench on the indenter.
-
-        The wrench, shapes (3,), acts at the sphere's centre, in world axes, and is held over the step.
+        `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
+        centre, in world axes, and is held over the step.
         """
+        total = np.abs(self.v, out=self._damping)
+        np.maximum(total, STICK_RADPS, out=total)
+        np.divide(self._coulomb, total, out=total)
+        total += self._viscous
+        total += damping
+        for set_damping, value in zip(self._set_damping, total.tolist(), strict=True):
+            set_damping(value)
         self._arm.setForces(torque)
         self._indenter.addExtForce(force_W, self._origin, False, True)
         self._indenter.addExtTorque(moment_W, False)
         self._world.step()  # clears torques and external forces
-
-    def positions(self) -> Array:
-        """Joint positions [rad], a fresh array of shape (7,)."""
-        return np.asarray(self._arm.getPositions())
-
-    def velocities(self) -> Array:
-        """Joint velocities [rad/s], a fresh array of shape (7,)."""
-        return np.asarray(self._arm.getVelocities())
+        self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
 
     def gravity_torque(self) -> Array:
         """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""

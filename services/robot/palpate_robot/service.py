@@ -70,8 +70,6 @@ class RobotService(Service):
         self._command_message: Message | None = None
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
-        self._q = self._plant.positions()
-        self._v = self._plant.velocities()
         self._applied = np.zeros(7)
         self._external_force = 0.0
         self._peak_force = 0.0
@@ -122,14 +120,10 @@ class RobotService(Service):
         self._read_contact(inbox)
         for _ in range(steps):
             gravity = plant.gravity_torque()
-            torque = driver.update(
-                t, self._q, self._v, gravity, self._external_force, command, lost=inbox.lost("control")
-            )
-            damping = driver.damping(self._v, gravity)
-            plant.set_damping(damping)
-            plant.step(gravity + torque, self._force_W, self._moment_W)
-            self._q, self._v = plant.positions(), plant.velocities()
-            self._applied = torque if driver.mode is Mode.ACTIVE else -damping * self._v
+            torque = driver.update(t, plant.q, plant.v, gravity, self._external_force, command, lost=inbox.lost("control"))
+            damping = driver.damping(plant.v, gravity)
+            plant.step(gravity + torque, self._force_W, self._moment_W, damping)
+            self._applied = torque if driver.mode is Mode.ACTIVE else -damping * plant.v
 
     def _newest_command(self, inbox: Inbox) -> Command | None:
         message = inbox.latest("control/joint_torque")
@@ -156,7 +150,7 @@ class RobotService(Service):
             self._row = 0
         noise = self._noise[self._row]
         self._row += 1
-        return _JointState(_Header(stamp, ""), _NAMES, self._q + noise[:7], self._v + noise[7:], self._applied.copy())
+        return _JointState(_Header(stamp, ""), _NAMES, self._plant.q + noise[:7], self._plant.v + noise[7:], self._applied.copy())
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""

@@ -1,0 +1,140 @@
+"""The driver's contract, tick by tick."""
+
+import numpy as np
+import pytest
+from palpate_bus.codec import message_type
+from palpate_models import lbr
+from palpate_robot.driver import HOLD_DAMPING, Cause, Command, Driver, Mode
+
+MS = 1_000_000
+STILL = np.zeros(7)
+GRAVITY = np.array([0.0, -40.0, 0.0, 15.0, 0.0, 0.5, 0.0])
+EMERGENCY = 40.0
+
+
+def _command(t: int, torque: np.ndarray | None = None, valid_ms: float = 50) -> Command:
+    return Command(np.full(7, 2.0) if torque is None else torque, t, t + int(valid_ms * MS))
+
+
+def _update(driver: Driver, t: int, command: Command | None, **changes: object) -> np.ndarray:
+    state = {"q": lbr.HOME, "v": STILL, "gravity": GRAVITY, "force": 0.0, "lost": False} | changes
+    return driver.update(t, command=command, **state)
+
+
+@pytest.fixture
+def active() -> Driver:
+    driver = Driver(EMERGENCY)
+    _update(driver, MS, _command(0))
+    assert driver.mode is Mode.ACTIVE
+    return driver
+
+
+def test_numbers_are_those_of_the_message() -> None:
+    status = message_type("palpation_msgs/msg/RobotStatus")
+    for mode in Mode:
+        assert getattr(status, f"MODE_{mode.name}") == mode
+    for cause in Cause:
+        assert getattr(status, f"CAUSE_{cause.name}") == cause
+
+
+def test_idle_until_the_first_valid_command() -> None:
+    driver = Driver(EMERGENCY)
+    assert not _update(driver, 0, None).any()
+    assert not _update(driver, 5 * MS, _command(MS, valid_ms=0)).any()
+    assert driver.mode is Mode.IDLE, "a command that is born expired is no command"
+    np.testing.assert_array_equal(_update(driver, 6 * MS, _command(5 * MS)), np.full(7, 2.0))
+    assert driver.mode is Mode.ACTIVE
+
+
+def test_obeys_to_the_last_valid_nanosecond_and_no_longer(active: Driver) -> None:
+    last = _command(10 * MS)
+    assert _update(active, last.expires, last).any()
+    assert not _update(active, last.expires + 1, last).any()
+    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, Cause.COMMAND_EXPIRED)
+    assert "expired" in active.reason
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause", "words"),
+    [
+        ({"lost": True}, Cause.COMMANDER_LOST, "control"),
+        ({"force": 40.5}, Cause.FORCE_LIMIT, "40.5 N"),
+        ({"q": lbr.HOME + np.eye(7)[3] * -0.5}, Cause.POSITION_LIMIT, "lbr_A4"),
+        ({"q": lbr.HOME * np.nan}, Cause.POSITION_LIMIT, "lbr_A1"),
+        ({"v": np.eye(7)[5] * 3.2}, Cause.VELOCITY_LIMIT, "lbr_A6"),
+        ({"v": np.eye(7)[1] * -1.8}, Cause.VELOCITY_LIMIT, "lbr_A2"),
+    ],
+)
+def test_broken_limits_hold(active: Driver, changes: dict, cause: Cause, words: str) -> None:
+    torque = _update(active, 2 * MS, _command(MS), **changes)
+    assert not torque.any()
+    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, cause)
+    assert words in active.reason
+
+
+@pytest.mark.parametrize(
+    ("torque", "cause", "words"),
+    [
+        (np.array([0, 0, np.nan, 0, 0, 0, 0.0]), Cause.INVALID_COMMAND, "lbr_A3"),
+        (np.array([np.inf, 0, 0, 0, 0, 0, 0.0]), Cause.INVALID_COMMAND, "lbr_A1"),
+        (np.zeros(6), Cause.INVALID_COMMAND, "(6,)"),
+        (np.zeros((7, 1)), Cause.INVALID_COMMAND, "(7, 1)"),
+        (np.array([0, 0, 0, 0, 0, 0, 40.1]), Cause.TORQUE_LIMIT, "lbr_A7"),
+        (np.array([0, -140.0, 0, 0, 0, 0, 0]), Cause.TORQUE_LIMIT, "gravity"),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_bad_commands_hold_and_are_counted(torque: np.ndarray, cause: Cause, words: str, first: bool) -> None:
+    driver = Driver(EMERGENCY)
+    if not first:
+        _update(driver, MS, _command(0))
+    assert not _update(driver, 2 * MS, _command(MS, torque)).any()
+    assert (driver.mode, driver.cause, driver.rejected) == (Mode.SAFE_HOLD, cause, 1)
+    assert words in driver.reason
+
+
+def test_full_torque_in_room_left_by_gravity_is_obeyed(active: Driver) -> None:
+    torque = lbr.TORQUE_LIMIT - GRAVITY
+    np.testing.assert_array_equal(_update(active, 2 * MS, _command(MS, torque)), torque)
+
+
+def test_hold_is_latched_and_keeps_its_first_cause(active: Driver) -> None:
+    _update(active, 2 * MS, _command(MS), force=50.0)
+    for tick in range(3, 200):
+        assert not _update(active, tick * MS, _command((tick - 1) * MS)).any()
+    active.hold(200 * MS, Cause.STOP_REQUESTED, "late")
+    assert active.cause is Cause.FORCE_LIMIT
+    assert len(active.holds) == 1
+
+
+def test_release_waits_for_a_command_sent_after_it(active: Driver) -> None:
+    active.hold(2 * MS, Cause.STOP_REQUESTED, "operator")
+    old = _command(2 * MS)
+    active.release(3 * MS)
+    assert (active.mode, active.cause, active.reason) == (Mode.IDLE, Cause.NONE, "")
+    assert not _update(active, 3 * MS, old).any()
+    assert active.mode is Mode.IDLE
+    assert _update(active, 5 * MS, _command(4 * MS)).any()
+    assert active.mode is Mode.ACTIVE
+
+
+def test_release_does_not_help_while_the_limit_is_broken(active: Driver) -> None:
+    far = lbr.HOME + np.eye(7)[3] * -0.5
+    _update(active, 2 * MS, _command(MS), q=far)
+    active.release(3 * MS)
+    _update(active, 4 * MS, _command(3 * MS + 1), q=far)
+    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, Cause.POSITION_LIMIT)
+
+
+def test_release_without_a_hold_changes_nothing(active: Driver) -> None:
+    active.release(2 * MS)
+    assert active.mode is Mode.ACTIVE
+
+
+def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
+    assert not active.damping(STILL, GRAVITY).any(), "an obeying driver adds no damping"
+    active.hold(2 * MS, Cause.STOP_REQUESTED, "operator")
+    np.testing.assert_array_equal(active.damping(STILL, GRAVITY), HOLD_DAMPING)
+    fast = np.array([1.7, -1.7, 1.7, 2.2, -2.4, 3.1, 3.1])
+    total = np.abs(active.damping(fast, GRAVITY) * fast) + np.abs(GRAVITY)
+    assert np.all(total <= lbr.TORQUE_LIMIT + 1e-9)

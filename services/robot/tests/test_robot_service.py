@@ -1,0 +1,270 @@
+"""The service against its contract: what it sends, when, and what it does when its inputs fail."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from palpate_bus.codec import decode, encode, message_type
+from palpate_bus.contract import contract
+from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_models import lbr
+from palpate_models.scenario import Robot, Scenario
+from palpate_robot.plant import GRAVITY
+from palpate_robot.service import RobotService, create
+
+MS = 1_000_000
+STATUS = message_type("palpation_msgs/msg/RobotStatus")
+REQUEST = message_type("palpation_msgs/msg/OperatorRequest")
+COMMAND = message_type("palpation_msgs/msg/JointTorqueCommand")
+WRENCH = message_type("geometry_msgs/msg/WrenchStamped")
+PARTS = message_type("geometry_msgs/msg/Wrench")
+VECTOR = message_type("geometry_msgs/msg/Vector3")
+
+
+class FakeInbox:
+    def __init__(self) -> None:
+        self.messages: dict[str, Any] = {}
+        self.events: dict[str, list[Any]] = {}
+        self.gone: set[str] = set()
+
+    def latest(self, topic: str) -> Any:
+        return self.messages.get(topic)
+
+    def new(self, topic: str) -> list[Any]:
+        return self.events.pop(topic, [])
+
+    def stamp(self, topic: str) -> int | None:
+        return None
+
+    def lost(self, role: str) -> bool:
+        return role in self.gone
+
+
+class Rig:
+    """A robot whose command law and tissue are functions of the last tick's outbox."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.robot: RobotService = create(scenario)
+        self.inbox = FakeInbox()
+        self.t = -MS
+        self.outbox: Mapping[str, Any] = {}
+        self.status: Any = None
+
+    def command(self, torque: np.ndarray, valid_ms: int = 50) -> None:
+        self.inbox.messages["control/joint_torque"] = COMMAND(header(self.t), np.asarray(torque), duration_message(valid_ms * MS))
+
+    def press(self, fx: float, fy: float, fz: float) -> None:
+        wrench = PARTS(VECTOR(fx, fy, fz), VECTOR(0.0, 0.0, 0.0))
+        self.inbox.messages["sim/contact_wrench"] = WRENCH(header(self.t, "world"), wrench)
+
+    def request(self, request: int) -> None:
+        self.inbox.events["operator/request"] = [REQUEST(header(self.t), request, "test")]
+
+    def tick(self, ticks: int = 1) -> None:
+        for _ in range(ticks):
+            self.t += MS
+            self.outbox = self.robot.step(self.t, self.inbox)
+            self.status = self.outbox.get("robot/status", self.status)
+
+    def servo(self, ticks: int, target: np.ndarray = lbr.HOME) -> None:
+        """Commands a joint impedance for a while."""
+        for _ in range(ticks):
+            self.tick()
+            state = self.outbox["joint_states"]
+            self.command(200.0 * (target - state.position) - 5.0 * state.velocity)
+
+    @property
+    def mode(self) -> tuple[int, int]:
+        while self.t % (10 * MS):
+            self.tick()
+        return self.status.mode, self.status.cause
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig(Scenario())
+
+
+def test_every_topic_comes_at_its_tick_and_keeps_its_ranges(rig: Rig) -> None:
+    topics = {topic.name: topic for topic in contract().outputs("robot")}
+    assert set(rig.robot.start()) == {name for name, topic in topics.items() if topic.latched}
+    for _ in range(60):
+        rig.tick()
+        due = {name for name, topic in topics.items() if topic.periodic and rig.t % topic.period == 0}
+        assert set(rig.outbox) == due
+        for name, message in rig.outbox.items():
+            topic = topics[name]
+            back = decode(encode(message, topic.type), topic.type)
+            stamped = back.transforms[0] if name == "sim/link_poses" else back
+            assert nanoseconds(stamped.header.stamp) == rig.t
+            assert stamped.header.frame_id == (topic.frame or "")
+
+
+def test_description_is_the_urdf(rig: Rig) -> None:
+    assert rig.robot.start()["robot_description"].data == lbr.urdf(Robot())
+
+
+def test_link_poses_name_every_link_once(rig: Rig) -> None:
+    rig.tick()
+    children = [transform.child_frame_id for transform in rig.outbox["sim/link_poses"].transforms]
+    assert children == list(lbr.LINK_NAMES)
+
+
+def test_first_tick_is_the_state_at_the_start(rig: Rig) -> None:
+    rig.tick()
+    np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME, atol=1e-5)
+    assert rig.mode == (STATUS.MODE_IDLE, STATUS.CAUSE_NONE)
+
+
+def test_holds_still_without_any_command(rig: Rig) -> None:
+    rig.tick(500)
+    np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME, atol=1e-5)
+    assert rig.mode[0] == STATUS.MODE_IDLE
+
+
+def test_sensor_topic_carries_weight_and_bias_until_tared(rig: Rig) -> None:
+    readings = []
+    for _ in range(400):
+        rig.tick()
+        force = rig.outbox["ft/wrench"].wrench.force
+        readings.append((force.x, force.y, force.z))
+    mean = np.mean(readings, axis=0)
+    weight = Robot().tool_mass_kg * GRAVITY
+    assert abs(mean[2] - weight) < Robot().ft_bias_n + 0.05
+    assert np.abs(mean - [0, 0, weight]).max() > 0.01, "a bias is there"
+    assert np.std(readings, axis=0) == pytest.approx([Robot().ft_noise_n] * 3, rel=0.2)
+
+
+def test_obeys_torque_and_tells_it(rig: Rig) -> None:
+    rig.servo(600, lbr.HOME + 0.02)
+    assert rig.mode == (STATUS.MODE_ACTIVE, STATUS.CAUSE_NONE)
+    np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME + 0.02, atol=2e-3)
+
+
+def test_effort_is_the_torque_of_the_command(rig: Rig) -> None:
+    rig.tick()
+    torque = np.arange(7.0) / 10
+    rig.command(torque)
+    rig.tick()
+    np.testing.assert_array_equal(rig.outbox["joint_states"].effort, torque)
+
+
+def test_silent_controller_brings_a_latched_hold_at_its_expiry(rig: Rig) -> None:
+    rig.servo(100)
+    sent = rig.t
+    rig.tick(50)
+    assert rig.robot.finish()["holds"] == []
+    rig.tick(1)
+    (hold,) = rig.robot.finish()["holds"]
+    assert hold["cause"] == "COMMAND_EXPIRED"
+    assert hold["t_s"] * 1e9 == pytest.approx(sent + 51 * MS)
+    rig.servo(100)
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_COMMAND_EXPIRED), "new commands do not unlatch it"
+    assert rig.status.reason
+    rig.request(REQUEST.RELEASE)
+    rig.servo(20)
+    assert rig.mode == (STATUS.MODE_ACTIVE, STATUS.CAUSE_NONE)
+
+
+def test_lost_controller_holds_at_the_next_tick(rig: Rig) -> None:
+    rig.servo(50)
+    rig.inbox.gone.add("control")
+    rig.tick()
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_COMMANDER_LOST)
+
+
+def test_operator_stops(rig: Rig) -> None:
+    rig.servo(50)
+    rig.request(REQUEST.STOP)
+    rig.tick()
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_STOP_REQUESTED)
+
+
+def test_nan_is_rejected_and_the_arm_does_not_jump(rig: Rig) -> None:
+    rig.servo(50)
+    rig.command(np.full(7, np.nan))
+    rig.tick(100)
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_INVALID_COMMAND)
+    assert rig.status.commands_rejected == 1
+    np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME, atol=1e-3)
+
+
+def test_hard_contact_holds(rig: Rig) -> None:
+    rig.servo(50)
+    rig.press(0.0, 0.0, 45.0)
+    rig.servo(3)
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_FORCE_LIMIT)
+
+
+def test_working_force_does_not_hold(rig: Rig) -> None:
+    rig.servo(50)
+    rig.press(0.0, 0.0, 15.0)
+    rig.servo(100)
+    assert rig.mode[0] == STATUS.MODE_ACTIVE
+
+
+def test_runaway_command_is_stopped_at_a_limit(rig: Rig) -> None:
+    rig.tick()
+    while rig.robot.finish()["mode"] != "SAFE_HOLD" and rig.t < 3_000 * MS:
+        rig.command(np.array([0, 0, 0, 0, 0, 0, 38.0]))
+        rig.tick()
+    (hold,) = rig.robot.finish()["holds"]
+    assert hold["cause"] in ("VELOCITY_LIMIT", "POSITION_LIMIT")
+    rig.tick(300)
+    assert np.abs(rig.outbox["joint_states"].velocity).max() < 0.05, "and damped to rest"
+
+
+def test_held_arm_yields_to_tissue_so_the_force_falls(rig: Rig) -> None:
+    """A spring under the indenter: from the hold on, the force never rises above what it was, and falls."""
+    stiffness = 1000.0
+    rig.servo(20)
+    start = rig.outbox["sim/tool_state"].pose.position.z
+    rest = start + 0.005  # so 5 N at once
+    forces = []
+    for tick in range(1500):
+        z = rig.outbox["sim/tool_state"].pose.position.z
+        forces.append(stiffness * max(0.0, rest - z))
+        rig.press(0.0, 0.0, forces[-1])
+        if tick < 200:
+            rig.servo(1)
+        else:
+            rig.inbox.gone.add("control")
+            rig.tick()
+    held = np.array(forces[202:])
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_COMMANDER_LOST)
+    assert held.max() <= forces[201] + 0.02
+    assert held[-1] < 0.8 * held[0]
+
+
+def test_runs_are_identical_to_the_bit_and_seeds_differ() -> None:
+    def run(seed: int) -> list[bytes]:
+        rig = Rig(Scenario(seed=seed))
+        sent = []
+        for _ in range(120):
+            rig.press(0.5, 0.0, 2.0)
+            rig.servo(1, lbr.HOME + 0.01)
+            sent += [encode(m, contract().topics[name].type) for name, m in rig.outbox.items()]
+        return sent
+
+    assert run(7) == run(7)
+    assert run(7) != run(8)
+
+
+def test_outbox_is_not_changed_by_later_steps(rig: Rig) -> None:
+    rig.servo(5)
+    before = rig.outbox
+    topics = contract().topics
+    bytes_before = {name: encode(message, topics[name].type) for name, message in before.items()}
+    rig.press(1.0, 2.0, 3.0)
+    rig.servo(50, lbr.HOME + 0.1)
+    assert bytes_before == {name: encode(message, topics[name].type) for name, message in before.items()}
+
+
+def test_phantom_never_reaches_the_robot() -> None:
+    a, b = (Rig(Scenario.model_validate({"phantom": {"edge_m": edge}})) for edge in (0.005, 0.01))
+    a.tick(20)
+    b.tick(20)
+    topics = contract().topics
+    for name in a.outbox:
+        assert encode(a.outbox[name], topics[name].type) == encode(b.outbox[name], topics[name].type)
