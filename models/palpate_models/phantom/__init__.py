@@ -7,7 +7,8 @@
 
 from __future__ import annotations
 
+from palpate_models.phantom.flat import flat_phantom
 from palpate_models.phantom.mesh import MeshError
 from palpate_models.phantom.model import PhantomModel, build_phantom, quadrant
 
-__all__ = ["MeshError", "PhantomModel", "build_phantom", "quadrant"]
+__all__ = ["MeshError", "PhantomModel", "build_phantom", "flat_phantom", "quadrant"]

@@ -29,8 +29,8 @@ def smoothstep(t: Array) -> Array:
 def gaussian_field(points: Array, correlation_m: float, seed: int) -> Array:
     """A zero-mean, unit-variance Gaussian random field at points (n, 3) [m], shape (n,).
 
-    Covariance exp(-r^2 / (2 correlation_m^2)), by random Fourier features (Rahimi and Recht 2007): a function of position,
-    so the field does not depend on the mesh.
+    Covariance exp(-r^2 / (2 correlation_m^2)), by random Fourier features (Rahimi and Recht 2007): a function of
+    position, so the field does not depend on the mesh.
     """
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, zlib.crc32(b"phantom")])))
     frequencies = rng.standard_normal((3, _FEATURES)) / correlation_m
@@ -52,21 +52,19 @@ def background_factor(points: Array, background: Background, half_length: float,
 
 
 def edge_distance(xy: Array, lesion: Lesion) -> Array:
-    """Distance [m] of points (n, 2) from a lesion's half-contrast ellipse, negative inside, to first order; shape (n,)."""
+    """Distance [m] of points (n, 2) from a lesion's half-contrast ellipse, to first order; negative inside; (n,)."""
     offset = xy - np.asarray(lesion.centre_m)
     radii = np.asarray(lesion.radii_m)
     rho = np.sqrt(((offset / radii) ** 2).sum(axis=1))
     slope = np.sqrt(((offset / radii**2) ** 2).sum(axis=1))
-    return np.where(rho > 1e-6, (rho - 1) * rho / np.maximum(slope, 1e-9), -radii.min())
+    return np.asarray(np.where(rho > 1e-6, (rho - 1) * rho / np.maximum(slope, 1e-9), -radii.min()))
 
 
-def lesion_field(
-    xy: Array, lesions: Sequence[Lesion], front: NDArray[np.bool_] | None = None
-) -> tuple[Array, NDArray[np.int32]]:
+def lesion_field(xy: Array, lesions: Sequence[Lesion], front: NDArray[np.bool_] | None = None) -> tuple[Array, NDArray[np.int32]]:
     """Stiffness with lesions over stiffness without, and the lesion that a point belongs to (-1: none), both (n,).
 
-    The contrast rises over `edge_m`, centred on the outline, so the outline is where it is half. Where lesions overlap, the
-    stiffer one counts. Only points where `front` is true can belong to a lesion.
+    The contrast rises over `edge_m`, centred on the outline, so the outline is where it is half. Where lesions overlap,
+    the stiffer one counts. Only points where `front` is true can belong to a lesion.
     """
     factor = np.ones(len(xy))
     label = np.full(len(xy), -1, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Triangle meshes from files: checked, oriented, refined where examined. Errors say what is wrong, where, and what to do."""
+"""Triangle meshes from files: checked, oriented, refined where examined. Errors say what is wrong and where."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Surface:
 
 
 def load_mesh(path: Path, edge_m: float) -> Surface:
-    """The surface in an OBJ, STL or PLY file (metres, abdomen frame), with edges up to `edge_m` [m] where it is examined.
+    """The surface in an OBJ, STL or PLY file (metres, abdomen frame), with edges up to `edge_m` [m] where examined.
 
-    Raises MeshError if the file is missing, unreadable, empty, not in metres, not at the origin, degenerate, non-manifold, in
-    several pieces, not orientable or too fine.
+    Raises MeshError if the file is missing, unreadable, empty, not in metres, not at the origin, degenerate,
+    non-manifold, in several pieces, not orientable or too fine.
     """
     import trimesh  # noqa: PLC0415 - only user meshes need it, and it takes 0.3 s to import
 
@@ -77,8 +77,8 @@ def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
     scale = float(np.ptp(vertices, axis=0).max()) or 1.0
     _, first, inverse = np.unique(np.round(vertices / (scale * 1e-7)), axis=0, return_index=True, return_inverse=True)
     triangles = inverse.reshape(-1)[triangles].astype(np.int32)
-    used, triangles = np.unique(triangles, return_inverse=True)
-    return vertices[first][used], triangles.reshape(-1, 3).astype(np.int32)
+    used, inverse = np.unique(triangles, return_inverse=True)
+    return vertices[first][used], inverse.reshape(-1, 3).astype(np.int32)
 
 
 def check(vertices: Array, triangles: IntArray) -> None:
@@ -95,9 +95,7 @@ def check(vertices: Array, triangles: IntArray) -> None:
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     flat = np.flatnonzero(double_areas <= 1e-6 * longest**2)
     if len(flat):
-        raise MeshError(
-            f"{len(flat)} degenerate triangles (no area), the first at {_place(corners[flat[0]])}: remove them"
-        )
+        raise MeshError(f"{len(flat)} degenerate triangles (no area), the first at {_place(corners[flat[0]])}: remove them")
     edges = np.sort(_half_edges(triangles), axis=1)
     unique, count = np.unique(edges, axis=0, return_counts=True)
     crowded = np.flatnonzero(count > 2)
@@ -222,17 +220,13 @@ def _check_fans(vertices: Array, triangles: IntArray) -> None:
     for vertex in edge.T:  # corner k of face f is node 3 f + k; corners at the same vertex are joined across the edge
         rows.append(3 * f + np.argmax(triangles[f] == vertex[:, None], axis=1))
         columns.append(3 * g + np.argmax(triangles[g] == vertex[:, None], axis=1))
-    graph = sparse.coo_array(
-        (np.ones(2 * len(f)), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * m, 3 * m)
-    )
+    graph = sparse.coo_array((np.ones(2 * len(f)), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * m, 3 * m))
     _, fan = connected_components(graph, directed=False)
     fans = np.unique(np.column_stack((triangles.ravel(), fan)), axis=0)
     touched, count = np.unique(fans[:, 0], return_counts=True)
     if (count > 1).any():
         where = _place(vertices[touched[count > 1][:1]])
-        raise MeshError(
-            f"non-manifold: surfaces touch in {int((count > 1).sum())} single vertices, the first at {where}"
-        )
+        raise MeshError(f"non-manifold: surfaces touch in {int((count > 1).sum())} single vertices, the first at {where}")
 
 
 def _half_edges(triangles: IntArray) -> IntArray:

@@ -24,7 +24,7 @@ _POSTERIOR_M = 0.010
 
 @dataclass(frozen=True)
 class PhantomModel:
-    """A phantom at rest, in the abdomen frame A (origin at the umbilicus, x to the patient's left, y to the head, z outward)."""
+    """A phantom at rest, in the abdomen frame A: origin at the umbilicus, x to the patient's left, y to the head, z outward."""
 
     vertices: Array
     """Vertex positions at rest [m], shape (n, 3), in A."""
@@ -35,7 +35,7 @@ class PhantomModel:
     areas: Array
     """Area that belongs to each vertex [m^2], shape (n,)."""
     laplacian: sparse.csr_array
-    """Positive semi-definite cotangent Laplacian [1], shape (n, n), of the intrinsic Delaunay triangulation: no edge pulls apart."""
+    """Cotangent Laplacian [1] of the intrinsic Delaunay triangulation, shape (n, n): every edge weight is >= 0."""
     stiffness: Array
     """Instantaneous foundation modulus k_w [N/m^3], shape (n,), with lesions."""
     background: Array
@@ -49,7 +49,7 @@ class PhantomModel:
 
 
 def quadrant(x: float, y: float) -> str:
-    """The quadrant of a point of the abdomen frame [m]: RUQ, LUQ, RLQ or LLQ. The patient's right is x < 0, lower is y < 0."""
+    """The quadrant of a point of A [m]: RUQ, LUQ, RLQ or LLQ. The patient's right is x < 0, lower is y < 0."""
     return ("R" if x < 0 else "L") + ("L" if y < 0 else "U") + "Q"
 
 

@@ -1,8 +1,8 @@
 """The default phantom's shape: a supine abdomen from the costal margin to the pelvis, lying on the table.
 
-Cross sections are superellipses; the crown line is slightly domed, the waist narrower than ribs and hips, and the costal arch, the
-iliac crests and the umbilicus show. The mesh is a hexagonal lattice of edges up to `edge_m` in the examined region (0.20 x 0.20 m
-about the umbilicus and a margin), and rings that grow coarser outside.
+Cross sections are superellipses; the crown line is slightly domed, the waist narrower than ribs and hips, and the costal
+arch, the iliac crests and the umbilicus show. The mesh is a hexagonal lattice of edges up to `edge_m` in the examined
+region (0.20 x 0.20 m about the umbilicus and a margin), and rings that grow coarser outside.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EXPONENT = 2.4
 DOME_M = 0.014
 """The crown line's fall at both ends."""
 UMBILICUS_M = (0.0015, 0.009)
-"""Depth and radius (standard deviation) of the umbilicus: an indenter of 15 mm follows it (radius of curvature 54 mm)."""
+"""Depth and radius (standard deviation) of the umbilicus: an indenter follows it (radius of curvature 54 mm)."""
 COSTAL_RISE_M = 0.004
 """The rib cage stands out above the costal arch."""
 ILIAC_RISE_M = 0.005
@@ -37,7 +37,7 @@ _GROWTH = 0.23
 
 @dataclass(frozen=True)
 class Shape:
-    """A closed surface in A: vertices (n, 3) [m], triangles (m, 3), outward unit normals (n, 3), and which vertices are fixed (n,)."""
+    """A closed surface in A: vertices (n, 3) [m], triangles (m, 3), outward normals (n, 3), fixed vertices (n,)."""
 
     vertices: Array
     triangles: NDArray[np.int32]
@@ -46,7 +46,7 @@ class Shape:
 
 
 class _Body:
-    """Maps (s, y) to the surface: s is the arc length from the crown along the section at the umbilicus, positive to the left."""
+    """Maps (s, y) to the surface: s is the arc length from the crown along the middle section, positive to the left."""
 
     def __init__(self, size_m: tuple[float, float, float]) -> None:
         width, length, self.height = size_m
@@ -85,13 +85,13 @@ class _Body:
         return np.column_stack((x, y, -self.height + share * (self.height + relief)))
 
 
-def _lattice(half_s: float, half_y: float, edge: float) -> Array:
+def lattice(half_s: float, half_y: float, edge: float) -> Array:
     """Hexagonal lattice with a point at the origin in a rectangle, shape (n, 2)."""
     rows = int(half_y / (edge * np.sqrt(3) / 2))
     columns = int(half_s / edge) + 1
     j, i = np.mgrid[-rows : rows + 1, -columns : columns + 1]
     points = np.column_stack(((i + (j % 2) / 2).ravel() * edge, j.ravel() * edge * np.sqrt(3) / 2))
-    return points[np.abs(points[:, 0]) <= half_s]
+    return np.asarray(points[np.abs(points[:, 0]) <= half_s])
 
 
 def _rings(half_s: float, half_y: float, outer: tuple[float, float], edge: float) -> Array:
@@ -130,7 +130,7 @@ def _strip(left: NDArray[np.intp], right: NDArray[np.intp]) -> NDArray[np.int32]
     quads = np.column_stack((left[:-1], right[:-1], right[1:], left[1:]))
     triangles = np.concatenate((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]))
     degenerate = (triangles[:, 0] == triangles[:, 1]) | (triangles[:, 1] == triangles[:, 2])
-    return triangles[~degenerate].astype(np.int32)
+    return np.asarray(triangles[~degenerate], dtype=np.int32)
 
 
 def _plan(body: _Body, edge: float) -> tuple[Array, int]:
@@ -140,7 +140,7 @@ def _plan(body: _Body, edge: float) -> tuple[Array, int]:
         min(EXAMINED_HALF_M, 0.8 * body.half_length),
     )
     outer = (body.half_arc, body.half_length)
-    inside = np.concatenate((_lattice(half_s, half_y, edge), _rings(half_s, half_y, outer, edge)))
+    inside = np.concatenate((lattice(half_s, half_y, edge), _rings(half_s, half_y, outer, edge)))
     end = _graded(outer[0], outer[1] - half_y, half_s, edge)
     side = _graded(outer[1], outer[0] - half_s, half_y, edge)[:-1]
     s_end = np.concatenate((-end[:0:-1], end))
@@ -165,7 +165,7 @@ def _close(plan: Array, inner: int, outer: tuple[float, float]) -> NDArray[np.in
 
 @lru_cache(maxsize=8)
 def parametric_surface(size_m: tuple[float, float, float], edge_m: float) -> Shape:
-    """The parametric abdomen of width, length and height `size_m` [m], with edges up to `edge_m` [m] where it is examined.
+    """The parametric abdomen of width, length and height `size_m` [m], edges up to `edge_m` [m] where it is examined.
 
     The surface is closed: its ends and back are flat, and fixed. The umbilicus is a vertex at the origin of A.
     """

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import ArpackNoConvergence, eigsh
-
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Stiffness
+from scipy import sparse
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 Array = NDArray[np.float64]
 
@@ -55,8 +54,9 @@ class Mechanics:
 def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
     """The matrices of a phantom.
 
-    Pasternak's G = k_w l^2 varies with k_w. An edge between two vertices carries the harmonic mean of their G, as between cells of
-    a finite-volume scheme: the same shear flows through both halves. Fixed vertices keep u = 0.
+    Pasternak's G = k_w l^2 varies with k_w. An edge between two vertices carries the harmonic mean of their G, as
+    between cells of a finite-volume scheme: the same shear flows through both halves. It also keeps the bound low at
+    sharp contrasts. Fixed vertices keep u = 0.
     """
     free = ~model.fixed
     edges = sparse.coo_array(model.laplacian)

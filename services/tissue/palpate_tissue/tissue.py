@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Breathing, Stiffness
 from scipy.linalg.blas import daxpy, dscal
 from scipy.sparse import _sparsetools
 from scipy.spatial import cKDTree
 
-from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Breathing, Stiffness
 from palpate_tissue.friction import Friction, shear_stiffness
 from palpate_tissue.mechanics import assemble
 
@@ -37,8 +37,9 @@ _RIM = 0.2
 class _Candidates:
     """Vertices that the sphere might hold while its centre stays near `origin`; m of them.
 
-    `project @ (q, 1, R^2 - q^2)` for q = p - origin gives how far the centre is below each vertex, along its inward normal [m], and
-    then R^2 - |p - X|^2 [m^2]. `collect` sums what belongs to each vertex: outward normal, position from origin [m], and one.
+    `project @ (q, 1, R^2 - q^2)` for q = p - origin gives how far the centre is below each vertex, along its inward
+    normal [m], and then R^2 - |p - X|^2 [m^2]. `collect` holds what is summed over them: outward normal, position from
+    origin [m], and one.
     """
 
     origin: list[float]  # [m], in A
@@ -245,9 +246,7 @@ class Tissue:
             reach=reach,
             radius=radius,
             index=index,
-            project=np.vstack(
-                (np.column_stack((-normals, height, zero)), np.column_stack((2 * positions, -square, one)))
-            ),
+            project=np.vstack((np.column_stack((-normals, height, zero)), np.column_stack((2 * positions, -square, one)))),
             collect=np.column_stack((normals, positions, one)),
             breathing=model.breathing[index],
             gain=self._gain[index],
@@ -261,7 +260,7 @@ class Tissue:
         near = self._candidates
         if near is None or not self.touching:
             return np.empty(0, dtype=np.intp)
-        return near.index[near.weights[0] > 0]
+        return np.asarray(near.index[near.weights[0] > 0])
 
     @property
     def contact_forces(self) -> Array:
@@ -269,7 +268,7 @@ class Tissue:
         near = self._candidates
         if near is None or not self.touching:
             return np.empty(0)
-        return near.weights[0][near.weights[0] > 0]
+        return np.asarray(near.weights[0][near.weights[0] > 0])
 
     @property
     def inward(self) -> Array:
