@@ -1,0 +1,122 @@
+"""The order of things on the surface: from targets to strokes, each a smooth curve in the abdomen's xy plane.
+
+Snake: lines joined by arcs, one stroke in contact. Raster: a stroke a line, retracted in between. Mode point: a stroke a
+target. A skipped target ends a stroke: what the arm can't reach it must not slide over either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.scenario import Mode, Pattern
+from scipy.interpolate import CubicSpline
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+SAMPLE_M = 0.002
+"""Spacing of the samples of a stroke."""
+JOIN_SPACINGS = 2.5
+"""Line ends farther apart than this many spacings are not joined in contact."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stroke:
+    """A curve to follow at depth. A single sample is a point to indent."""
+
+    xy: Array
+    """Samples in frame A [m], about `SAMPLE_M` apart, shape (n, 2)."""
+    targets: Ints
+    """Indices of the targets that it visits, in order, shape (m,)."""
+    visits: Ints
+    """Sample at which each of them is reached, shape (m,)."""
+
+
+def line_through(points: Array) -> tuple[Array, Ints]:
+    """A smooth curve through points, shape (k, 2): samples (n, 2), and the sample of each point. Chord-length spline."""
+    if len(points) == 1:
+        return points.copy(), np.zeros(1, dtype=np.int64)
+    chords = np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6)
+    knots = np.concatenate(([0.0], np.cumsum(chords)))
+    counts = np.maximum(1, np.round(chords / SAMPLE_M).astype(int))
+    u = np.concatenate([np.linspace(a, b, k, endpoint=False) for (a, b), k in zip(pairwise(knots), counts, strict=True)])
+    u = np.append(u, knots[-1])
+    curve = CubicSpline(knots, points, bc_type="natural") if len(points) > 2 else None
+    xy = curve(u) if curve else points[0] + (points[1] - points[0]) * (u / knots[-1])[:, None]
+    return np.asarray(xy), np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
+
+
+def arc(p0: Array, t0: Array, p1: Array, t1: Array) -> Array:
+    """The curve that joins p0, left along unit t0, to p1, entered along unit t1: inner samples, shape (n, 2).
+
+    A cubic Bezier with handles of 2/3 of the gap: for two opposite tangents across the gap it is a semicircle to 2 %.
+    """
+    gap = float(np.linalg.norm(p1 - p0))
+    b1, b2 = p0 + t0 * (2 / 3 * gap), p1 - t1 * (2 / 3 * gap)
+    length = 0.5 * (gap + float(np.linalg.norm(b1 - p0) + np.linalg.norm(b2 - b1) + np.linalg.norm(p1 - b2)))
+    u = np.linspace(0.0, 1.0, max(2, round(length / SAMPLE_M)) + 1)[1:-1, None]
+    return np.asarray((1 - u) ** 3 * p0 + 3 * u * (1 - u) ** 2 * b1 + 3 * u**2 * (1 - u) * b2 + u**3 * p1)
+
+
+def _runs(lines: Ints, usable: Bools, *, pointwise: bool) -> list[Ints]:
+    """Unbroken runs of usable targets within one line, in order."""
+    runs: list[list[int]] = []
+    for i in np.flatnonzero(usable):
+        joined = runs and not pointwise and runs[-1][-1] == i - 1 and lines[i - 1] == lines[i]
+        if joined:
+            runs[-1].append(int(i))
+        else:
+            runs.append([int(i)])
+    return [np.array(run, dtype=np.int64) for run in runs]
+
+
+def _direction(a: Array, b: Array) -> Array:
+    return np.asarray((b - a) / max(float(np.linalg.norm(b - a)), 1e-9))
+
+
+def strokes(xy: Array, lines: Ints, usable: Bools, pattern: Pattern, mode: Mode, spacing: float) -> list[Stroke]:
+    """Strokes that visit all usable targets in their order.
+
+    Args:
+        xy: targets in frame A [m], shape (n, 2), in coverage order.
+        lines: index of each target's scan line, shape (n,).
+        usable: whether it may be visited, shape (n,).
+        pattern: joins line ends (snake) or not (raster).
+        mode: continuous, or a stroke a target.
+        spacing: distance of the lines [m].
+    """
+    pieces = []
+    for run in _runs(lines, usable, pointwise=mode is Mode.POINT):
+        samples, visits = line_through(xy[run])
+        pieces.append(Stroke(samples, run, visits))
+    if pattern is not Pattern.SNAKE or mode is Mode.POINT:
+        return pieces
+    joined: list[Stroke] = []
+    for piece in pieces:
+        last = joined[-1] if joined else None
+        near = last is not None and np.linalg.norm(piece.xy[0] - last.xy[-1]) <= JOIN_SPACINGS * spacing
+        if last is None or not near or last.targets[-1] != piece.targets[0] - 1 or min(len(last.xy), len(piece.xy)) < 2:
+            joined.append(piece)
+            continue
+        t0, t1 = _direction(last.xy[-2], last.xy[-1]), _direction(piece.xy[0], piece.xy[1])
+        bridge = arc(last.xy[-1], t0, piece.xy[0], t1)
+        offset = len(last.xy) + len(bridge)
+        joined[-1] = Stroke(
+            np.vstack((last.xy, bridge, piece.xy)),
+            np.concatenate((last.targets, piece.targets)),
+            np.concatenate((last.visits, piece.visits + offset)),
+        )
+    return joined
+
+
+def transfer(a: Array, b: Array) -> Array:
+    """Samples of the straight way above the surface from a to b in frame A, shape (n, 2)."""
+    length = float(np.linalg.norm(b - a))
+    if length < 1e-6:
+        return a[None].copy()
+    n = max(2, round(length / SAMPLE_M) + 1)
+    return np.asarray(a + (b - a) * np.linspace(0.0, 1.0, n)[:, None])

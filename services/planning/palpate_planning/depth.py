@@ -1,0 +1,112 @@
+"""Depth regulation: the sphere's true depth at its set-point, on soft and stiff tissue, and never more than so much force.
+
+Depth d is measured: radius minus the signed distance of the sphere's centre (forward kinematics) from the perceived rest
+surface. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F - F_ff)/K_z. So
+
+    F_ff = a LP(F)                          feed-forward of the measured force, a < 1: positive feedback of gain below one
+    d_c  = d_r + k_i integral(d_r - d) - g  a slow integral for what is left: friction, model error
+    d_r  -> min(target, d (F_max/F_p)^(1/1.45))   the depth at which the force would be F_max (F ~ d^1.45, facts.md)
+    g'   = w (F_p - F_max)/K_z, g >= 0      guard that needs no tissue model: a hard surface, a wrong exponent
+
+with F_p = F + tau dF/dt the force expected when the command takes effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+EXPONENT = 1.45
+"""Local exponent of force against depth, 5 to 15 mm (facts.md)."""
+FORCE_FRACTION = 0.9
+"""Part of the working force limit at which depth yields."""
+FEED_FORWARD = 0.9
+"""a: below one, so that even a rigid surface does not wind the force up."""
+FORCE_LAG_S = 0.02
+"""Low-pass of the measured force."""
+RATE_LAG_S = 0.03
+"""Low-pass of its derivative."""
+LEAD_S = 0.08
+"""tau: delay of the command (20 ms) and rise of the impedance (about 60 ms)."""
+INTEGRAL_PER_S = 4.0
+"""k_i: well below the impedance's bandwidth of about 5 Hz."""
+INTEGRAL_MAX_M = 0.004
+INTEGRAL_FADE_S = 0.1
+"""Out of contact the integral fades."""
+GUARD_PER_S = 10.0
+"""w."""
+GUARD_MAX_M = 0.02
+YIELD_LAG_S = 0.03
+"""Smoothing of d_r."""
+YIELD_MPS = 0.08
+RETURN_MPS = 0.02
+"""Fastest d_r towards the surface and, after yielding, back into the tissue."""
+MODEL_DEPTH_M = 0.003
+"""Shallower than this the power law says little."""
+LIMITED_M = 0.0002
+"""Yielding by more than this is reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class Regulation:
+    """What the regulator asks for at one step."""
+
+    depth: float
+    """Depth to command [m]."""
+    rate: float
+    """Its rate [m/s]."""
+    reference: float
+    """The depth aimed at [m]: the target, or less where force limits it."""
+    force: float
+    """Normal feed-forward force [N], positive into the tissue."""
+    limited: bool
+    """Whether depth yields to the force limit."""
+    expected_force: float
+    """F_p [N]."""
+
+
+class DepthRegulator:
+    """Regulates one stroke; `reset` before the next. One call a planning period."""
+
+    def __init__(self, period: float, stiffness: float, force_working: float, depth_max: float) -> None:
+        """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N], `depth_max` [m]."""
+        self._dt, self._stiffness, self._depth_max = period, stiffness, depth_max
+        self.force_max = FORCE_FRACTION * force_working
+        self.reset(0.0)
+
+    def reset(self, depth: float) -> None:
+        """Starts at rest at a commanded depth [m], negative above the surface."""
+        self._force = self._raw = self._slope = 0.0
+        self._integral = self._guard = self._yield = 0.0
+        self._command = depth
+
+    def update(self, target: float, depth: float, force: float, in_contact: bool) -> Regulation:
+        """One step: target depth, measured depth [m], measured normal force [N], whether the tissue is touched."""
+        dt = self._dt
+        self._slope += dt / (RATE_LAG_S + dt) * ((force - self._raw) / dt - self._slope)
+        self._raw = force
+        self._force += dt / (FORCE_LAG_S + dt) * (force - self._force)
+        expected = self._force + LEAD_S * max(self._slope, 0.0)
+
+        self._guard += dt * GUARD_PER_S * (expected - self.force_max) / self._stiffness
+        self._guard = min(max(self._guard, 0.0), GUARD_MAX_M)
+        allowed = target
+        if depth > MODEL_DEPTH_M and expected > 0.5 * self.force_max:
+            allowed = min(target, depth * (self.force_max / expected) ** (1.0 / EXPONENT))
+        step = (target - allowed - self._yield) * dt / (YIELD_LAG_S + dt)
+        self._yield = max(0.0, self._yield + min(max(step, -RETURN_MPS * dt), YIELD_MPS * dt))
+        reference = target - self._yield
+
+        error = reference - depth
+        if in_contact and abs(error) < INTEGRAL_MAX_M:
+            self._integral += dt * INTEGRAL_PER_S * error
+            self._integral = min(max(self._integral, -INTEGRAL_MAX_M), INTEGRAL_MAX_M)
+        elif not in_contact:
+            self._integral -= dt / INTEGRAL_FADE_S * self._integral
+        command = min(reference + self._integral - self._guard, self._depth_max)
+        rate = (command - self._command) / dt
+        self._command = command
+        feed = FEED_FORWARD * min(max(self._force, 0.0), self.force_max)
+        limited = self._yield + self._guard > LIMITED_M
+        return Regulation(command, float(np.clip(rate, -0.2, 0.2)), reference, feed, limited, expected)

@@ -1,0 +1,343 @@
+"""The examination as a state machine: home, look, plan, approach, indent, scan, retract, return, assess, done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models import lbr
+from palpate_models.scenario import ExamInput
+
+from palpate_planning.follow import Follower
+from palpate_planning.kinematics import Kinematics
+from palpate_planning.look import look_postures
+from palpate_planning.measure import Contact, ContactSense, Reading
+from palpate_planning.motion import NoPathError
+from palpate_planning.palpation import Doing, Palpation, Progress
+from palpate_planning.prepare import ExamPlan, Planner, Seen
+from palpate_planning.setpoint import ControlMode, Setpoint
+from palpate_planning.surface import Surface
+from palpate_planning.thinking import Thought
+from palpate_planning.timing import JointTrajectory
+from palpate_planning.weight import ToolWeight
+
+Array = NDArray[np.float64]
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+LOOKS_MAX = 3
+REST = 200 * MS
+"""Time at rest before looking or taring [ns]: the arm's oscillations fade."""
+TARE = 300 * MS
+"""Time of taring [ns]: 300 readings of 0.05 N noise leave 3 mN."""
+LOOK_PATIENCE = 3 * SECOND
+"""How long perception may take beyond the burst."""
+FRAME = 100 * MS
+MOTION_BUDGET = 200 * MS
+"""Simulated time that planning one free motion takes."""
+PLAN_BUDGET = 2 * SECOND
+"""Simulated time that planning the examination takes."""
+ASSESS_PATIENCE = 30 * SECOND
+END_AFTER = SECOND
+"""The run goes on so long after the exam has ended."""
+AT_HOME_RAD = 0.01
+
+
+class Phase(IntEnum):
+    """As in palpation_msgs/ExamState."""
+
+    HOME = 0
+    LOOK = 1
+    PLAN = 2
+    APPROACH = 3
+    INDENT = 4
+    SCAN = 5
+    RETRACT = 6
+    RETURN = 7
+    ASSESS = 8
+    DONE = 9
+    ABORTED = 10
+
+
+PHASE_OF = {
+    Doing.DESCEND: Phase.INDENT,
+    Doing.SETTLE: Phase.INDENT,
+    Doing.SLIDE: Phase.SCAN,
+    Doing.HOLD: Phase.SCAN,
+    Doing.LIFT: Phase.RETRACT,
+    Doing.TRANSFER: Phase.RETRACT,
+    Doing.DONE: Phase.RETRACT,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Unseen:
+    """Perception's answer when it could not give targets."""
+
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """All that planning knows at a step."""
+
+    t: int
+    """[ns]"""
+    reading: Reading | None
+    """None before the first joint states."""
+    seen: Seen | Unseen | None = None
+    """Perception's answer, at the step at which it came."""
+    findings_final: bool = False
+    stop: str = ""
+    """Why the driver holds safely or the operator stops; empty when all is well."""
+    lost: tuple[str, ...] = ()
+    """Roles whose services are gone."""
+
+
+@dataclass(slots=True)
+class ExamStatus:
+    """What exam/state says. World frame; the contact values are those of `contact`."""
+
+    phase: Phase = Phase.HOME
+    message: str = "waiting for the robot"
+    target_index: int = 0
+    target_count: int = 0
+    targets_skipped: int = 0
+    steady: bool = False
+    force_limited: bool = False
+    view_blocked: bool = False
+    depth_setpoint: float = 0.0
+    end_tick: int = -1
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a step asks for."""
+
+    setpoint: Setpoint
+    contact: Contact | None
+    """None before the robot has been heard of."""
+    trigger: bool = False
+    """Ask the camera for a burst now."""
+    path: Array | None = None
+    """Planned poses of the indenter at depth, shape (n, 4, 4), once."""
+
+
+class Exam:
+    """Runs one examination. `step` each planning period; `status` says where it stands."""
+
+    def __init__(self, known: ExamInput) -> None:
+        self._known = known
+        self._kinematics = Kinematics(known.robot, known.limits)
+        plane = Surface.plane(np.array(known.X_WA))
+        self._sense = ContactSense(self._kinematics, ToolWeight.of(known.robot), plane, known.robot.indenter_radius_m)
+        self._planner = Planner(known)
+        self._looks = look_postures(known)
+        self._follower = Follower(self._kinematics, np.array(lbr.HOME))
+        self.status = ExamStatus()
+        self._steps: dict[Phase, Callable[[Observation], Setpoint | None]] = {
+            Phase.HOME: self._home,
+            Phase.LOOK: self._look,
+            Phase.PLAN: self._plan,
+            Phase.APPROACH: self._approach,
+            Phase.INDENT: self._palpate,
+            Phase.SCAN: self._palpate,
+            Phase.RETRACT: self._palpate,
+            Phase.RETURN: self._return,
+            Phase.ASSESS: self._assess,
+            Phase.DONE: self._rest,
+            Phase.ABORTED: self._rest,
+        }
+        self._since = 0
+        self._started = False
+        self._attempts = 0
+        self._trigger = False
+        self._path: Array | None = None
+        self._asked: int | None = None
+        self._seen: Seen | None = None
+        self._plan_made: ExamPlan | None = None
+        self._motion: Thought[JointTrajectory] | None = None
+        self._thought: Thought[ExamPlan] | None = None
+        self._palpation: Palpation | None = None
+        self._skipped: dict[int, str] = {}
+        self._broken = ""
+
+    @property
+    def skipped(self) -> dict[int, str]:
+        """Skipped targets with the reason."""
+        return dict(self._skipped)
+
+    def step(self, now: Observation) -> Outcome:
+        """One planning period. Until the robot has been heard of, the arm is asked for nothing."""
+        if now.reading is None:
+            q = np.array(lbr.HOME)
+            return Outcome(Setpoint(ControlMode.JOINT, self._kinematics.pose(q), q, limp=True), None)
+        if not self._started:
+            self._started = True
+            self._follower.hold(now.reading.q)
+            self._enter(Phase.HOME, now.t, "going home")
+        self.status.steady = self.status.force_limited = False
+        self._trigger, self._path = False, None
+        self._contact = self._sense.sense(now.reading)
+        self.status.depth_setpoint = self._contact.depth
+        self._watch(now)
+        setpoint = self._steps[self.status.phase](now) or self._follower.step()
+        return Outcome(setpoint, self._contact, self._trigger, self._path)
+
+    # --- transitions --------------------------------------------------------------------------------------------------
+
+    def _enter(self, phase: Phase, t: int, message: str) -> None:
+        self.status.phase, self.status.message = phase, message
+        self._since = t
+        if phase in (Phase.DONE, Phase.ABORTED):
+            self.status.end_tick = t + END_AFTER
+
+    def _abort(self, now: Observation, why: str) -> None:
+        """Ends the exam where the arm is; it holds still."""
+        assert now.reading is not None
+        self._follower.hold(now.reading.q)
+        self._enter(Phase.ABORTED, now.t, f"aborted in phase {self.status.phase.name}: {why}")
+
+    def _watch(self, now: Observation) -> None:
+        """Ends the exam when the driver holds, an operator stops it, or a service that it needs is gone."""
+        if self.status.phase in (Phase.DONE, Phase.ABORTED):
+            return
+        if now.stop:
+            self._abort(now, now.stop)
+        elif now.lost:
+            why = f"lost {', '.join(now.lost)}"
+            if self._palpation is None or self.status.phase not in (Phase.INDENT, Phase.SCAN, Phase.RETRACT):
+                self._abort(now, why)
+            else:
+                self._palpation.abandon(why)
+
+    def _move(self, now: Observation, goal: Array) -> bool:
+        """Moves to a posture: plans, then follows. Returns whether it is there. Raises NoPathError."""
+        if self._motion is None:
+            if float(np.abs(self._follower.q - goal).max()) < AT_HOME_RAD and self._follower.arrived:
+                return True
+            start, seen = self._follower.q.copy(), self._seen
+            self._motion = Thought(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen))
+        elif self._motion.due(now.t):
+            self._follower.start(self._motion.result())
+            self._motion = None
+        return False
+
+    # --- phases -------------------------------------------------------------------------------------------------------
+
+    def _home(self, now: Observation) -> Setpoint | None:
+        try:
+            if self._move(now, np.array(lbr.HOME)) and now.t - self._since >= REST:
+                self._enter(Phase.LOOK, now.t, "moving the arm out of the camera's view")
+        except NoPathError as error:
+            self._abort(now, f"no way home: {error}")
+        return None
+
+    def _look(self, now: Observation) -> Setpoint | None:
+        status, frames = self.status, self._known.camera.frames
+        if self._asked is None:
+            try:
+                if not self._move(now, self._looks[self._attempts]):
+                    self._since = now.t
+                elif now.t - self._since >= REST:
+                    self._trigger, self._asked = True, now.t
+                    status.message = f"looking: {frames} frames"
+            except NoPathError as error:
+                self._look_again(now, f"look posture cannot be reached: {error}")
+        elif isinstance(now.seen, Seen):
+            self._seen = now.seen
+            self._sense.surface = now.seen.surface
+            status.target_count, status.view_blocked = len(now.seen.positions), False
+            self._enter(Phase.PLAN, now.t, f"planning over {status.target_count} targets")
+        elif isinstance(now.seen, Unseen):
+            self._look_again(now, now.seen.message)
+        elif now.t - self._asked > frames * FRAME + LOOK_PATIENCE:
+            self._look_again(now, f"no answer from perception {LOOK_PATIENCE / SECOND:.0f} s after the burst")
+        return None
+
+    def _look_again(self, now: Observation, why: str) -> None:
+        self._asked, self._motion = None, None
+        self._attempts += 1
+        self.status.view_blocked = "blocked" in why
+        self.status.message = why
+        if self._attempts >= min(LOOKS_MAX, len(self._looks)):
+            self._abort(now, f"gave up after {self._attempts} looks: {why}")
+
+    def _plan(self, now: Observation) -> Setpoint | None:
+        if self._thought is None:
+            seen, start = self._seen, self._follower.q.copy()
+            assert seen is not None
+            self._thought = Thought(now.t, PLAN_BUDGET, lambda: self._planner.examination(seen, start))
+        elif self._thought.due(now.t):
+            try:
+                plan = self._thought.result()
+            except NoPathError as error:
+                self._abort(now, str(error))
+                return None
+            self._plan_made, self._skipped = plan, dict(plan.skipped)
+            self._path = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m)
+            self._follower.start(plan.approach)
+            self.status.targets_skipped = len(self._skipped)
+            self._enter(Phase.APPROACH, now.t, plan.skipped_in_words() or "approaching the first target")
+        return None
+
+    def _approach(self, now: Observation) -> Setpoint | None:
+        assert now.reading is not None and self._plan_made is not None
+        if not self._follower.arrived:
+            self._since = now.t
+            self._sense.weight.start_tare()
+        elif now.t - self._since >= REST + TARE:
+            exam, limits = self._known.exam, self._known.limits
+            self._palpation = Palpation(self._plan_made.legs, exam, limits, self._known.robot.indenter_radius_m)
+            self._enter(Phase.INDENT, now.t, Doing.DESCEND.value)
+            return self._palpate(now)
+        elif now.t - self._since >= REST:
+            self._sense.weight.tare(self._contact.R_WS, now.reading.wrench_S)
+        return None
+
+    def _palpate(self, now: Observation) -> Setpoint | None:
+        assert now.reading is not None and self._palpation is not None
+        progress = self._palpation.step(self._contact)
+        self._report(progress, now.t)
+        if progress.doing is Doing.DONE:
+            self._broken = self._palpation.failed
+            self._follower.hold(now.reading.q)
+            self._enter(Phase.RETURN, now.t, f"returning home: {self._broken}" if self._broken else "returning home")
+        return progress.setpoint
+
+    def _report(self, progress: Progress, t: int) -> None:
+        status = self.status
+        assert self._palpation is not None
+        self._skipped |= self._palpation.skipped
+        status.steady, status.force_limited = progress.steady, progress.limited
+        status.depth_setpoint, status.target_index = progress.depth_setpoint, progress.target
+        status.targets_skipped = len(self._skipped)
+        phase = PHASE_OF[progress.doing]
+        message = self._palpation.failed or progress.doing.value
+        if phase is not status.phase or message != status.message:
+            self._enter(phase, t, message)
+
+    def _return(self, now: Observation) -> Setpoint | None:
+        try:
+            if self._move(now, np.array(lbr.HOME)):
+                if self._broken:
+                    self._abort(now, self._broken)
+                else:
+                    self._enter(Phase.ASSESS, now.t, "waiting for the findings")
+        except NoPathError as error:
+            self._abort(now, f"no way home: {error}")
+        return None
+
+    def _assess(self, now: Observation) -> Setpoint | None:
+        if now.findings_final:
+            skipped = f", {len(self._skipped)} of {self.status.target_count} targets skipped" if self._skipped else ""
+            self._enter(Phase.DONE, now.t, f"examination complete{skipped}")
+        elif now.t - self._since > ASSESS_PATIENCE:
+            self._abort(now, f"no final findings after {ASSESS_PATIENCE / SECOND:.0f} s")
+        return None
+
+    def _rest(self, now: Observation) -> Setpoint | None:
+        return None

@@ -1,0 +1,37 @@
+"""Postures from which the camera sees the region of interest."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models import lbr
+from palpate_models.scenario import ExamInput
+
+from palpate_planning.kinematics import Kinematics
+from palpate_planning.scene import Scene, View, region_corners
+
+Array = NDArray[np.float64]
+
+VIEW_MARGIN_M = 0.03
+"""The view is kept free about the region, too: perception wants a margin of surface."""
+TURNS_RAD = (0.0, 1.2, -1.2, 2.2, -2.2)
+"""Turns of the whole arm away from the table that are tried."""
+
+
+def look_postures(known: ExamInput) -> list[Array]:
+    """Postures to look from [rad], shape (7,) each: those that leave the view free first, in order of their turn.
+
+    Home itself comes first if it does; folded postures turned about the vertical follow. None of them collides.
+    """
+    kinematics = Kinematics(known.robot, known.limits)
+    size = (known.exam.region_m[0] + 2 * VIEW_MARGIN_M, known.exam.region_m[1] + 2 * VIEW_MARGIN_M)
+    corners = region_corners(np.array(known.X_WA), known.exam.centre_m, size)
+    view = View(kinematics, known.robot, np.array(known.camera.position_m), corners)
+    scene = Scene(kinematics, known.robot)
+    postures = []
+    for turn in TURNS_RAD:
+        q = np.array(lbr.HOME)
+        q[0] += turn
+        if scene.free(q):
+            postures.append(q)
+    return sorted(postures, key=lambda q: not view.clear(q))

@@ -1,0 +1,83 @@
+"""Collision-free joint-space motion: the straight line where it is free, else OMPL's RRT-Connect and shortcuts.
+
+Deterministic: OMPL's seed generator is set anew for each query, so that the planner and sampler built after it draw the
+same numbers whatever was planned before; planning ends on a count of iterations, never on time; shortcuts are greedy, not
+random.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base, geometric, util
+
+from palpate_planning.scene import STEP_RAD, Scene
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 6000
+"""Iterations of RRT-Connect after which a motion counts as impossible."""
+RANGE_RAD = 0.4
+"""Longest extension of the tree."""
+
+
+class NoPathError(RuntimeError):
+    """No collision-free motion was found. The message says between which postures and why."""
+
+
+def plan(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
+    """A collision-free path from q0 to q1 within +-bound [rad]: returns way points, shape (n, 7), the ends included.
+
+    Raises NoPathError if an end collides or `ITERATIONS` do not suffice.
+    """
+    for name, q in (("start", q0), ("goal", q1)):
+        if not scene.free(q):
+            raise NoPathError(f"{name} posture {np.round(q, 3).tolist()} collides: {', '.join(scene.collisions(q))}")
+    if scene.motion_free(q0, q1):
+        return np.array([q0, q1])
+    return _shortcut(scene, _rrt_connect(scene, q0, q1, bound, seed))
+
+
+def _rrt_connect(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
+    util.noOutputHandler()  # it would complain that numbers were drawn before; all that draw are built below
+    util.RNG.setSeed(seed + 1)  # zero is no seed for OMPL
+    space = base.RealVectorStateSpace(7)
+    bounds = base.RealVectorBounds(7)
+    for i in range(7):
+        bounds.setLow(i, float(min(-bound[i], q0[i], q1[i])))
+        bounds.setHigh(i, float(max(bound[i], q0[i], q1[i])))
+    space.setBounds(bounds)
+    information = base.SpaceInformation(space)
+    information.setStateValidityChecker(lambda state: scene.free(np.array([state[i] for i in range(7)])))
+    information.setStateValidityCheckingResolution(STEP_RAD / space.getMaximumExtent())
+    information.setup()
+    start, goal = space.allocState(), space.allocState()
+    for i in range(7):
+        start[i], goal[i] = float(q0[i]), float(q1[i])
+    problem = base.ProblemDefinition(information)
+    problem.setStartAndGoalStates(start, goal)
+    planner = geometric.RRTConnect(information)
+    planner.setRange(RANGE_RAD)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+    iterations = iter(range(ITERATIONS))
+    planner.solve(base.PlannerTerminationCondition(lambda: next(iterations, None) is None))
+    if not problem.hasExactSolution():
+        ends = f"from {np.round(q0, 3).tolist()} to {np.round(q1, 3).tolist()}"
+        raise NoPathError(f"no collision-free motion {ends} in {ITERATIONS} iterations")
+    return np.array([[state[i] for i in range(7)] for state in problem.getSolutionPath().getStates()])
+
+
+def _shortcut(scene: Scene, path: Array) -> Array:
+    """Greedy shortcuts: from each way point to the farthest that can be reached straight; then with edges halved, again."""
+    for halve in (False, True):
+        points = [p for a, b in pairwise(path) for p in ((a, (a + b) / 2) if halve else (a,))] + [path[-1]]
+        kept, i = [points[0]], 0
+        while i < len(points) - 1:
+            j = next((k for k in range(len(points) - 1, i + 1, -1) if scene.motion_free(points[i], points[k])), i + 1)
+            kept.append(points[j])
+            i = j
+        path = np.array(kept)
+    return path

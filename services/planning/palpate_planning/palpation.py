@@ -1,0 +1,239 @@
+"""Carrying out the planned strokes: descend, indent, slide or hold at depth, lift, move over to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.scenario import Exam, Limits
+
+from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
+from palpate_planning.measure import Contact
+from palpate_planning.poses import centre, pose
+from palpate_planning.prepare import HOVER_M, Leg
+from palpate_planning.setpoint import NORMAL_STIFFNESS, ControlMode, Setpoint
+from palpate_planning.timing import PERIOD_S, Axis
+
+Array = NDArray[np.float64]
+
+TRANSFER_M = 0.015
+"""Gap on the way between strokes."""
+SLOW_M = 0.006
+"""Nearer to the surface than this the indenter descends slowly."""
+DESCEND_MPS = 0.08
+PLUNGE_MPS = 0.02
+LIFT_MPS = 0.12
+TRANSFER_MPS = 0.15
+DEPTH_ACCELERATION = 0.5
+"""[m/s^2]"""
+SETTLED_M = 0.0005
+"""Depth error at which an indentation counts as settled ..."""
+SETTLED_S = 0.08
+"""... for so long,"""
+SETTLE_MAX_S = 0.8
+"""or after this anyhow: it will say so by its measured depth."""
+HOLD_S = 0.3
+"""Time at a point in which samples are taken."""
+STEADY_FRACTION = 0.5
+"""Samples count from this part of the path's speed on."""
+CREEP = 0.1
+"""Below this part of its speed the descent counts as stopped by force."""
+SOFT_STOPS_MAX = 3
+
+
+class Doing(Enum):
+    """Part of a stroke."""
+
+    DESCEND = "descending"
+    SETTLE = "settling at depth"
+    SLIDE = "sliding at depth"
+    HOLD = "holding at depth"
+    LIFT = "lifting"
+    TRANSFER = "moving to the next stroke"
+    DONE = "done"
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What a step of the palpation did."""
+
+    setpoint: Setpoint
+    doing: Doing
+    depth_setpoint: float
+    """[m]"""
+    steady: bool
+    limited: bool
+    target: int
+    """Index of the latest target reached."""
+
+
+class Palpation:
+    """Executes the legs of a plan; one `step` each planning period until `doing` is DONE.
+
+    Targets that a soft stop passes over are in `skipped`; `failed` says why it gave up, if it did.
+    """
+
+    def __init__(self, legs: tuple[Leg, ...], exam: Exam, limits: Limits, radius: float) -> None:
+        self._legs, self._exam, self._limits, self._radius = legs, exam, limits, radius
+        self._regulator = DepthRegulator(PERIOD_S, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
+        self._regulator.reset(-HOVER_M)
+        self._depth = Axis(-HOVER_M, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05)
+        self._regulation = Regulation(-HOVER_M, 0.0, -HOVER_M, 0.0, False, 0.0)
+        self._soft_stops = 0
+        self._resume: float | None = None
+        self.skipped: dict[int, str] = {}
+        self.failed = ""
+        self._k = -1
+        self._next_leg()
+
+    # --- the sequence -------------------------------------------------------------------------------------------------
+
+    def _next_leg(self) -> None:
+        self._k += 1
+        if self._k == len(self._legs):
+            self._k -= 1
+            self._enter(Doing.DONE)
+            return
+        leg = self._legs[self._k]
+        speed = self._exam.speed_mps if leg.contact else TRANSFER_MPS
+        self._limit = leg.path.speed_limit(speed, self._limits)
+        self._s = Axis(0.0, 0.2 if leg.contact else 0.8, 2.0 if leg.contact else 8.0)
+        self._enter(Doing.DESCEND if leg.contact else Doing.TRANSFER)
+
+    def _enter(self, doing: Doing) -> None:
+        self.doing = doing
+        self._time = 0.0
+        self._settled = 0.0
+
+    @property
+    def _target(self) -> int:
+        path = self._legs[self._k].path
+        i = int(np.searchsorted(path.visits, self._s.position + 1e-6, side="right")) - 1
+        return int(path.targets[max(i, 0)])
+
+    def abandon(self, why: str) -> None:
+        """Lifts off and ends."""
+        self.failed = self.failed or why
+        if self.doing not in (Doing.LIFT, Doing.DONE):
+            self._enter(Doing.LIFT)
+
+    def step(self, contact: Contact) -> Progress:
+        """One planning period on, given the measured contact."""
+        self._time += PERIOD_S
+        if contact.force > self._limits.force_soft_stop_n and self.doing in (
+            Doing.DESCEND,
+            Doing.SETTLE,
+            Doing.SLIDE,
+            Doing.HOLD,
+        ):
+            self._soft_stop(contact.force)
+        if self.doing is Doing.DESCEND:
+            self._descend()
+        elif self.doing is Doing.SETTLE:
+            self._settle(contact)
+        elif self.doing is Doing.SLIDE:
+            self._slide()
+        elif self.doing is Doing.HOLD:
+            if self._time >= HOLD_S:
+                self._enter(Doing.LIFT)
+        elif self.doing is Doing.LIFT:
+            self._lift()
+        elif self.doing is Doing.TRANSFER:
+            self._transfer()
+        lifting = self.doing is Doing.LIFT
+        self._regulation = self._regulator.update(
+            self._depth.position, contact.depth, contact.force, contact.touching and not lifting
+        )
+        return self._progress(contact)
+
+    def _slow_down(self, floor: float) -> float:
+        """Part of the speed that the expected force leaves: all of it below 70 % of the limit, `floor` at 100 %."""
+        room = (1.0 - self._regulation.expected_force / self._regulator.force_max) / 0.3
+        return min(max(room, floor), 1.0)
+
+    def _descend(self) -> None:
+        near = self._depth.position > -SLOW_M - self._depth.velocity**2 / DEPTH_ACCELERATION
+        there = self._deeper() if near else self._depth.step(self._exam.depth_m, DESCEND_MPS)
+        self._settled = self._settled + PERIOD_S if self._slow_down(0.0) < CREEP else 0.0
+        if there or self._settled > SETTLED_S:  # at depth, or as deep as the force allows
+            self._enter(Doing.SETTLE)
+
+    def _deeper(self) -> bool:
+        """Goes on to full depth, the slower the nearer the force is to its limit; returns whether it is there."""
+        return self._depth.step(self._exam.depth_m, PLUNGE_MPS * self._slow_down(0.01))
+
+    def _settle(self, contact: Contact) -> None:
+        self._deeper()
+        near = abs(self._regulation.reference - contact.depth) < SETTLED_M
+        self._settled = self._settled + PERIOD_S if near else 0.0
+        if self._settled >= SETTLED_S or self._time >= SETTLE_MAX_S:
+            self._enter(Doing.SLIDE if self._legs[self._k].path.length > 0 else Doing.HOLD)
+
+    def _slide(self) -> None:
+        self._deeper()
+        path = self._legs[self._k].path
+        allowed = self._limit.at(self._s.position + self._s.velocity * PERIOD_S)
+        if self._s.step(path.length, max(allowed * self._slow_down(0.3), 1e-3)):
+            self._enter(Doing.LIFT)
+
+    def _lift(self) -> None:
+        if self._s.velocity > 1e-4:
+            self._s.step(self._s.position + self._s.velocity**2 / 0.3, max(self._s.velocity, 1e-3))
+        last = self._k == len(self._legs) - 1
+        height = HOVER_M if last or self.failed else TRANSFER_M
+        if not self._depth.step(-height, LIFT_MPS):
+            return
+        if self.failed:
+            self._enter(Doing.DONE)
+        elif self._resume is not None:
+            self._enter(Doing.TRANSFER)
+        else:
+            self._next_leg()
+
+    def _transfer(self) -> None:
+        path = self._legs[self._k].path
+        goal = path.length if self._resume is None else self._resume
+        if not self._s.step(goal, max(self._limit.at(self._s.position), 1e-3)):
+            return
+        if self._resume is None:
+            self._next_leg()
+        else:
+            self._resume = None
+            self._enter(Doing.DESCEND)
+
+    def _soft_stop(self, force: float) -> None:
+        """Retreats along the normal and passes over the targets nearby; the third time it gives up."""
+        path = self._legs[self._k].path
+        self._soft_stops += 1
+        why = f"soft stop at {force:.1f} N, limit {self._limits.force_soft_stop_n:g} N"
+        here = self._s.position
+        passed = (path.visits > here - 1e-6) & (path.visits < here + self._exam.spacing_m)
+        self.skipped |= dict.fromkeys((int(i) for i in path.targets[passed]), why)
+        ahead = path.visits[path.visits >= here + self._exam.spacing_m]
+        self._resume = float(ahead[0]) if len(ahead) else None
+        if self._soft_stops >= SOFT_STOPS_MAX:
+            self.failed = f"{why}, {self._soft_stops} times"
+        self._enter(Doing.LIFT)
+
+    # --- set-points ---------------------------------------------------------------------------------------------------
+
+    def _progress(self, contact: Contact) -> Progress:
+        place = self._legs[self._k].path.at(self._s.position)
+        rate, regulation = self._s.velocity, self._regulation
+        arm = self._radius - regulation.depth
+        linear = (place.dp + place.dn * arm) * rate - place.n * regulation.rate
+        setpoint = Setpoint(
+            ControlMode.CARTESIAN,
+            pose(place.R, centre(place.p, place.n, self._radius, regulation.depth)),
+            place.q,
+            np.concatenate((linear, place.w * rate)),
+            -place.n * regulation.force,
+            place.dq * rate,
+        )
+        at_depth = self.doing in (Doing.SETTLE, Doing.SLIDE, Doing.HOLD)
+        limited = regulation.limited or (at_depth and self._depth.position < self._exam.depth_m - LIMITED_M)
+        fast = rate >= STEADY_FRACTION * self._exam.speed_mps or limited
+        steady = contact.touching and (self.doing is Doing.HOLD or (self.doing is Doing.SLIDE and fast))
+        return Progress(setpoint, self.doing, regulation.reference, steady, limited, self._target)

@@ -1,0 +1,103 @@
+"""A path over the surface: points, normals, orientations and postures as smooth functions of the length travelled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models import lbr
+from palpate_models.scenario import Limits
+from scipy.interpolate import CubicSpline
+
+from palpate_planning.poses import angular_velocity, orientations, orthonormal
+from palpate_planning.surface import Surface
+from palpate_planning.timing import SpeedLimit
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LATERAL_ACCELERATION = 0.3
+"""Largest v^2/r in curves in contact [m/s^2] [A]."""
+TURN_RATE = 0.6
+"""Largest rate at which the tool axis turns in contact [rad/s] [A]."""
+ACCELERATION = 0.2
+"""Tangential acceleration in contact [m/s^2] [A]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a path is at one position along it. World frame; derivatives by path length."""
+
+    p: Array
+    """Surface point [m], shape (3,)."""
+    n: Array
+    """Outward unit normal, shape (3,)."""
+    R: Array
+    """Orientation of the indenter, z opposite to n, shape (3, 3)."""
+    dp: Array
+    dn: Array
+    w: Array
+    """Turn of R [rad/m], shape (3,)."""
+    q: Array
+    """Posture [rad], shape (7,)."""
+    dq: Array
+
+
+class SurfacePath:
+    """p(s), n(s), R(s), q(s) for s in 0..length, from samples; cubic splines in between."""
+
+    def __init__(self, s: Array, p: Array, n: Array, R: Array, q: Array, targets: Ints, visits: Ints) -> None:
+        """Samples at path lengths s: points and normals (k, 3), orientations (k, 3, 3), postures (k, 7).
+
+        `targets` are indices of targets, `visits` the samples at which they are reached, shape (m,).
+        """
+        self.s, self.p, self.n, self.R, self.q = s, p, n, R, q
+        self.targets, self.visits = targets, s[visits]
+        self.length = float(s[-1])
+        if len(s) > 1:
+            self._spline = CubicSpline(s, np.hstack((p, n, R[:, :, 0], q)), bc_type="natural")
+            self._rate = self._spline.derivative()
+
+    def at(self, s: float) -> Place:
+        """The place at path length s, clipped to the path."""
+        if self.length == 0.0:
+            zero = np.zeros(3)
+            return Place(self.p[0], self.n[0], self.R[0], zero, zero, zero, self.q[0], np.zeros(7))
+        s = min(max(s, 0.0), self.length)
+        y, dy = self._spline(s), self._rate(s)
+        R = _frame(y)
+        step = 1e-4
+        w = angular_velocity(R, _frame(y + step * dy), step)
+        return Place(y[:3], -R[:, 2], R, dy[:3], dy[3:6], w, y[9:], dy[9:])
+
+    def speed_limit(self, speed: float, limits: Limits) -> SpeedLimit:
+        """Speed along the path [m/s]: `speed` [m/s], less in tight curves, where the tool turns or joints would race."""
+        if self.length == 0.0:
+            return SpeedLimit(self.s, np.array([speed]), ACCELERATION)
+        dp = np.gradient(self.p, self.s, axis=0)
+        curvature = np.linalg.norm(np.gradient(dp, self.s, axis=0), axis=1)
+        turn = np.linalg.norm(np.gradient(self.n, self.s, axis=0), axis=1)
+        joints = np.abs(np.gradient(self.q, self.s, axis=0)) / (limits.joint_velocity_scale * lbr.VELOCITY_LIMIT)
+        allowed = np.minimum.reduce(
+            [
+                np.full(len(self.s), speed),
+                np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature, 1e-6)),
+                TURN_RATE / np.maximum(turn, 1e-6),
+                1.0 / np.maximum(joints.max(axis=1), 1e-6),
+            ]
+        )
+        return SpeedLimit(self.s, allowed, 0.7 * ACCELERATION)
+
+
+def _frame(y: Array) -> Array:
+    """Orientation from a spline's columns: z opposite to the normal, x near the interpolated x."""
+    z = -y[3:6] / np.linalg.norm(y[3:6])
+    return orthonormal(np.column_stack((y[6:9], y[6:9], z)), z)
+
+
+def lay(surface: Surface, xy: Array, R_first: Array) -> tuple[Array, Array, Array, Array]:
+    """A curve in A's xy plane laid onto the surface: s (k,), p and n (k, 3) in world, R (k, 3, 3) without spin."""
+    p, n = surface.at(xy)
+    s = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))
+    return s, p, n, orientations(n, R_first)

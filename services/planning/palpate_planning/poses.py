@@ -1,0 +1,88 @@
+"""From a point and its normal to the pose of the indenter.
+
+The indenter's z axis is opposite to the outward normal. The sphere's centre is at p + n (R - depth), so that its deepest
+point lies `depth` below the surface point p along the inward normal. Spin about z is free: the sphere is round.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def centre(p_W: Array, n_W: Array, radius: float, depth: float | Array) -> Array:
+    """Centre of the sphere [m] at `depth` [m] below surface points p_W with outward unit normals n_W, shape (..., 3)."""
+    return np.asarray(p_W + n_W * (radius - np.asarray(depth)[..., None]))
+
+
+def least_twist(z_W: Array, R_near: Array) -> Array:
+    """The rotation, shape (3, 3), whose z axis is z_W and which is reached from R_near by the shortest turn.
+
+    Rotates R_near about z_near x z by the angle between them (no spin about z). Where they are opposite, turns about
+    R_near's x axis.
+    """
+    z = z_W / np.linalg.norm(z_W)
+    z0 = R_near[:, 2]
+    c = float(z0 @ z)
+    if c < -1.0 + 1e-9:
+        return np.column_stack((R_near[:, 0], -R_near[:, 1], -R_near[:, 2]))
+    v = np.cross(z0, z)
+    vx = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    R = (np.eye(3) + vx + vx @ vx / (1.0 + c)) @ R_near  # Rodrigues, with sin and cos from v and c
+    return orthonormal(R, z)
+
+
+def orthonormal(R: Array, z: Array) -> Array:
+    """R with its z axis set to unit z exactly and x, y made orthonormal to it."""
+    x = R[:, 0] - z * float(z @ R[:, 0])
+    x = x / np.linalg.norm(x)
+    return np.column_stack((x, np.cross(z, x), z))
+
+
+def orientations(n_W: Array, R_first: Array) -> Array:
+    """Orientations along a path with outward normals n_W, shape (n, 3): z opposite to the normal, no spin. Shape (n, 3, 3).
+
+    Parallel transport: each is reached from the one before by the shortest turn, the first from R_first.
+    """
+    out = np.empty((len(n_W), 3, 3))
+    R = R_first
+    for i, n in enumerate(n_W):
+        R = least_twist(-n, R)
+        out[i] = R
+    return out
+
+
+def pose(R: Array, p: Array) -> Array:
+    """Homogeneous matrix, shape (4, 4)."""
+    X = np.eye(4)
+    X[:3, :3] = R
+    X[:3, 3] = p
+    return X
+
+
+def quaternion(R: Array) -> Array:
+    """Unit quaternion (x, y, z, w) with w >= 0 of a rotation matrix, shape (4,). Shepperd's method."""
+    trace = float(R[0, 0] + R[1, 1] + R[2, 2])
+    i = int(np.argmax((R[0, 0], R[1, 1], R[2, 2], trace)))
+    q = np.empty(4)
+    if i == 3:
+        q[:] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1.0 - trace + 2.0 * R[i, i]
+        q[j] = R[j, i] + R[i, j]
+        q[k] = R[k, i] + R[i, k]
+        q[3] = R[k, j] - R[j, k]
+    q /= np.linalg.norm(q)
+    return -q if q[3] < 0 else q
+
+
+def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
+    """w_W [rad/s] that turns R0 into R1 in dt [s], shape (3,)."""
+    D = R1 @ R0.T
+    v = 0.5 * np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
+    s = float(np.linalg.norm(v))
+    angle = float(np.arctan2(s, 0.5 * (np.trace(D) - 1.0)))
+    return np.asarray(v * ((angle / s if s > 1e-9 else 1.0) / dt))

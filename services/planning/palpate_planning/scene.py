@@ -1,0 +1,175 @@
+"""The collision scene: the arm's capsules, table, base and the perceived abdomen, checked with coal through pinocchio."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from palpate_models import lbr, table
+from palpate_models.frames import apply
+from palpate_models.scenario import Robot
+
+from palpate_planning.kinematics import Kinematics
+
+Array = NDArray[np.float64]
+
+MARGIN_M = 0.010
+"""Distance that free motion keeps. More than half of what any point of the arm moves between two checks."""
+STEP_RAD = 0.02
+"""Largest joint step between two checks of a motion: at 0.95 m of reach 19 mm at the tool."""
+SELF_APART = 3
+"""Links this many joints apart and more are checked against each other; nearer ones cannot meet within the limits."""
+TOOL_LINKS = ("ft_sensor", "indenter")
+"""Stand-off and sphere: they dip under the rest surface while indenting."""
+
+
+def _alignment(start: Array, end: Array) -> pin.SE3:
+    """Pose of a capsule's centre with z along its axis, in the link frame."""
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    R = np.eye(3) if length == 0 else pin.Quaternion.FromTwoVectors(np.array((0.0, 0.0, 1.0)), axis / length).matrix()
+    return pin.SE3(R, (start + end) / 2)
+
+
+def mesh_geometry(vertices: Array, triangles: NDArray[np.int64]) -> coal.BVHModelOBBRSS:
+    """A triangle mesh for coal: vertices [m] shape (n, 3), vertex indices shape (m, 3)."""
+    geometry = coal.BVHModelOBBRSS()
+    geometry.beginModel(len(triangles), len(vertices))
+    geometry.addVertices(np.ascontiguousarray(vertices, dtype=float))
+    for a, b, c in triangles:
+        geometry.addTriangle(vertices[a], vertices[b], vertices[c])
+    geometry.endModel()
+    return geometry
+
+
+def with_skirt(vertices: Array, triangles: NDArray[np.int64], floor: float) -> tuple[Array, NDArray[np.int64]]:
+    """The mesh with walls from its border down to height `floor` [m], so that nothing reaches under the surface."""
+    edges = np.concatenate([triangles[:, (0, 1)], triangles[:, (1, 2)], triangles[:, (2, 0)]])
+    keys = np.sort(edges, axis=1)
+    _, first, counts = np.unique(keys, axis=0, return_index=True, return_counts=True)
+    border = edges[np.sort(first[counts == 1])]
+    used, local = np.unique(border, return_inverse=True)
+    local = local.reshape(border.shape)
+    feet = vertices[used].copy()
+    feet[:, 2] = floor
+    a, b = border[:, 0], border[:, 1]
+    fa, fb = len(vertices) + local[:, 0], len(vertices) + local[:, 1]
+    walls = np.concatenate([np.column_stack((a, fa, b)), np.column_stack((b, fa, fb))])
+    return np.concatenate([vertices, feet]), np.concatenate([triangles, walls])
+
+
+class Scene:
+    """Whether arm postures and motions collide. `abdomen` is (vertices in world, triangles), None before perception."""
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        robot: Robot,
+        abdomen: tuple[Array, NDArray[np.int64]] | None = None,
+        tool_may_touch: bool = False,
+        margin: float = MARGIN_M,
+    ) -> None:
+        """`tool_may_touch` lets stand-off and sphere meet the abdomen, as in the contact phase."""
+        self._model = kinematics.model
+        self._data = self._model.createData()
+        self._geometry = pin.GeometryModel()
+        arm = self._add_arm(robot)
+        obstacles = [(box.name, self._add(box.name, 0, pin.SE3(box.X_WB), coal.Box(*box.size))) for box in table.boxes(robot)]
+        if abdomen is not None:
+            vertices, triangles = with_skirt(*abdomen, table.TABLE_TOP_M)
+            obstacles.append(("abdomen", self._add("abdomen", 0, pin.SE3.Identity(), mesh_geometry(vertices, triangles))))
+        for k, (link, shape) in enumerate(arm):
+            for other, other_shape in arm[:k]:
+                if lbr.LINK_NAMES.index(link) - lbr.LINK_NAMES.index(other) >= SELF_APART:
+                    self._geometry.addCollisionPair(pin.CollisionPair(other_shape, shape))
+            for name, obstacle in obstacles:
+                mounted = link == "lbr_link_0" or (link == "lbr_link_1" and name == "robot_base")
+                if not mounted and not (name == "abdomen" and tool_may_touch and link in TOOL_LINKS):
+                    self._geometry.addCollisionPair(pin.CollisionPair(shape, obstacle))
+        self._results = self._geometry.createData()
+        for request in self._results.collisionRequests:
+            request.security_margin = margin
+
+    def _add(self, name: str, joint: int, placement: pin.SE3, geometry: coal.CollisionGeometry) -> int:
+        return int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, placement, geometry)))
+
+    def _add_arm(self, robot: Robot) -> list[tuple[str, int]]:
+        """Adds the arm's capsules; link name and geometry index of each, base first."""
+        shapes = []
+        for link, capsules in lbr.capsules(robot).items():
+            frame = self._model.frames[self._model.getFrameId(link)]
+            for k, capsule in enumerate(capsules):
+                start, end = np.array(capsule.start), np.array(capsule.end)
+                length = float(np.linalg.norm(end - start))
+                shape = coal.Capsule(capsule.radius, length) if length > 0 else coal.Sphere(capsule.radius)
+                placement = frame.placement * _alignment(start, end)
+                shapes.append((link, self._add(f"{link}_{k}", frame.parentJoint, placement, shape)))
+        return shapes
+
+    def free(self, q: Array) -> bool:
+        """Whether the arm at q [rad] keeps its margin to everything, itself included."""
+        return not pin.computeCollisions(self._model, self._data, self._geometry, self._results, q, True)
+
+    def collisions(self, q: Array) -> list[str]:
+        """Names of the pairs that are nearer than the margin at q, for messages."""
+        pin.computeCollisions(self._model, self._data, self._geometry, self._results, q, False)
+        found = []
+        for pair, result in zip(self._geometry.collisionPairs, self._results.collisionResults, strict=True):
+            if result.isCollision():
+                names = (self._geometry.geometryObjects[i].name for i in (pair.first, pair.second))
+                found.append(" and ".join(names))
+        return found
+
+    def motion_free(self, q0: Array, q1: Array) -> bool:
+        """Whether the straight joint-space motion from q0 to q1 is free, checked every `STEP_RAD`, both ends included."""
+        steps = max(1, int(np.ceil(float(np.abs(q1 - q0).max()) / STEP_RAD)))
+        order = sorted(range(steps + 1), key=lambda k: -(k & -k) if k else -steps)  # coarse first: fails early
+        return all(self.free(q0 + (q1 - q0) * (k / steps)) for k in order)
+
+    def path_free(self, path: Iterable[Array]) -> bool:
+        """Whether a polyline of postures is free all along."""
+        points = list(path)
+        return all(self.motion_free(a, b) for a, b in pairwise(points))
+
+
+class View:
+    """The pyramid from the camera's centre to the region of interest: the arm must stay out of it for a free view."""
+
+    def __init__(self, kinematics: Kinematics, robot: Robot, apex_W: Array, corners_W: Array) -> None:
+        """`corners_W`: the four corners of the region in order round it, shape (4, 3)."""
+        vertices = np.vstack((apex_W, corners_W))
+        triangles = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 3, 2), (1, 4, 3)])
+        self._kinematics = kinematics
+        self._view = mesh_geometry(vertices, triangles)
+        self._parts = []
+        for link, capsules in lbr.capsules(robot).items():
+            frame = kinematics.model.frames[kinematics.model.getFrameId(link)]
+            for capsule in capsules:
+                start, end = np.array(capsule.start), np.array(capsule.end)
+                length = float(np.linalg.norm(end - start))
+                shape = coal.Capsule(capsule.radius, length) if length > 0 else coal.Sphere(capsule.radius)
+                self._parts.append((frame.parentJoint, frame.placement * _alignment(start, end), shape))
+
+    def clear(self, q: Array) -> bool:
+        """Whether the arm at q leaves the whole pyramid free."""
+        model, data = self._kinematics.model, self._kinematics.data
+        pin.forwardKinematics(model, data, q)
+        request = coal.CollisionRequest()
+        world = coal.Transform3s()
+        for joint, placement, shape in self._parts:
+            X = data.oMi[joint] * placement
+            at = coal.Transform3s(X.rotation, X.translation)
+            if coal.collide(shape, at, self._view, world, request, coal.CollisionResult()):
+                return False
+        return True
+
+
+def region_corners(X_WA: Array, centre: tuple[float, float], size: tuple[float, float]) -> Array:
+    """Corners of the examined region in world, in order round it, shape (4, 3); heights on A's xy plane."""
+    half = np.array(size) / 2
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    return apply(X_WA, np.array([(centre[0] + i * half[0], centre[1] + j * half[1], 0.0) for i, j in signs]))

@@ -1,0 +1,142 @@
+"""Planning as a service: messages to arrays and back. The examination itself is `exam`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_bus.codec import Message
+from palpate_bus.contract import MS
+from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import duration_message, header
+from palpate_models.lbr import JOINT_NAMES
+from palpate_models.load import exam_input
+from palpate_models.scenario import ExamInput, Scenario
+
+from palpate_planning.exam import Exam, Observation, Phase, Unseen
+from palpate_planning.measure import Reading
+from palpate_planning.messages import path_message, setpoint_message, state_message
+from palpate_planning.prepare import Seen
+from palpate_planning.surface import Surface
+
+Array = NDArray[np.float64]
+
+VALID_FOR = 250 * MS
+"""The contract's expiry of planning/setpoint."""
+NEEDED = ("robot", "assessment")
+"""Roles whose loss ends the exam, whatever its phase."""
+NEEDED_TO_SEE = ("camera", "perception")
+"""Roles whose loss ends it until the targets are there."""
+
+
+class PlanningService(Service):
+    """Runs the examination of a scenario."""
+
+    role: ClassVar[str] = "planning"
+
+    def __init__(self, known: ExamInput) -> None:
+        self._known = known
+        self._X_WA = np.array(known.X_WA)
+        self._exam = Exam(known)
+        self._reading: Reading | None = None
+        self._surface: Message | None = None
+        self._valid = duration_message(VALID_FOR)
+        self._peak_force = 0.0
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """One planning period: what is measured, what the exam makes of it, what is to be done."""
+        self._read(inbox)
+        outcome = self._exam.step(
+            Observation(
+                t=t,
+                reading=self._reading,
+                seen=self._perceived(inbox),
+                findings_final=any(message.final for message in inbox.new("assessment/findings")),
+                stop=_stop(inbox),
+                lost=self._lost(inbox),
+            )
+        )
+        contact = outcome.contact
+        if contact is not None and contact.touching:
+            self._peak_force = max(self._peak_force, contact.force)
+        outbox: dict[str, Message | list[Message]] = {
+            "planning/setpoint": setpoint_message(t, outcome.setpoint, self._valid),
+            "exam/state": state_message(t, self._exam.status, contact),
+        }
+        if outcome.trigger:
+            outbox["planning/camera_trigger"] = CameraTrigger(header(t), self._known.camera.frames)
+        if outcome.path is not None:
+            outbox["planning/path"] = path_message(t, outcome.path)
+        return outbox
+
+    def finish(self) -> Mapping[str, Any]:
+        """Phase reached, targets, skipped targets with reasons, highest measured force [N]."""
+        status = self._exam.status
+        return {
+            "phase": status.phase.name,
+            "message": status.message,
+            "targets": status.target_count,
+            "skipped_targets": {str(i): why for i, why in sorted(self._exam.skipped.items())},
+            "peak_force_N": self._peak_force,
+        }
+
+    def _read(self, inbox: Inbox) -> None:
+        """Means of joint positions and wrench over the messages of this period: force and depth of the same moment."""
+        joints = [message.position for message in inbox.new("joint_states") if list(message.name) == list(JOINT_NAMES)]
+        forces = [(f.x, f.y, f.z, m.x, m.y, m.z) for f, m in ((w.wrench.force, w.wrench.torque) for w in inbox.new("ft/wrench"))]
+        if self._reading is None and not (joints and forces):
+            return
+        old = self._reading
+        q = np.mean(np.array(joints), axis=0) if joints or old is None else old.q
+        wrench = np.mean(np.array(forces), axis=0) if forces or old is None else old.wrench_S
+        self._reading = Reading(q, wrench)
+
+    def _perceived(self, inbox: Inbox) -> Seen | Unseen | None:
+        """Perception's newest answer, if one came."""
+        for message in inbox.new("perception/surface"):
+            self._surface = message
+        answer = None
+        for message in inbox.new("perception/targets"):
+            answer = self._seen(message)
+        return answer
+
+    def _seen(self, targets: Message) -> Seen | Unseen:
+        mesh = self._surface
+        if not len(targets.positions) or mesh is None:
+            return Unseen(targets.message or "perception found no targets")
+        vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
+        normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
+        try:
+            surface = Surface.from_mesh(vertices, normals, self._X_WA)
+        except ValueError as error:
+            return Unseen(f"perception/surface: {error}")
+        return Seen(
+            positions=np.array([(p.x, p.y, p.z) for p in targets.positions]),
+            lines=np.asarray(targets.lines, dtype=np.int64),
+            vertices=vertices,
+            triangles=np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3),
+            surface=surface,
+        )
+
+    def _lost(self, inbox: Inbox) -> tuple[str, ...]:
+        seeing = self._exam.status.phase in (Phase.HOME, Phase.LOOK)
+        return tuple(role for role in NEEDED + (NEEDED_TO_SEE if seeing else ()) if inbox.lost(role))
+
+
+def _stop(inbox: Inbox) -> str:
+    """Why the arm must rest: the driver's safe hold or an operator's stop; empty when all is well."""
+    for request in inbox.new("operator/request"):
+        if request.request == OperatorRequest.STOP:
+            return f"stopped by the operator: {request.reason}"
+    status = inbox.latest("robot/status")
+    if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
+        return f"the driver holds safely: {status.reason}"
+    return ""
+
+
+def create(scenario: Scenario) -> PlanningService:
+    """The service for a scenario, of which it may know the exam input."""
+    return PlanningService(exam_input(scenario))

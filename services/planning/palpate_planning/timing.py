@@ -1,0 +1,136 @@
+"""When to be where: smooth speed along a path, by ruckig on one degree of freedom, within limits on joints and tool."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import ruckig
+from numpy.typing import NDArray
+from palpate_models import lbr
+from palpate_models.scenario import Limits
+
+from palpate_planning.kinematics import Kinematics
+
+Array = NDArray[np.float64]
+
+PERIOD_S: Final = 0.01
+"""Planning's period."""
+JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])
+"""Joint acceleration of free motion [rad/s^2] [A]: about a third of what the arm's torques allow."""
+RISE_S = 0.15
+"""Time in which acceleration builds up: jerk limit = acceleration / RISE_S."""
+BLEND_RAD = 0.25
+"""Joint-space length of path that is rounded off at each side of a way point, at most."""
+
+
+class Axis:
+    """One degree of freedom that moves to a target with bounded speed, acceleration and jerk; limits may change on the way."""
+
+    def __init__(self, position: float, acceleration: float, jerk: float) -> None:
+        self._otg = ruckig.Ruckig(1, PERIOD_S)
+        self._in = ruckig.InputParameter(1)
+        self._out = ruckig.OutputParameter(1)
+        self._in.max_acceleration, self._in.max_jerk = [acceleration], [jerk]
+        self.position, self.velocity, self.acceleration = position, 0.0, 0.0
+
+    def step(self, target: float, speed: float) -> bool:
+        """Advances one period towards `target` at no more than `speed`, at rest there; returns whether it has arrived.
+
+        Raises RuntimeError if ruckig finds no way, which takes limits that are not positive.
+        """
+        self._in.current_position, self._in.current_velocity = [self.position], [self.velocity]
+        self._in.current_acceleration, self._in.max_velocity = [self.acceleration], [speed]
+        self._in.target_position = [target]
+        result = self._otg.update(self._in, self._out)
+        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+            raise RuntimeError(f"ruckig: {result} from {self.position}, {self.velocity} to {target} at {speed}")
+        self.position, self.velocity = self._out.new_position[0], self._out.new_velocity[0]
+        self.acceleration = self._out.new_acceleration[0]
+        return bool(result == ruckig.Result.Finished)
+
+
+class SpeedLimit:
+    """Speed allowed along a path, lowered ahead of slow places so that braking at `acceleration` suffices."""
+
+    def __init__(self, s: Array, speed: Array, acceleration: float) -> None:
+        """Speeds [m/s or rad/s] at increasing path positions s, shape (n,)."""
+        reachable = np.array(speed, dtype=float)
+        for k in range(len(s) - 2, -1, -1):
+            reachable[k] = min(reachable[k], np.sqrt(reachable[k + 1] ** 2 + 2 * acceleration * (s[k + 1] - s[k])))
+        self._s, self._speed = s, reachable
+
+    def at(self, s: float) -> float:
+        """Speed allowed at s."""
+        return float(np.interp(s, self._s, self._speed))
+
+
+@dataclass(frozen=True, slots=True)
+class JointTrajectory:
+    """Joint positions [rad] and velocities [rad/s] every `PERIOD_S`, shapes (n, 7); starts and ends at rest."""
+
+    q: Array
+    qd: Array
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+def rounded(points: Array, blend: float = BLEND_RAD) -> Array:
+    """A polyline in joint space, shape (n, 7), with its corners replaced by parabolas sampled finely, shape (m, 7).
+
+    A parabola lies in the triangle of the corner and its two ends, at most blend / 4 from the corner.
+    """
+    if len(points) < 3:
+        return points
+    out = [points[0]]
+    for before, corner, after in zip(points, points[1:], points[2:], strict=False):
+        ends = []
+        for other in (before, after):
+            length = float(np.linalg.norm(other - corner))
+            ends.append(corner + (other - corner) * min(0.45, blend / max(length, 1e-9)))
+        t = np.linspace(0.0, 1.0, 21)[:, None]
+        out.extend((1 - t) ** 2 * ends[0] + 2 * t * (1 - t) * corner + t**2 * ends[1])
+    out.append(points[-1])
+    return np.array(out)
+
+
+def joint_trajectory(kinematics: Kinematics, points: Array, limits: Limits) -> JointTrajectory:
+    """Times a joint-space polyline, shape (n, 7), within joint speed, joint acceleration and tool speed limits.
+
+    The path is q(s) with s its length; s(t) comes from ruckig with a speed limit for each place:
+    |q'| v <= joint_velocity_scale * limit, |J q'| v <= speed_mps, |q''| v^2 <= half of the acceleration limit; the other
+    half is left to |q'| dv/dt.
+    """
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    points = points[np.concatenate(([True], lengths > 1e-9))]
+    if len(points) < 2:
+        return JointTrajectory(points[:1].copy(), np.zeros((1, 7)))
+    knots = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    s = np.unique(np.concatenate([np.linspace(a, b, max(2, round((b - a) / 0.02) + 1)) for a, b in pairwise(knots)]))
+    q = np.column_stack([np.interp(s, knots, points[:, i]) for i in range(7)])
+    tangent = np.gradient(q, s, axis=0)
+    bend = np.abs(np.gradient(tangent, s, axis=0)) if len(s) > 2 else np.zeros_like(q)
+    tool = np.array([np.linalg.norm((kinematics.jacobian(a) @ b)[:3]) for a, b in zip(q, tangent, strict=True)])
+    speeds = np.column_stack(
+        [
+            limits.joint_velocity_scale * lbr.VELOCITY_LIMIT / np.maximum(np.abs(tangent), 1e-9),
+            np.sqrt(0.5 * JOINT_ACCELERATION / np.maximum(bend, 1e-9)),
+        ]
+    )
+    speed = np.minimum(speeds.min(axis=1), limits.speed_mps / np.maximum(tool, 1e-9))
+    acceleration = float((0.5 * JOINT_ACCELERATION / np.maximum(np.abs(tangent), 1e-9)).min())
+    limit = SpeedLimit(s, speed, 0.7 * acceleration)
+    axis = Axis(0.0, acceleration, acceleration / RISE_S)
+    positions, rates = [0.0], [0.0]
+    while not axis.step(float(s[-1]), limit.at(axis.position + axis.velocity * PERIOD_S)):
+        positions.append(axis.position)
+        rates.append(axis.velocity)
+    positions.append(float(s[-1]))
+    rates.append(0.0)
+    along, rate = np.array(positions), np.array(rates)
+    Q = np.column_stack([np.interp(along, s, q[:, i]) for i in range(7)])
+    T = np.column_stack([np.interp(along, s, tangent[:, i]) for i in range(7)])
+    return JointTrajectory(Q, T * rate[:, None])
