@@ -1,0 +1,1 @@
+"""Assessment: palpation samples to a stiffness map with its uncertainty, and to findings."""

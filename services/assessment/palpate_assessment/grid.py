@@ -1,0 +1,95 @@
+"""The map's mesh: a regular grid over the examined region in the xy plane of the abdomen frame, lifted to the perceived surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+
+Array = NDArray[np.float64]
+
+_DEGREE = 4
+"""Degree of the polynomial that stands for the abdomen's shape: its curvature is that of the trunk, not of the noise."""
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """A regular grid of nodes on the perceived surface, row by row: node j * nx + i is at (x[i], y[j])."""
+
+    x: Array
+    """[m], shape (nx,), in A."""
+    y: Array
+    """[m], shape (ny,), in A."""
+    z: Array
+    """Height of the perceived surface [m], shape (ny, nx)."""
+    area: Array
+    """Area of the surface that belongs to each node [m^2], shape (ny * nx,)."""
+    shape: Array
+    """Coefficients of the smooth shape's polynomial in (x, y) / 0.1 m."""
+
+    @property
+    def pitch(self) -> float:
+        """Distance of neighbouring nodes in the xy plane [m]."""
+        return float(self.x[1] - self.x[0])
+
+    @property
+    def nodes(self) -> Array:
+        """Positions [m], shape (ny * nx, 3), in A."""
+        xx, yy = np.meshgrid(self.x, self.y)
+        return np.column_stack((xx.ravel(), yy.ravel(), self.z.ravel()))
+
+    @property
+    def triangles(self) -> NDArray[np.uint32]:
+        """Two triangles a cell, shape (m, 3), counter-clockwise seen from outside."""
+        nx, ny = len(self.x), len(self.y)
+        corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
+        lower = np.column_stack((corner, corner + 1, corner + nx + 1))
+        upper = np.column_stack((corner, corner + nx + 1, corner + nx))
+        return np.concatenate((lower, upper)).astype(np.uint32)
+
+    def curvature(self, p: Array) -> Array:
+        """Mean curvature [1/m], convex positive, of the smooth shape at points [m], shape (n, 3)."""
+        step = 1e-3
+        x, y = p[:, 0], p[:, 1]
+
+        def z(dx: float, dy: float) -> Array:
+            return _terms(x + dx, y + dy) @ self.shape
+
+        middle = z(0, 0)
+        zx, zy = (z(step, 0) - z(-step, 0)) / (2 * step), (z(0, step) - z(0, -step)) / (2 * step)
+        zxx = (z(step, 0) - 2 * middle + z(-step, 0)) / step**2
+        zyy = (z(0, step) - 2 * middle + z(0, -step)) / step**2
+        zxy = (z(step, step) - z(step, -step) - z(-step, step) + z(-step, -step)) / (4 * step**2)
+        top = (1 + zy**2) * zxx - 2 * zx * zy * zxy + (1 + zx**2) * zyy
+        return np.asarray(-top / (2 * (1 + zx**2 + zy**2) ** 1.5))
+
+
+def _terms(x: Array, y: Array) -> Array:
+    u, v = x / 0.1, y / 0.1
+    return np.stack([u**i * v**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=-1)
+
+
+def map_grid(surface: Array, centre: tuple[float, float], size: tuple[float, float], margin: float, pitch: float) -> MapGrid:
+    """The grid over a region of `size` [m] about `centre` [m], widened by `margin` [m], on a perceived surface.
+
+    `surface`: vertices [m], shape (n, 3), in A. Where none is near, the smooth shape through all of them stands in.
+    Raises ValueError when fewer than 30 vertices lie in the region.
+    """
+    half = 0.5 * np.asarray(size) + margin
+    near = surface[np.all(np.abs(surface[:, :2] - centre) <= half + 0.03, axis=1)]
+    near = near[np.isfinite(near).all(axis=1)]
+    if len(near) < 30:
+        raise ValueError(f"perceived surface: {len(near)} vertices in the examined region, want at least 30")
+    shape = np.linalg.lstsq(_terms(near[:, 0], near[:, 1]), near[:, 2], rcond=None)[0]
+    count = np.maximum(np.round(2 * half / pitch).astype(int) + 1, 3)
+    x = centre[0] + (np.arange(count[0]) - 0.5 * (count[0] - 1)) * pitch
+    y = centre[1] + (np.arange(count[1]) - 0.5 * (count[1] - 1)) * pitch
+    xx, yy = np.meshgrid(x, y)
+    smooth = _terms(xx, yy) @ shape
+    rest = near[:, 2] - _terms(near[:, 0], near[:, 1]) @ shape
+    z = smooth + LinearNDInterpolator(near[:, :2], rest, fill_value=0.0)(xx, yy)
+    zy, zx = np.gradient(smooth, pitch)
+    area = pitch**2 * np.sqrt(1 + zx**2 + zy**2)
+    return MapGrid(x, y, z, area.ravel(), shape)

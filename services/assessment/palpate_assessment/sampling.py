@@ -1,0 +1,128 @@
+"""States of the examination at 100 Hz to samples: one every few millimetres of travel, by averaging."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_assessment.contact import ReferenceContact
+from palpate_assessment.memory import PathMemory
+
+Array = NDArray[np.float64]
+
+TRAVEL = 0.004
+"""Travel that one sample averages [m]: a third of the footprint's radius, so it blurs nothing."""
+LONGEST = 0.4
+"""Time that one sample averages at most [s], for an indenter that stands still."""
+_FEWEST = 3
+"""States that make a sample."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What the examination measures at one instant, in the abdomen frame A."""
+
+    time: float
+    """[s]"""
+    position: Array
+    """Perceived rest surface point under the indenter [m], shape (3,)."""
+    normal: Array
+    """Outward unit normal there, shape (3,)."""
+    depth: float
+    """Indentation along the inward normal from the perceived rest surface [m]."""
+    force: float
+    """Tared normal force [N], positive when the wall is pressed."""
+    in_contact: bool
+    counts: bool
+    """Whether it belongs into a sample: in contact, at depth, outside transitions."""
+    force_limited: bool = False
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One measurement of force at depth, averaged over a few millimetres of travel, in A."""
+
+    time: float
+    """[s]"""
+    position: Array
+    """[m], shape (3,)."""
+    normal: Array
+    """Shape (3,)."""
+    velocity: Array
+    """Tangential velocity of the indenter [m/s], shape (3,)."""
+    depth: float
+    """[m]"""
+    depth_rate: float
+    """[m/s]"""
+    force: float
+    """[N]"""
+    force_noise: float
+    """Standard error of the mean force [N]."""
+    lost: float
+    """Force over k_w that the wall's memory takes away [m^3]."""
+    time_in_contact: float
+    """Since the onset of contact of this stroke [s]."""
+    force_limited: bool
+
+
+class Sampler:
+    """Thins states to samples. Feed every state in order; a sample comes out now and then."""
+
+    def __init__(self, contact: ReferenceContact, travel: float = TRAVEL) -> None:
+        self._memory = PathMemory(contact)
+        self._travel = travel
+        self._block: list[State] = []
+        self._last: State | None = None
+        self._onset: float | None = None
+
+    def add(self, state: State) -> Sample | None:
+        """Takes the next state; returns the sample that it completes, if any."""
+        sample = None
+        if state.in_contact:
+            if self._onset is None:
+                self._onset = state.time
+            if self._last is not None:
+                self._memory.add(state.time, state.time - self._last.time, state.position, state.depth)
+        else:
+            self._onset = None
+        self._last = state
+        if state.in_contact and state.counts:
+            self._block.append(state)
+            first = self._block[0]
+            far = float(np.linalg.norm(state.position - first.position)) >= self._travel
+            if far or state.time - first.time >= LONGEST:
+                sample = self._average()
+        else:
+            sample = self._average()
+        return sample
+
+    def _average(self) -> Sample | None:
+        block, self._block = self._block, []
+        if len(block) < _FEWEST:
+            return None
+        time = np.array([s.time for s in block])
+        position = np.array([s.position for s in block])
+        depth = np.array([s.depth for s in block])
+        force = np.array([s.force for s in block])
+        normal = np.array([s.normal for s in block]).mean(axis=0)
+        normal /= np.linalg.norm(normal)
+        centred = time - time.mean()
+        slope = centred / (centred @ centred)
+        velocity = slope @ position
+        rest = force - force.mean() - centred * float(slope @ force)
+        middle = position.mean(axis=0)
+        return Sample(
+            time=float(time.mean()),
+            position=middle,
+            normal=normal,
+            velocity=velocity - normal * float(normal @ velocity),
+            depth=float(depth.mean()),
+            depth_rate=float(slope @ depth),
+            force=float(force.mean()),
+            force_noise=float(np.sqrt(rest @ rest / max(len(block) - 2, 1) / len(block))),
+            lost=self._memory.lost(float(time.mean()), middle),
+            time_in_contact=float(time.mean()) - (self._onset if self._onset is not None else float(time[0])),
+            force_limited=any(s.force_limited for s in block),
+        )
