@@ -75,7 +75,7 @@ class InputBuffer:
     def ready(self, t: int) -> bool:
         """Whether the reader may step at `t` as far as this topic goes."""
         if self.lost or not self.edge.blocking:
-            return self.lost or self.edge is not Edge.LATCHED or bool(self._pending or self.latest)
+            return self.lost or self.edge is not Edge.LATCHED or self.holds_any
         return self.advanced >= self.need(t)
 
     def accept(self, sequence: int, payload: bytes) -> None:
@@ -115,6 +115,11 @@ class InputBuffer:
     def waits_for_data(self) -> bool:
         """Whether an advance is known whose messages are not all here."""
         return bool(self._advances)
+
+    @property
+    def holds_any(self) -> bool:
+        """Whether any message has come."""
+        return bool(self._pending) or self.latest is not None
 
     def deliver(self, received: Received) -> None:
         """Takes a message whose stamp is known (composed run, observers)."""

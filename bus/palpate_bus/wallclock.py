@@ -13,7 +13,7 @@ from typing import Any
 
 import zenoh
 
-from palpate_bus.contract import MS, Contract
+from palpate_bus.contract import MS, Contract, Edge
 from palpate_bus.distributed import Link, RunAborted
 from palpate_bus.lockstep import NEVER, Received, Stepper
 from palpate_bus.messages import RunControl, ServiceReport
@@ -94,7 +94,7 @@ class WallClockNode:
 
     def _loop(self, epoch: int) -> None:
         period = self._stepper.role.period
-        t = 0
+        t = self._await_inputs(epoch)
         while self._end is None or t <= self._end:
             due = epoch + t
             now = monotonic_ns()
@@ -116,6 +116,19 @@ class WallClockNode:
                 self._obey(message)
             self._link.progress(t)
             t += period
+
+    def _await_inputs(self, epoch: int) -> int:
+        """Waits until every input that the first step needs has come once; returns the tick [ns] at which it may step."""
+        needed = [b for b in self._stepper.buffers.values() if b.edge in (Edge.SAME_TICK, Edge.LATCHED)]
+        while True:
+            self._receive(0)
+            if all(b.holds_any for b in needed):
+                break
+            message = self._link.poll(HANDSHAKE_POLL_S if needed else None)
+            if message is not None:
+                self._obey(message)
+        period = self._stepper.role.period
+        return max(0, (monotonic_ns() - epoch) // period * period)
 
     def _receive(self, t: int) -> None:
         now = time_ns()

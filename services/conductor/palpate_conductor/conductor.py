@@ -175,6 +175,7 @@ class Conductor:
         self._handshake(died)
         self._started_at = monotonic()
         self.started_at_perf = perf_counter()
+        self.watchdog.forgive()
         self._epoch = time_ns() + WALLCLOCK_LEAD
         self._grant(self._epoch if self._wallclock else WINDOW - MS)
         try:

@@ -1,0 +1,138 @@
+"""Conservative synchronisation without transport: what a reader may see, and when."""
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from palpate_bus.contract import MS, Edge, contract
+from palpate_bus.lockstep import InputBuffer, LockstepError, Stepper, run_hash
+from toy_services import TOYS, Control, Robot
+
+TOPICS = contract().topics
+
+
+def buffer(topic: str, edge: Edge) -> InputBuffer:
+    row = TOPICS[topic]
+    return InputBuffer(row, edge, contract().roles[row.producer].period)
+
+
+def test_same_tick_needs_the_producers_tick_and_previous_the_one_before() -> None:
+    assert buffer("joint_states", Edge.SAME_TICK).need(7 * MS) == 7 * MS
+    assert buffer("control/joint_torque", Edge.PREVIOUS).need(7 * MS) == 6 * MS
+    assert buffer("control/joint_torque", Edge.PREVIOUS).need(0) < 0
+
+
+def test_a_slow_producer_has_its_whole_period_to_compute() -> None:
+    setpoint = buffer("planning/setpoint", Edge.PREVIOUS)
+    assert [setpoint.need(t * MS) // MS for t in (10, 15, 19, 20, 29)] == [0, 0, 0, 10, 10]
+
+
+def test_messages_become_visible_after_their_delay() -> None:
+    torque = buffer("control/joint_torque", Edge.PREVIOUS)
+    for sequence in range(1, 5):
+        torque.accept(sequence, b"")
+    torque.take(2 * MS)
+    assert [received.stamp for received in torque.new] == [0, MS]
+    torque.take(3 * MS)
+    assert [received.stamp for received in torque.new] == [2 * MS]
+
+
+@pytest.mark.parametrize("sequence", [2, 5])
+def test_a_gap_is_an_error_that_names_topic_and_numbers(sequence: int) -> None:
+    joints = buffer("joint_states", Edge.SAME_TICK)
+    with pytest.raises(LockstepError, match=rf"joint_states: messages 1\.\.{sequence - 1} of robot are missing"):
+        joints.accept(sequence, b"")
+
+
+def test_a_repeated_message_is_an_error() -> None:
+    joints = buffer("joint_states", Edge.SAME_TICK)
+    joints.accept(1, b"")
+    with pytest.raises(LockstepError, match="came again"):
+        joints.accept(1, b"")
+
+
+@given(
+    counts=st.lists(st.integers(0, 3), min_size=1, max_size=12),
+    order=st.randoms(use_true_random=False),
+)
+def test_event_topics_read_the_same_whatever_order_data_and_advances_arrive_in(counts: list[int], order: random.Random) -> None:
+    period = 100 * MS
+    sent = [(tick * period, sequence) for tick, count in enumerate(counts) for sequence in range(count)]
+    stamps = [stamp for stamp, _ in sent]
+    data = [("data", sequence + 1) for sequence in range(len(sent))]
+    advances = [("advance", tick * period, sum(counts[: tick + 1])) for tick in range(len(counts))]
+    merged: list[tuple[object, ...]] = []
+    while data or advances:  # each stream is in order; how they interleave is not known
+        merged.append((data if data and (not advances or order.random() < 0.5) else advances).pop(0))
+    images = buffer("camera/depth/image_raw", Edge.PREVIOUS)
+    for event in merged:
+        if event[0] == "data":
+            images.accept(int(str(event[1])), b"")
+        else:
+            images.advance(int(str(event[1])), int(str(event[2])))
+    assert images.advanced == (len(counts) - 1) * period
+    images.take(len(counts) * period)
+    assert [received.stamp for received in images.new] == stamps
+
+
+def test_event_topic_is_not_ready_before_its_messages_are_here() -> None:
+    images = buffer("camera/depth/image_raw", Edge.PREVIOUS)
+    images.advance(0, 1)
+    assert not images.ready(100 * MS)
+    assert images.waits_for_data
+    images.accept(1, b"")
+    assert images.ready(100 * MS)
+
+
+def test_a_lost_producer_holds_nobody_up() -> None:
+    joints = buffer("joint_states", Edge.SAME_TICK)
+    joints.lost = True
+    assert joints.ready(5 * MS)
+
+
+class Silent(Robot):
+    def step(self, t, inbox):  # type: ignore[no-untyped-def]
+        out = dict(super().step(t, inbox))
+        del out["ft/wrench"]
+        return out
+
+
+class Intruder(Control):
+    def step(self, t, inbox):  # type: ignore[no-untyped-def]
+        return {"ft/wrench": None}
+
+
+class OffTick(Robot):
+    def step(self, t, inbox):  # type: ignore[no-untyped-def]
+        return {**super().step(t, inbox), "robot/status": None} if t else super().step(t, inbox)
+
+
+def test_a_service_that_leaves_out_a_periodic_message_is_named() -> None:
+    stepper = Stepper(Silent(), contract())
+    with pytest.raises(LockstepError, match="robot sent no ft/wrench at 0 ns"):
+        stepper.step(0)
+
+
+def test_a_service_may_send_only_what_the_contract_gives_it() -> None:
+    with pytest.raises(LockstepError, match="control sent ft/wrench, which the contract does not give it"):
+        Stepper(Intruder(), contract()).step(0)
+
+
+def test_a_message_off_its_tick_is_an_error() -> None:
+    stepper = Stepper(OffTick(), contract())
+    stepper.step(0)
+    with pytest.raises(LockstepError, match="no tick of its period"):
+        stepper.step(MS)
+
+
+def test_latched_topics_are_due_at_start() -> None:
+    toy = TOYS["robot"]()
+    toy.start = dict  # type: ignore[method-assign, assignment]
+    with pytest.raises(LockstepError, match="did not send its latched robot_description"):
+        Stepper(toy, contract()).start()
+
+
+def test_run_hash_depends_on_every_digest_and_not_on_their_order() -> None:
+    assert run_hash({"a": "1", "b": "2"}) == run_hash({"b": "2", "a": "1"})
+    assert run_hash({"a": "1", "b": "2"}) != run_hash({"a": "2", "b": "1"})

@@ -1,0 +1,184 @@
+"""A small dataflow with every kind of edge, for tests of the runtimes: numbers that depend on every input and its delay.
+
+Run as a program it is the process of one role: `python toy_services.py ROLE`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from palpate_bus.messages import (
+    CameraTrigger,
+    ExamState,
+    Image,
+    ImpedanceSetpoint,
+    IndentationTruth,
+    JointState,
+    JointTorqueCommand,
+    PalpationSample,
+    PhantomTruth,
+    Point,
+    Pose,
+    Quaternion,
+    RobotStatus,
+    String,
+    SurfaceMesh,
+    TFMessage,
+    ToolState,
+    Twist,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+)
+from palpate_bus.run import main
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import NS, duration_message, header
+
+MS = 1_000_000
+NAMES = [f"lbr_A{i}" for i in range(1, 8)]
+END = int(float(os.environ.get("TOY_END_S", "2")) * NS)
+
+
+def pose(x: float = 0.0) -> Any:
+    return Pose(Point(x, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
+
+
+def twist() -> Any:
+    return Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+
+
+def wrench(x: float = 0.0) -> Any:
+    return Wrench(Vector3(x, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+
+
+class Robot(Service):
+    role = "robot"
+
+    def start(self) -> Outbox:
+        return {"robot_description": String("<robot/>")}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        torque, contact = inbox.latest("control/joint_torque"), inbox.latest("sim/contact_wrench")
+        x = np.full(7, (torque.torque[0] if torque else 0.0) + 0.5 * (contact.wrench.force.x if contact else 0.0))
+        h = header(t, "world")
+        out: dict[str, Any] = {
+            "joint_states": JointState(h, NAMES, x, x, x),
+            "sim/tool_state": ToolState(h, pose(x[0]), twist(), 0.015),
+            "ft/wrench": WrenchStamped(h, wrench()),
+        }
+        if t % (10 * MS) == 0:
+            out["robot/status"] = _status(h, x, inbox.lost("control"))
+        if t % (50 * MS) == 0:
+            out["sim/link_poses"] = TFMessage([])
+        return out
+
+
+def _status(h: Any, x: Any, lost: bool) -> Any:
+    fields = {name: x for name in ("applied_torque", "position", "velocity") if name in RobotStatus.__dataclass_fields__}
+    if "wrench" in RobotStatus.__dataclass_fields__:
+        fields["wrench"] = wrench()
+    return RobotStatus(header=h, mode=2 if lost else 1, cause=0, reason="", commands_rejected=0, **fields)
+
+
+class Control(Service):
+    role = "control"
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        if os.environ.get("TOY_CONTROL_FAILS_AT") == str(t // MS):
+            raise ArithmeticError("toy failure")
+        joints, setpoint = inbox.latest("joint_states"), inbox.latest("planning/setpoint")
+        torque = np.sin(1.1 * joints.position + 1e-9 * t + (setpoint.joint_position if setpoint else 0.0))
+        return {"control/joint_torque": JointTorqueCommand(header(t), torque, duration_message(50 * MS))}
+
+
+class Tissue(Service):
+    role = "tissue"
+
+    def start(self) -> Outbox:
+        none = np.zeros(0, np.float32)
+        mesh = SurfaceMesh(header(0, "abdomen"), np.zeros(3, np.float32), none, np.zeros(0, np.uint32))
+        return {"truth/phantom": PhantomTruth(mesh, np.zeros(1), np.zeros(1), np.zeros(1, np.int32), pose())}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        h = header(t, "world")
+        x = float(np.cos(inbox.latest("sim/tool_state").pose.position.x))
+        out: dict[str, Any] = {"sim/contact_wrench": WrenchStamped(h, wrench(x))}
+        if t % (10 * MS) == 0:
+            out["truth/indentation"] = IndentationTruth(h, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
+        if t % (50 * MS) == 0:
+            vertices = np.full(9000, x, np.float32)
+            out["sim/surface"] = SurfaceMesh(h, vertices, np.zeros(0, np.float32), np.zeros(18000, np.uint32))
+        return out
+
+
+class Planning(Service):
+    role = "planning"
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        if "TOY_SLEEP_S" in os.environ and t == 500 * MS:
+            time.sleep(float(os.environ["TOY_SLEEP_S"]))
+        h = header(t, "world")
+        status = inbox.latest("robot/status")
+        q = 0.1 * status.applied_torque if status else np.zeros(7)
+        end = END if t >= END - NS else -1
+        out: dict[str, Any] = {
+            "planning/setpoint": ImpedanceSetpoint(
+                h, 0, pose(), twist(), wrench(), np.zeros(6), np.zeros(6), q, np.zeros(7), np.zeros(7), duration_message(250 * MS)
+            ),
+            "exam/state": ExamState(
+                h, 0, "", 0, 0, 0, False, False, False, False, 0.0, 0.0, 0.0, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), end
+            ),
+        }
+        if t % (500 * MS) == 0:
+            out["planning/camera_trigger"] = CameraTrigger(h, 3)
+        return out
+
+
+class Assessment(Service):
+    role = "assessment"
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        if inbox.latest("exam/state") is None or t % (50 * MS):
+            return {}
+        sample = PalpationSample(header(t), Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, False)
+        return {"assessment/samples": [sample, sample]}
+
+
+class Camera(Service):
+    role = "camera"
+
+    def __init__(self) -> None:
+        self.frames = 0
+
+    def start(self) -> Outbox:
+        return {"tf_static": TFMessage([])}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        self.frames += sum(message.frames for message in inbox.new("planning/camera_trigger"))
+        if not self.frames:
+            return {}
+        self.frames -= 1
+        data = np.full(640 * 480 * 4, self.frames, np.uint8)
+        return {"camera/depth/image_raw": Image(header(t), 480, 640, "32FC1", 0, 2560, data)}
+
+
+class Perception(Service):
+    role = "perception"
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        assert inbox.latest("tf_static") is not None
+        images = list(inbox.new("camera/depth/image_raw"))
+        if not images:
+            return {}
+        level = np.full(3, float(images[-1].data[0]), np.float32)
+        return {"perception/surface": SurfaceMesh(header(t), level, np.zeros(0, np.float32), np.zeros(0, np.uint32))}
+
+
+TOYS: dict[str, type[Service]] = {toy.role: toy for toy in (Robot, Control, Tissue, Planning, Assessment, Camera, Perception)}
+
+if __name__ == "__main__":
+    main(sys.argv[1], lambda _: TOYS[sys.argv[1]](), lambda _: None)

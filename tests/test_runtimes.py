@@ -1,0 +1,182 @@
+"""The runtimes against each other and against faults, with a toy dataflow in real processes over zenoh."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import zenoh
+from palpate_bus.composed import Composed
+from palpate_bus.contract import contract
+from palpate_bus.stamps import NS
+from palpate_bus.wire import topic_key
+from palpate_bus.zenoh_config import close_session, mesh, open_session
+from palpate_conductor.collector import Collector
+from palpate_conductor.conductor import Conductor, Outcome, Patience, RunFailed
+
+TOYS = Path(__file__).parents[1] / "bus" / "tests" / "toy_services.py"
+sys.path.insert(0, str(TOYS.parent))
+import toy_services  # noqa: E402
+
+ROLES = tuple(toy_services.TOYS)
+
+
+@dataclass
+class Running:
+    """A toy run that is on."""
+
+    processes: dict[str, subprocess.Popen[bytes]]
+    session: zenoh.Session
+    conductor: Conductor
+
+
+def run_toys(
+    meddle: Callable[[Running], None] = lambda _: None,
+    environment: Mapping[str, str] | None = None,
+    patience: Patience | None = None,
+    wallclock: bool = False,
+) -> Outcome:
+    with tempfile.TemporaryDirectory(prefix="toy-") as folder:
+        bus = mesh(("conductor", *ROLES), Path(folder), lowlatency=("robot", "control", "tissue"))
+        session = open_session(bus["conductor"])
+        base = {
+            **os.environ,
+            **(environment or {}),
+            "PALPATE_SCENARIO": "",
+            "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
+        }
+        processes = {
+            role: subprocess.Popen(
+                [sys.executable, str(TOYS), role], env={**base, **bus[role].to_env()}, stderr=subprocess.DEVNULL
+            )
+            for role in ROLES
+        }
+        conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, wallclock=wallclock)
+        running = Running(processes, session, conductor)
+
+        def died() -> dict[str, str]:
+            return {role: f"status {code}" for role, child in processes.items() if (code := child.poll()) is not None}
+
+        try:
+            return conductor.run(died, lambda _: meddle(running))
+        finally:
+            for child in processes.values():
+                try:
+                    child.wait(timeout=3)
+                except subprocess.TimeoutExpired:
+                    child.kill()
+                    child.wait()
+            close_session(session)
+
+
+def composed_hash() -> str:
+    collector = Collector()
+    run = Composed([*(toy() for toy in toy_services.TOYS.values()), collector])
+    assert run.run(lambda: collector.collected.end_tick, 60 * NS) == toy_services.END
+    return run.run_hash()
+
+
+def test_composed_and_distributed_give_the_same_run_hash() -> None:
+    outcome = run_toys()
+    assert outcome.failure is None
+    assert outcome.last_tick == toy_services.END
+    assert outcome.run_hash == composed_hash()
+    assert set(outcome.reports) == set(ROLES)
+
+
+def at(running: Running, seconds: float, done: list[bool]) -> bool:
+    """True once, when the simulated time is reached."""
+    reached = running.conductor.watchdog.progress["robot"].tick > seconds * NS
+    if reached and not done:
+        done.append(True)
+        return True
+    return False
+
+
+def test_killed_controller_is_named_and_the_survivors_run_one_more_second() -> None:
+    done: list[bool] = []
+
+    def kill(running: Running) -> None:
+        if at(running, 0.5, done):
+            running.processes["control"].kill()
+
+    outcome = run_toys(kill, {"TOY_END_S": "30"})
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("control lost at tick")
+    assert outcome.run_hash is None
+    assert abs(outcome.last_tick - outcome.lost["control"] - NS) <= NS // 2
+
+
+def test_killed_tissue_ends_the_run_at_once() -> None:
+    done: list[bool] = []
+
+    def kill(running: Running) -> None:
+        if at(running, 0.3, done):
+            running.processes["tissue"].kill()
+
+    outcome = run_toys(kill, {"TOY_END_S": "30"})
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("tissue lost at tick")
+
+
+def test_a_service_that_raises_is_named_with_its_error() -> None:
+    outcome = run_toys(environment={"TOY_CONTROL_FAILS_AT": "700"})
+    assert outcome.failure is not None
+    assert "control lost" in outcome.failure
+    assert "ArithmeticError: toy failure" in outcome.failure
+
+
+def test_a_frozen_service_ends_the_run_and_is_blamed() -> None:
+    done: list[bool] = []
+
+    def freeze(running: Running) -> None:
+        if at(running, 0.3, done):
+            running.processes["tissue"].send_signal(signal.SIGSTOP)
+
+    outcome = run_toys(freeze, {"TOY_END_S": "30"}, Patience(soft=0.5, hard=2.0))
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("tissue blocks the run")
+
+
+def test_garbage_and_strangers_are_counted_and_change_nothing() -> None:
+    done: list[bool] = []
+
+    def shout(running: Running) -> None:
+        if at(running, 0.2, done):
+            for topic in contract().topics.values():
+                key = topic_key(topic, 0)
+                running.session.put(key, b"\xff" * 40)
+                running.session.put(key, b"\xff" * 40, attachment=b"not an attachment")
+                running.session.put(key, b"\xff" * 40, attachment=bytes(16) + b"\x10" + bytes(16))
+
+    outcome = run_toys(shout)
+    assert outcome.failure is None
+    assert outcome.run_hash == composed_hash()
+    assert sum(report["garbage"] for report in outcome.reports.values()) >= 2
+    assert sum(report["foreign"] for report in outcome.reports.values()) >= 1
+
+
+def test_a_service_that_never_comes_is_named() -> None:
+    def leave() -> Mapping[str, str]:
+        return {}
+
+    with tempfile.TemporaryDirectory(prefix="toy-") as folder:
+        session = open_session(mesh(("conductor",), Path(folder))["conductor"])
+        conductor = Conductor(session, contract(), 0, ("robot",), Collector(), Patience(start=0.5))
+        with pytest.raises(RunFailed, match="no answer from robot"):
+            conductor.run(leave)
+        close_session(session)
+
+
+def test_wall_clock_runs_the_same_services_to_the_announced_end() -> None:
+    outcome = run_toys(wallclock=True)
+    assert outcome.failure is None
+    assert outcome.last_tick >= toy_services.END
+    assert outcome.reports["control"]["blame"]["steps"] > 0.8 * toy_services.END / 1_000_000
