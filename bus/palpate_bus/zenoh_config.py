@@ -159,7 +159,9 @@ def _settings(options: BusOptions) -> dict[str, Any]:
         "scouting/gossip/enabled": options.router is not None or options.mode == "router",
         "connect/endpoints": connect,
         # Peers start in any order. The default first retry comes after one second, which would be most of a start.
-        "connect/retry": {"period_init_ms": 20, "period_max_ms": 500, "period_increase_factor": 1.5},
+        "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
+        # Opening does not wait for peers (half a second by default): the runtime's hello does, on every edge.
+        "open/return_conditions/connect_scouted": options.router is not None,
         # Late joiners of latched topics are served by time stamp, as in rmw_zenoh.
         "timestamping/enabled": True,
         # Where a queue is full for a moment (a reader that was not scheduled), wait rather than lose: in lockstep a lost message
