@@ -1,0 +1,168 @@
+"""Meshes of users: what is taken, what is refused, and in which words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from palpate_models.phantom import MeshError, build_phantom
+from palpate_models.phantom.mesh import orient, refine
+from palpate_models.phantom.parametric import parametric_surface
+from palpate_models.scenario import Phantom
+
+
+def dome(subdivisions=4):
+    """A closed ellipsoid whose top is at the origin."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=1.0)
+    return mesh.vertices * (0.18, 0.23, 0.10) - (0, 0, 0.10), np.array(mesh.faces)
+
+
+def write(path, vertices, faces):
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    return Phantom(kind="mesh", mesh=str(path))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "ply"])
+def test_every_format_gives_the_same_phantom(tmp_path, suffix):
+    vertices, faces = dome()
+    model = build_phantom(write(tmp_path / f"belly.{suffix}", vertices, faces), 0)
+    top = np.argmin(np.linalg.norm(model.vertices, axis=1))
+    assert np.linalg.norm(model.vertices[top]) < 0.004
+    assert model.normals[top, 2] > 0.99
+    examined = (np.abs(model.vertices[:, :2]) <= 0.10).all(axis=1) & (model.normals[:, 2] > 0.2)
+    pairs = np.concatenate((model.triangles[:, :2], model.triangles[:, 1:]))
+    pairs = pairs[examined[pairs].all(axis=1)]
+    assert np.linalg.norm(model.vertices[pairs[:, 0]] - model.vertices[pairs[:, 1]], axis=1).max() <= 0.005
+    assert model.fixed[model.vertices[:, 2] < -0.195].all()
+
+
+def test_refinement_leaves_no_hanging_vertices():
+    vertices, faces = dome(3)
+    surface = refine(vertices, faces.astype(np.int32), 0.005)
+    mesh = trimesh.Trimesh(surface.vertices, surface.triangles, process=False)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.area == pytest.approx(trimesh.Trimesh(vertices, faces, process=False).area)
+
+
+def test_open_surface_has_its_border_fixed(tmp_path):
+    vertices, faces = dome()
+    model = build_phantom(write(tmp_path / "open.ply", vertices, faces[vertices[faces][:, :, 2].min(axis=1) > -0.08]), 0)
+    assert model.fixed.any()
+    assert (~model.fixed).any()
+    assert model.normals[np.argmin(np.linalg.norm(model.vertices, axis=1)), 2] > 0.99
+
+
+@pytest.mark.parametrize("mess", ["inside_out", "every_other"])
+def test_orientation_is_put_right(mess):
+    vertices, faces = dome(2)
+    turned = faces[:, ::-1].copy() if mess == "inside_out" else faces.copy()
+    if mess == "every_other":
+        turned[::2] = turned[::2, ::-1]
+    out = orient(vertices, turned.astype(np.int32))
+    assert trimesh.Trimesh(vertices, out, process=False).volume == pytest.approx(
+        trimesh.Trimesh(vertices, faces, process=False).volume
+    )
+
+
+def test_a_parametric_abdomen_survives_the_way_through_a_file(tmp_path):
+    shape = parametric_surface((0.36, 0.46, 0.20), 0.005)
+    model = build_phantom(write(tmp_path / "abdomen.ply", shape.vertices, shape.triangles), 0)
+    assert len(model.vertices) < 2 * len(shape.vertices)
+
+
+def refused(path, message):
+    with pytest.raises(MeshError, match=message) as error:
+        build_phantom(Phantom(kind="mesh", mesh=str(path)), 0)
+    assert str(path) in str(error.value)
+    assert "phantom.mesh" in str(error.value)
+
+
+def test_millimetres_are_named(tmp_path):
+    vertices, faces = dome(2)
+    write(tmp_path / "mm.stl", vertices * 1000, faces)
+    refused(tmp_path / "mm.stl", r"millimetres.*0\.001")
+
+
+def test_too_small_is_named(tmp_path):
+    vertices, faces = dome(2)
+    write(tmp_path / "tiny.stl", vertices / 1000, faces)
+    refused(tmp_path / "tiny.stl", "want metres")
+
+
+def test_missing_and_wrong_files_are_named(tmp_path):
+    refused(tmp_path / "nothing.obj", "no such file")
+    (tmp_path / "x.step").write_text("x")
+    refused(tmp_path / "x.step", r"want a file in \.obj")
+    (tmp_path / "junk.ply").write_bytes(b"\x00\x01 no mesh at all")
+    refused(tmp_path / "junk.ply", r"cannot be read as \.ply")
+
+
+def test_empty_mesh_is_refused(tmp_path):
+    (tmp_path / "empty.obj").write_text("# nothing\n")
+    refused(tmp_path / "empty.obj", "no triangles|cannot be read")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n")
+    refused(tmp_path / "points.obj", "no triangles|cannot be read")
+
+
+def test_degenerate_triangle_is_refused(tmp_path):
+    vertices, faces = dome(2)
+    middle = vertices[faces[0][:2]].mean(axis=0)
+    vertices = np.vstack((vertices, middle))
+    faces = np.vstack((faces, [faces[0][0], faces[0][1], len(vertices) - 1]))
+    write(tmp_path / "flat.ply", vertices, faces)
+    refused(tmp_path / "flat.ply", "1 degenerate triangles")
+
+
+def test_three_triangles_on_an_edge_are_refused(tmp_path):
+    vertices, faces = dome(2)
+    vertices = np.vstack((vertices, (0.0, 0.0, 0.05)))
+    faces = np.vstack((faces, [faces[0][0], faces[0][1], len(vertices) - 1]))
+    write(tmp_path / "fin.ply", vertices, faces)
+    refused(tmp_path / "fin.ply", "non-manifold: 1 edges")
+
+
+def test_surfaces_that_touch_in_a_vertex_are_refused(tmp_path):
+    vertices, faces = dome(2)
+    top = int(np.argmin(np.linalg.norm(vertices, axis=1)))
+    other = vertices * (1, 1, -1) + (0, 0, 2 * vertices[top, 2])
+    index = np.arange(len(vertices)) + len(vertices)
+    index[top] = top
+    write(tmp_path / "bow.ply", np.vstack((vertices, other)), np.vstack((faces, index[faces][:, ::-1])))
+    refused(tmp_path / "bow.ply", "touch in 1 single vertices")
+
+
+def test_several_pieces_are_refused(tmp_path):
+    vertices, faces = dome(2)
+    both = np.vstack((vertices, vertices + (0.6, 0, 0)))
+    write(tmp_path / "two.ply", both, np.vstack((faces, faces + len(vertices))))
+    refused(tmp_path / "two.ply", "2 separate pieces")
+
+
+def test_a_moebius_strip_is_refused():
+    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    rim = [
+        [(0.2 + s * np.cos(a / 2)) * np.cos(a), (0.2 + s * np.cos(a / 2)) * np.sin(a), s * np.sin(a / 2)]
+        for a in angles
+        for s in (-0.05, 0.05)
+    ]
+    faces = []
+    for k in range(40):
+        a, b = 2 * k, 2 * k + 1
+        c, d = (2 * k + 2, 2 * k + 3) if k < 39 else (1, 0)
+        faces += [[a, b, c], [b, d, c]]
+    with pytest.raises(MeshError, match="not orientable"):
+        orient(np.array(rim), np.array(faces, dtype=np.int32))
+
+
+def test_umbilicus_off_the_origin_is_refused(tmp_path):
+    vertices, faces = dome(3)
+    write(tmp_path / "off.ply", vertices + (0, 0, 0.3), faces)
+    refused(tmp_path / "off.ply", "umbilicus must be at the origin")
+
+
+def test_a_mesh_too_fine_is_refused(tmp_path):
+    vertices, faces = dome(5)
+    write(tmp_path / "fine.ply", vertices, faces)
+    with pytest.raises(MeshError, match="decimate"):
+        build_phantom(Phantom(kind="mesh", mesh=str(tmp_path / "fine.ply"), edge_m=0.0025), 0)
