@@ -58,6 +58,7 @@ class _Statistics:
     u: NDArray[np.int32]
     v: NDArray[np.int32]
     axial: Vector
+    """Of every pixel of the image, flat: the noise is that of the surface which a jittered ray meets."""
     lateral: Vector
     grazing: NDArray[np.intp]
     """Indices into the n at which loss is possible."""
@@ -96,7 +97,7 @@ class KinectNoise:
         w += s.view.gu.ravel()[seen] * (du - whole_u)
         w += s.view.gv.ravel()[seen] * (dv - whole_v)
         z = 1 / np.maximum(w, np.float32(1e-6))
-        z += s.axial * draw[2]
+        z += s.axial[seen] * draw[2]
         step = self._scale * np.float32(DISPARITY_STEP_PX)
         disparity = np.maximum(np.rint(self._focal_baseline / np.maximum(z, np.float32(1e-3)) / step), 1) * step
         z = self._focal_baseline / disparity
@@ -111,10 +112,10 @@ class KinectNoise:
             theta = np.asarray(np.arccos(np.minimum(view.cos.ravel()[pixel], 1)), np.float32)
             loss = loss_probability(theta)
             grazing = np.flatnonzero(loss)
-            theta = np.asarray(
-                np.minimum(theta, GRAZING_RAD[1]), np.float32
-            )  # beyond, all pixels are lost: stay off the pole
-            axial, lateral = self._scale * axial_sigma(z, theta), self._scale * lateral_sigma(theta)
+            theta = np.asarray(np.minimum(theta, GRAZING_RAD[1]), np.float32)  # beyond, all pixels are lost: stay off the pole
+            axial = np.zeros(view.w.size, np.float32)
+            axial[pixel] = self._scale * axial_sigma(z, theta)
+            lateral = self._scale * lateral_sigma(theta)
             loss = np.minimum(self._scale, 1) * loss[grazing]
             self._known = _Statistics(view, pixel, u, v, axial, lateral, grazing, loss)
         return self._known

@@ -29,9 +29,7 @@ class Pinhole:
     def of(cls, camera: Camera) -> Pinhole:
         """The intrinsics of a scenario's camera."""
         focal = camera.focal_px
-        return cls(
-            camera.width_px, camera.height_px, focal, focal, (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-        )
+        return cls(camera.width_px, camera.height_px, focal, focal, (camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
 
     @property
     def matrix(self) -> Array:

@@ -56,9 +56,10 @@ class DepthFusion:
         return len(self._frames)
 
     def motion(self, depth: Image, pixel: NDArray[np.intp]) -> float:
-        """Standard deviation [m] over the frames of their mean offset from `depth` at `pixel` (rows, columns), shape (n, 2).
+        """Standard deviation [m] over the frames of their mean offset from `depth` at some pixels.
 
-        Noise averages out over thousands of pixels, so what is left is a surface that moves, as in breathing.
+        `pixel`: rows and columns in the window, shape (n, 2). Noise averages out over thousands of pixels, so what is
+        left is a surface that moves, as in breathing.
         """
         row, column = pixel[:, 0], pixel[:, 1]
         offset = np.stack([frame[row, column] for frame in self._frames]) - depth[row, column]

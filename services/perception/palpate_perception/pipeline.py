@@ -166,9 +166,7 @@ def _remarks(guessed: int, nodes: int, motion: float) -> str:
     if guessed:
         remarks.append(f"{guessed} of {nodes} targets lie in small gaps and are interpolated")
     if motion > MOTION_M:
-        remarks.append(
-            f"the surface moved while it was seen, by {1e3 * motion:.1f} mm (standard deviation): breathing?"
-        )
+        remarks.append(f"the surface moved while it was seen, by {1e3 * motion:.1f} mm (standard deviation): breathing?")
     return "; ".join(remarks)
 
 

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 CUTOFF_M: Final = 0.03
 """Wave length that passes with half its amplitude: wider waves are shape, narrower ones noise."""
-KNOTS_PER_CUTOFF: Final = 3
+KNOTS_PER_CUTOFF: Final = 4
 DEGREE: Final = 3
 TUKEY: Final = 4.685
 """Tukey's biweight for 95 % efficiency."""
@@ -85,9 +85,7 @@ class HeightField:
     def sigma(self, x: Array, y: Array) -> Array:
         """Standard deviation [m] of the height at points, shape (n,): the posterior of the smoothing spline (Wahba)."""
         rows = np.einsum("ni,nj->nij", self.x.values(x), self.y.values(y)).reshape(len(x), -1)
-        return np.asarray(
-            self.scale * np.sqrt(np.einsum("nm,mn->n", rows, cho_solve_banded((self.factor, True), rows.T)))
-        )
+        return np.asarray(self.scale * np.sqrt(np.einsum("nm,mn->n", rows, cho_solve_banded((self.factor, True), rows.T))))
 
     def _evaluate(self, x: Array, y: Array, nu_x: int, nu_y: int) -> Array:
         return np.asarray(

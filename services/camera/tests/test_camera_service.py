@@ -1,0 +1,173 @@
+"""The service: idle until triggered, one frame a tick, messages as the contract has them, the robot occludes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from palpate_bus import codec
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import CameraTrigger, SurfaceMesh, TFMessage
+from palpate_bus.stamps import header, nanoseconds
+from palpate_camera.service import FRAME, CameraService, create, transform
+from palpate_models.frames import look_at
+from palpate_models.load import exam_input
+from palpate_models.scenario import Pose, Scenario
+from scipy.spatial.transform import Rotation
+
+
+class FakeInbox:
+    """New messages of one step, and the latest of all steps."""
+
+    def __init__(self) -> None:
+        self._latest: dict[str, Any] = {}
+        self._new: dict[str, list[Any]] = {}
+
+    def put(self, **messages: Any) -> FakeInbox:
+        """Messages by topic, with __ for /; what was new before no longer is."""
+        self._new = {topic.replace("__", "/"): [message] for topic, message in messages.items()}
+        self._latest |= {topic: items[-1] for topic, items in self._new.items()}
+        return self
+
+    def latest(self, topic: str) -> Any:
+        return self._latest.get(topic)
+
+    def new(self, topic: str) -> Iterable[Any]:
+        return self._new.get(topic, [])
+
+    def stamp(self, topic: str) -> int | None:
+        return None
+
+    def lost(self, role: str) -> bool:
+        return False
+
+
+def scenario(**camera: Any) -> Scenario:
+    return Scenario().model_copy(update={"camera": Scenario().camera.model_copy(update=camera)})
+
+
+def plate(height: float = 0.9, half: float = 0.15, frame: str = "world") -> Any:
+    """A horizontal square at the patient's place."""
+    corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
+    vertices = np.column_stack((corners[:, 0] + 0.56, corners[:, 1], np.full(4, height))).astype(np.float32)
+    return SurfaceMesh(header(0, frame), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]))
+
+
+def trigger(frames: int, t: int = 0) -> Any:
+    return CameraTrigger(header(t), frames)
+
+
+def depth(message: Any) -> np.ndarray:
+    return np.frombuffer(message.data, "<f4").reshape(message.height, message.width)
+
+
+def test_idle_until_triggered_then_one_frame_a_tick() -> None:
+    camera, inbox = CameraService(exam_input(Scenario())), FakeInbox()
+    assert camera.step(0, inbox.put(sim__surface=plate())) == {}
+    sent = [camera.step(100 * MS, inbox.put(planning__camera_trigger=trigger(3)))]
+    sent += [camera.step(t * MS, inbox.put()) for t in (200, 300, 400, 500)]
+    assert [bool(outbox) for outbox in sent] == [True, True, True, False, False]
+    stamps = [nanoseconds(outbox["camera/depth/image_raw"].header.stamp) for outbox in sent[:3]]
+    assert stamps == [100 * MS, 200 * MS, 300 * MS]
+    assert camera.finish() == {"bursts": 1, "frames": 3}
+
+
+def test_a_new_trigger_replaces_the_burst() -> None:
+    camera, inbox = CameraService(exam_input(Scenario())), FakeInbox()
+    camera.step(0, inbox.put(sim__surface=plate(), planning__camera_trigger=trigger(50)))
+    sent = [camera.step(100 * MS, inbox.put(planning__camera_trigger=trigger(2)))]
+    sent += [camera.step(t * MS, inbox.put()) for t in (200, 300)]
+    assert [bool(outbox) for outbox in sent] == [True, True, False]
+
+
+def test_a_burst_waits_for_the_first_surface() -> None:
+    camera, inbox = CameraService(exam_input(Scenario())), FakeInbox()
+    assert camera.step(0, inbox.put(planning__camera_trigger=trigger(1))) == {}
+    assert camera.step(100 * MS, inbox.put(sim__surface=plate()))
+
+
+def test_messages_are_what_the_contract_says() -> None:
+    service = create(Scenario())
+    tf = service.start()["tf_static"]
+    sent = service.step(0, FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1)))
+    names = {topic.name for topic in contract().outputs("camera")}
+    assert {*sent, "tf_static"} == names
+    for name, message in {**sent, "tf_static": tf}.items():
+        kind = contract().topics[name].type
+        again = codec.decode(codec.encode(message, kind), kind)
+        if name != "tf_static":
+            assert again.header.frame_id == contract().topics[name].frame == FRAME
+    image, info = sent["camera/depth/image_raw"], sent["camera/depth/camera_info"]
+    assert (image.encoding, image.is_bigendian, image.step, image.data.size) == ("32FC1", 0, 2560, 2560 * 480)
+    assert (info.height, info.width, info.distortion_model) == (480, 640, "plumb_bob")
+    assert info.k.tolist() == [585.0, 0.0, 319.5, 0.0, 585.0, 239.5, 0.0, 0.0, 1.0]
+    assert info.p.reshape(3, 4)[:, :3].ravel().tolist() == info.k.tolist()
+
+
+def test_an_ideal_camera_measures_the_plate_and_the_table() -> None:
+    service = CameraService(exam_input(scenario(noise_scale=0.0)))
+    sent = service.step(0, FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1)))
+    image = depth(sent["camera/depth/image_raw"])
+    camera = Scenario().camera
+    X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
+    rows, columns = np.nonzero(np.isfinite(image))
+    direction = np.column_stack(((columns - 319.5) / 585, (rows - 239.5) / 585, np.ones(len(rows))))
+    p_W = direction * image[rows, columns, np.newaxis] @ X_WC[:3, :3].T + X_WC[:3, 3]
+    heights = p_W[:, 2]
+    assert np.mean(np.abs(heights - 0.9) < 1e-4) > 0.05  # the plate
+    assert np.mean(np.abs(heights - 0.73) < 1e-4) > 0.2  # the table's top
+    assert heights.max() < 0.9 + 1e-4
+
+
+def test_the_calibrated_pose_has_the_error_and_the_true_one_takes_the_picture() -> None:
+    error = Pose(xyz_m=(0.004, -0.003, 0.01), rpy_rad=(0.0, 0.01, 0.0))
+    good, bad = CameraService(exam_input(scenario())), CameraService(exam_input(scenario(extrinsic_error=error)))
+    (true,), (told,) = good.start()["tf_static"].transforms, bad.start()["tf_static"].transforms
+    assert (told.header.frame_id, told.child_frame_id) == ("world", FRAME)
+
+    def pose(message: Any) -> tuple[np.ndarray, Rotation]:
+        p, q = message.transform.translation, message.transform.rotation
+        return np.array([p.x, p.y, p.z]), Rotation.from_quat([q.x, q.y, q.z, q.w])
+
+    (p, R), (p_told, R_told) = pose(true), pose(told)
+    np.testing.assert_allclose(p, Scenario().camera.position_m)
+    np.testing.assert_allclose(R.inv().apply(p_told - p), error.xyz_m, atol=1e-12)
+    np.testing.assert_allclose((R.inv() * R_told).as_rotvec(), error.rpy_rad, atol=1e-12)
+    inbox = FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1))
+    a, b = (service.step(0, inbox)["camera/depth/image_raw"].data for service in (good, bad))
+    assert a.tobytes() == b.tobytes()
+
+
+def test_a_link_before_the_abdomen_hides_it() -> None:
+    X = np.eye(4)
+    X[:3, 3] = 0.6, -0.1, 1.1
+    links = TFMessage([transform(0, "world", "lbr_link_4", X)])
+    pictures = []
+    for poses in ({}, {"sim__link_poses": links}):
+        service = CameraService(exam_input(scenario(noise_scale=0.0)))
+        inbox = FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1), **poses)
+        pictures.append(depth(service.step(0, inbox)["camera/depth/image_raw"]))
+    without, with_link = pictures
+    nearer = with_link < without - 0.05
+    assert 1000 < nearer.sum() < 60_000
+    untouched = ~nearer & np.isfinite(without)
+    np.testing.assert_array_equal(with_link[untouched], without[untouched])
+
+
+def test_two_cameras_of_one_seed_send_the_same_bytes() -> None:
+    def run(seed: int) -> list[bytes]:
+        service, inbox = create(Scenario(seed=seed)), FakeInbox()
+        inbox.put(sim__surface=plate(), planning__camera_trigger=trigger(3))
+        out = [service.step(0, inbox), *(service.step(t * MS, inbox.put()) for t in (100, 200))]
+        return [codec.encode(sent["camera/depth/image_raw"], "sensor_msgs/msg/Image") for sent in out]
+
+    assert run(5) == run(5)
+    assert run(5) != run(6)
+
+
+def test_a_surface_in_another_frame_is_refused() -> None:
+    service = create(Scenario())
+    with pytest.raises(ValueError, match=r"sim/surface: header.frame_id = 'abdomen', want 'world'"):
+        service.step(0, FakeInbox().put(sim__surface=plate(frame="abdomen"), planning__camera_trigger=trigger(1)))
