@@ -48,7 +48,9 @@ class StaticContact:
 
     def influence(self, r: Array) -> Array:
         """du/dd at distance r [m] from the axis: 1 in contact, K0(r/l) / K0(a/l) outside [1]."""
-        return np.asarray(np.where(r < self.radius, 1.0, k0(np.maximum(r, self.radius) / self.length) / k0(self.radius / self.length)))
+        return np.asarray(
+            np.where(r < self.radius, 1.0, k0(np.maximum(r, self.radius) / self.length) / k0(self.radius / self.length))
+        )
 
     def pressure(self, r: Array) -> Array:
         """Contact pressure over k_w at distance r [m]: w - l^2 lap w in contact, else 0 [m]."""

@@ -103,7 +103,9 @@ def confidence(log_ratio: float, variance: float) -> float:
     return float(1.0 / (1.0 + np.exp(-np.clip(np.log(PRIOR_ODDS) + lesion - healthy, -60, 60))))
 
 
-def find(excess: Array, grid: MapGrid, reached: Mask, posterior: Posterior, observations: Observations, healthy: Field) -> list[StiffArea]:
+def find(
+    excess: Array, grid: MapGrid, reached: Mask, posterior: Posterior, observations: Observations, healthy: Field
+) -> list[StiffArea]:
     """The findings, most confident first."""
     areas: list[Mask] = []
     for candidate in candidates(excess, grid, reached):

@@ -12,7 +12,7 @@ from palpate_assessment.memory import PathMemory
 
 Array = NDArray[np.float64]
 
-TRAVEL = 0.004
+TRAVEL = 0.005
 """Travel that one sample averages [m]: a third of the footprint's radius, so it blurs nothing."""
 LONGEST = 0.4
 """Time that one sample averages at most [s], for an indenter that stands still."""

@@ -1,0 +1,198 @@
+"""Assessment as a service: states of the examination in; samples, a growing map, the final map and findings out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_bus.codec import Message, message_type
+from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, StiffnessMap
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import NS, header, nanoseconds
+from palpate_models.frames import apply, inverse
+from palpate_models.load import exam_input
+from palpate_models.phantom import quadrant
+from palpate_models.scenario import ExamInput, Scenario
+
+from palpate_assessment.assess import Assessment, assess
+from palpate_assessment.contact import ReferenceContact
+from palpate_assessment.findings import StiffArea
+from palpate_assessment.grid import MapGrid, map_grid
+from palpate_assessment.sampling import Sample, Sampler, State
+
+Array = NDArray[np.float64]
+
+_Point: Any = message_type("geometry_msgs/msg/Point")
+_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
+
+FRAME = "abdomen"
+PITCH = 0.005
+"""Of the final map's grid [m]: a third of the footprint's radius."""
+MARGIN = 0.020
+"""The map's grid goes this far beyond the examined region [m]: what the footprint reaches."""
+GROWING_PITCH = 0.008
+GROWING_SAMPLES = 300
+"""A growing map takes every n-th sample, so that it stays cheap."""
+GROWING_EVERY = 4 * NS
+GROWING_FIRST = 40
+"""Samples before the first growing map."""
+SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
+FINISHED = frozenset({ExamState.PHASE_ASSESS, ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
+
+
+class AssessmentService(Service):
+    """Thins the measured states to samples and turns them into a stiffness map and findings."""
+
+    role: ClassVar[str] = "assessment"
+
+    def __init__(self, exam: ExamInput) -> None:
+        self._exam = exam.exam
+        self._X_AW = inverse(np.array(exam.X_WA))
+        self._contact = ReferenceContact(exam.robot.indenter_radius_m, exam.exam.depth_m)
+        self._reach = float(np.clip(0.8 * exam.exam.spacing_m, 0.006, 0.020))
+        self._sampler = Sampler(self._contact)
+        self._samples: list[Sample] = []
+        self._surface: Array | None = None
+        self._coarse: MapGrid | None = None
+        self._last_map = 0
+        self._mapped = 0
+        self._final: Assessment | None = None
+        self._finished = False
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Samples as they come, a map every few seconds, and once the scan is over the final map and the findings."""
+        for surface in inbox.new("perception/surface"):
+            self._perceive(surface)
+        new: list[Sample] = []
+        phase = None
+        for state in inbox.new("exam/state"):
+            phase = int(state.phase)
+            sample = self._sampler.add(self._state(state))
+            if sample is not None:
+                new.append(sample)
+        self._samples += new
+        outbox: dict[str, Message | list[Message]] = {}
+        if new:
+            outbox["assessment/samples"] = [sample_message(s) for s in new]
+        if phase in FINISHED and not self._finished:
+            self._finished = True
+            outbox |= self._finish(t)
+        elif phase in SCANNING and self._due(t):
+            outbox |= self._grow(t)
+        return outbox
+
+    def finish(self) -> Mapping[str, Any]:
+        """How much was assessed."""
+        final = self._final
+        return {
+            "samples": len(self._samples),
+            "samples_used": 0 if final is None else final.samples,
+            "findings": 0 if final is None else len(final.findings),
+        }
+
+    def _perceive(self, message: Message) -> None:
+        if message.header.frame_id != "world":
+            raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want 'world'")
+        p_W = np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3)
+        self._surface = apply(self._X_AW, p_W)
+        self._coarse = self._grid(GROWING_PITCH)
+
+    def _grid(self, pitch: float) -> MapGrid:
+        assert self._surface is not None
+        return map_grid(self._surface, self._exam.centre_m, self._exam.region_m, MARGIN, pitch)
+
+    def _state(self, message: Message) -> State:
+        p, n = message.surface_point, message.surface_normal
+        return State(
+            time=nanoseconds(message.header.stamp) / NS,
+            position=apply(self._X_AW, np.array([[p.x, p.y, p.z]]))[0],
+            normal=self._X_AW[:3, :3] @ np.array([n.x, n.y, n.z]),
+            depth=float(message.depth),
+            force=float(message.normal_force),
+            in_contact=bool(message.in_contact),
+            counts=bool(message.steady),
+            force_limited=bool(message.force_limited),
+        )
+
+    def _due(self, t: int) -> bool:
+        grown = len(self._samples) >= max(GROWING_FIRST, self._mapped + 10)
+        return grown and self._coarse is not None and t - self._last_map >= GROWING_EVERY
+
+    def _grow(self, t: int) -> Outbox:
+        assert self._coarse is not None
+        self._last_map, self._mapped = t, len(self._samples)
+        every = -(-len(self._samples) // GROWING_SAMPLES)
+        chosen = self._samples[::every]
+        result = assess(chosen, self._coarse, self._contact, self._reach, refine=False)
+        return {} if result is None else {"assessment/map": map_message(t, result, self._contact.common_depth)}
+
+    def _finish(self, t: int) -> Outbox:
+        if self._surface is not None:
+            self._final = assess(self._samples, self._grid(PITCH), self._contact, self._reach)
+        if self._final is None:
+            return {"assessment/findings": findings_message(t, [])}
+        return {
+            "assessment/map": map_message(t, self._final, self._contact.common_depth),
+            "assessment/findings": findings_message(t, self._final.findings),
+        }
+
+
+def create(scenario: Scenario) -> Service:
+    """The assessment of a scenario; it knows nothing of the phantom but where the patient is registered."""
+    return AssessmentService(exam_input(scenario))
+
+
+def sample_message(sample: Sample) -> Message:
+    """`palpation_msgs/PalpationSample`, stamped with the middle of the measurement."""
+    return PalpationSample(
+        header=header(round(sample.time * NS), FRAME),
+        position=_Point(*map(float, sample.position)),
+        normal=_Vector3(*map(float, sample.normal)),
+        depth=sample.depth,
+        normal_force=sample.force,
+        tangential_speed=float(np.linalg.norm(sample.velocity)),
+        time_in_contact=sample.time_in_contact,
+        force_limited=sample.force_limited,
+    )
+
+
+def map_message(t: int, result: Assessment, common_depth: float) -> Message:
+    """`palpation_msgs/StiffnessMap`."""
+    finding = np.full(len(result.stiffness), -1, dtype=np.int32)
+    for i, area in enumerate(result.findings):
+        finding[area.nodes] = i
+    return StiffnessMap(
+        header=header(t, FRAME),
+        vertices=result.grid.nodes.astype(np.float32).reshape(-1),
+        triangles=result.grid.triangles.reshape(-1),
+        force=result.force.astype(np.float32),
+        stiffness=result.stiffness.astype(np.float32),
+        stiffness_lower=result.lower.astype(np.float32),
+        stiffness_upper=result.upper.astype(np.float32),
+        scanned=result.scanned,
+        finding=finding,
+        common_depth=common_depth,
+        background=result.background,
+        samples=result.samples,
+    )
+
+
+def findings_message(t: int, findings: Sequence[StiffArea]) -> Message:
+    """`palpation_msgs/Findings`, the final ones."""
+    return Findings(header=header(t, FRAME), findings=[finding_message(f) for f in findings], final=True)
+
+
+def finding_message(area: StiffArea) -> Message:
+    """`palpation_msgs/Finding`."""
+    x, y, z = map(float, area.centroid)
+    return Finding(
+        centroid=_Point(x, y, z),
+        quadrant=quadrant(x, y),
+        area=area.area,
+        stiffness_ratio=area.ratio,
+        stiffness_ratio_lower=area.ratio_lower,
+        stiffness_ratio_upper=area.ratio_upper,
+        confidence=area.confidence,
+    )
