@@ -14,8 +14,9 @@ Nothing is ever found by multicast: a run must not meet another run's peers on t
 
 **Low-latency transport.** zenoh's usual transport hands every message to a transmission task; the low-latency one writes it
 to the socket in the caller's thread. It has no priorities, no fragments (so a message over 64 KiB needs shared memory) and no
-time-out of its own: a frozen reader blocks its writers as soon as the socket's buffer is full. So it is for lockstep runs on one
-host, where the barrier bounds what is in flight, and only between blocking roles; either side without it gets the usual transport.
+time-out of its own: a frozen reader blocks its writers as soon as the socket's buffer is full. So it is for lockstep runs on
+one host, where the barrier bounds what is in flight, and only between blocking roles; a pair of which either side does not offer
+it gets the usual transport.
 
 Round trip of 300 bytes between two Python processes (SimpleQueue receivers, five interleaved repeats of 3,500, two busy cores):
 
@@ -31,6 +32,7 @@ Round trip of 300 bytes between two Python processes (SimpleQueue receivers, fiv
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -135,7 +137,7 @@ def _check_endpoint(endpoint: str) -> None:
 
 
 def zenoh_config(options: BusOptions) -> zenoh.Config:
-    """zenoh's configuration for these options. Raises BusConfigError if the configuration file cannot be used."""
+    """The configuration of zenoh for these options. Raises BusConfigError if the configuration file cannot be used."""
     if options.file is not None:
         try:
             return zenoh.Config.from_file(options.file)
@@ -204,22 +206,25 @@ def open_session(options: BusOptions | None = None) -> zenoh.Session:
     """
     options = options or BusOptions.from_env()
     try:
-        return zenoh.open(zenoh_config(options))
+        opened = zenoh.open(zenoh_config(options))
     except zenoh.ZError as error:
         raise BusConfigError(f"cannot open a zenoh session with {options}: {error}") from error
+    atexit.register(close_session, opened)
+    return opened
 
 
 def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
     """Undeclares what is passed, closes the session and says whether it closed in order; never raises.
 
-    Without this, a process that merely ends can abort in zenoh's exit handler, because the session's close then waits for
-    callbacks that need the interpreter that is going away.
+    A session that is still open when the interpreter ends makes it hang for ten seconds and then print a panic ("close
+    operation timed out"), because its close waits for callbacks that need the interpreter. So `open_session` also registers
+    this function with atexit.
     """
     for item in declared:
         with suppress(Exception):
             item.undeclare()
     try:
-        zenoh_session.close()
+        zenoh_session.close()  # type: ignore[no-untyped-call]
     except Exception:  # the session is lost either way; zenoh's errors share no base with PyO3's panics
         return False
     return True

@@ -12,7 +12,6 @@ from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import duration_message, header
-from palpate_models.lbr import JOINT_NAMES
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
 
@@ -84,15 +83,13 @@ class PlanningService(Service):
         }
 
     def _read(self, inbox: Inbox) -> None:
-        """Means of joint positions and wrench over the messages of this period: force and depth of the same moment."""
-        joints = [message.position for message in inbox.new("joint_states") if list(message.name) == list(JOINT_NAMES)]
-        forces = [(f.x, f.y, f.z, m.x, m.y, m.z) for f, m in ((w.wrench.force, w.wrench.torque) for w in inbox.new("ft/wrench"))]
-        if self._reading is None and not (joints and forces):
+        """Joint positions and wrench as the robot averages them over a period: force and depth of the same moment."""
+        status = inbox.latest("robot/status")
+        if status is None:
             return
-        old = self._reading
-        q = np.mean(np.array(joints), axis=0) if joints or old is None else old.q
-        wrench = np.mean(np.array(forces), axis=0) if forces or old is None else old.wrench_S
-        self._reading = Reading(q, wrench)
+        force, moment = status.wrench.force, status.wrench.torque
+        wrench = np.array((force.x, force.y, force.z, moment.x, moment.y, moment.z))
+        self._reading = Reading(np.array(status.position), wrench)
 
     def _perceived(self, inbox: Inbox) -> Seen | Unseen | None:
         """Perception's newest answer, if one came."""

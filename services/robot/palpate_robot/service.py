@@ -71,6 +71,8 @@ class RobotService(Service):
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
         self._applied = np.zeros(7)
+        self._sums = np.zeros(20)
+        self._summed = 0
         self._external_force = 0.0
         self._peak_force = 0.0
 
@@ -150,11 +152,17 @@ class RobotService(Service):
             self._row = 0
         noise = self._noise[self._row]
         self._row += 1
-        return _JointState(_Header(stamp, ""), _NAMES, self._plant.q + noise[:7], self._plant.v + noise[7:], self._applied.copy())
+        q, v = self._plant.q + noise[:7], self._plant.v + noise[7:]
+        self._sums[:7] += q
+        self._sums[7:14] += v
+        self._summed += 1
+        return _JointState(_Header(stamp, ""), _NAMES, q, v, self._applied.copy())
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
-        fx, fy, fz, mx, my, mz = self._sensor.read(self._plant.sensor_wrench()).tolist()
+        reading = self._sensor.read(self._plant.sensor_wrench())
+        self._sums[14:] += reading
+        fx, fy, fz, mx, my, mz = reading.tolist()
         weight = self._weight
         external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
         self._external_force = external**0.5
@@ -169,11 +177,17 @@ class RobotService(Service):
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
+        mean = self._sums / self._summed
+        self._sums[:] = 0.0
+        self._summed = 0
         return _RobotStatus(
             _Header(stamp, ""),
             int(driver.mode),
             int(driver.cause),
             driver.reason,
+            mean[:7],
+            mean[7:14],
+            _Wrench(_Vector3(*mean[14:17].tolist()), _Vector3(*mean[17:].tolist())),
             self._applied.copy(),
             driver.rejected,
         )
