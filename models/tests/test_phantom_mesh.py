@@ -134,7 +134,7 @@ def test_surfaces_that_touch_in_a_vertex_are_refused(tmp_path):
 
 def test_several_pieces_are_refused(tmp_path):
     vertices, faces = dome(2)
-    both = np.vstack((vertices, vertices + (0.6, 0, 0)))
+    both = np.vstack((vertices, vertices + np.array((0.6, 0, 0))))
     write(tmp_path / "two.ply", both, np.vstack((faces, faces + len(vertices))))
     refused(tmp_path / "two.ply", "2 separate pieces")
 
@@ -157,7 +157,7 @@ def test_a_moebius_strip_is_refused():
 
 def test_umbilicus_off_the_origin_is_refused(tmp_path):
     vertices, faces = dome(3)
-    write(tmp_path / "off.ply", vertices + (0, 0, 0.3), faces)
+    write(tmp_path / "off.ply", vertices + np.array((0, 0, 0.3)), faces)
     refused(tmp_path / "off.ply", "umbilicus must be at the origin")
 
 

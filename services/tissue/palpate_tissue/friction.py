@@ -41,7 +41,8 @@ class Friction:
     def step(self, dt: float, velocity: Vector, normal: Vector, load: float) -> Vector:
         """Friction force on the indenter [N] after `dt` [s].
 
-        `velocity` [m/s] of the indenter's surface against the tissue, `normal` unit, `load` the normal force [N]; all in one frame.
+        `velocity` [m/s] is of the indenter's surface against the tissue, `normal` of unit length, `load` the normal
+        force [N]; all in one frame.
         """
         limit = self.coefficient * load
         if limit <= 0:

@@ -39,9 +39,8 @@ class Surface:
         corners = model.vertices[model.triangles]
         self._corner = corners[:, 0]
         sides = corners[:, 1:] - corners[:, :1]
-        self._flat: Array = np.linalg.pinv(sides.transpose(0, 2, 1)).astype(
-            np.float64
-        )  # barycentric coordinates of an offset, (m, 2, 3)
+        # Maps an offset from the first corner to its barycentric coordinates, shape (m, 2, 3).
+        self._flat: Array = np.linalg.pinv(sides.transpose(0, 2, 1)).astype(np.float64)
         self._faces = _incident_faces(model)
         self._gradient = _gradient(model, self._flat)
 

@@ -95,7 +95,8 @@ class Tissue:
         self._tree = cKDTree(model.vertices[free])
         self._candidates: _Candidates | None = None
         self._at: list[float] | None = None
-        self._moved = False
+        self.disturbed = False
+        """Whether anything has ever moved; until then the field is left at its exact rest."""
         self.touching = False
         """Whether the sphere holds a vertex after the step."""
 
@@ -150,7 +151,7 @@ class Tissue:
 
     def _relax(self) -> None:
         """The field as it moves by itself: u += -h C^-1 K (u - sum y). A surface never touched is at rest exactly."""
-        if not self._moved:
+        if not self.disturbed:
             return
         u, strain = self.displacement, self._strain
         if self.branches:
@@ -163,7 +164,7 @@ class Tissue:
 
     def _remember(self) -> None:
         """The Prony branches: exact for a displacement that is held over the step."""
-        if not self._moved:
+        if not self.disturbed:
             return
         for branch, decay, feed in zip(self.branches, self._decay, self._feed, strict=True):
             dscal(decay, branch)
@@ -201,7 +202,7 @@ class Tissue:
         if load <= 0:
             return self._no_contact()
         self.displacement[near.index] = u
-        self.touching = self._moved = True
+        self.touching = self.disturbed = True
         nx, ny, nz = on_f[:3]
         fx = nx + on_below[0] + g * qx - on_steep[3]
         fy = ny + on_below[1] + g * qy - on_steep[4]

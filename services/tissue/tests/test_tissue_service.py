@@ -1,0 +1,200 @@
+"""The tissue service against its rows of the contract."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from palpate_bus.codec import decode, encode, message_type
+from palpate_bus.contract import MS, contract
+from palpate_bus.stamps import header, nanoseconds
+from palpate_models.frames import matrix
+from palpate_models.phantom import build_phantom
+from palpate_models.scenario import Breathing, Lesion, Phantom, Pose, Registration, Scenario
+from palpate_tissue import bench
+from palpate_tissue.service import create
+from palpate_tissue.surface import Surface, nearest_weights
+
+LESION = Lesion(centre_m=(-0.02, 0.0))
+
+
+def tool_state(t, p, v=(0.0, 0.0, 0.0), radius=0.015):
+    point, vector = message_type("geometry_msgs/msg/Point"), message_type("geometry_msgs/msg/Vector3")
+    pose = message_type("geometry_msgs/msg/Pose")(point(*p), message_type("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0))
+    twist = message_type("geometry_msgs/msg/Twist")(vector(*v), vector(0.0, 0.0, 0.0))
+    return message_type("palpation_msgs/msg/ToolState")(header(t, "world"), pose, twist, radius)
+
+
+class OneTopic:
+    """An inbox with the newest tool state."""
+
+    def __init__(self):
+        self.message = None
+
+    def latest(self, topic):
+        assert topic == "sim/tool_state"
+        return self.message
+
+    def new(self, topic):
+        return [] if self.message is None else [self.message]
+
+    def stamp(self, topic):
+        return None
+
+    def lost(self, role):
+        return False
+
+
+def scenario(**phantom):
+    return Scenario(phantom=Phantom(lesions=(LESION,), **phantom))
+
+
+def press(service, X_WA, depth=0.008, ticks=60, at=(0.0, 0.0)):
+    inbox, out = OneTopic(), {}
+    for k in range(ticks + 1):
+        p_A = np.array((*at, 0.015 - depth * min(1, k / 30)))
+        p_W = X_WA[:3, :3] @ p_A + X_WA[:3, 3]
+        inbox.message = tool_state(k * MS, p_W.tolist())
+        out.update(service.step(k * MS, inbox))
+    return out
+
+
+def vector(message):
+    return np.array((message.x, message.y, message.z))
+
+
+def test_every_output_is_sent_on_its_ticks_encodes_and_lies_in_range():
+    service = create(scenario())
+    topics = {topic.name: topic for topic in contract().outputs("tissue")}
+    latched = service.start()
+    assert set(latched) == {name for name, topic in topics.items() if topic.latched}
+    inbox = OneTopic()
+    for k in range(101):
+        inbox.message = tool_state(k * MS, (0.56, 0.0, 0.935))
+        out = service.step(k * MS, inbox)
+        due = {name for name, topic in topics.items() if not topic.latched and k % topic.period_ms == 0}
+        assert set(out) == due
+        for name, message in out.items():
+            copy = decode(encode(message, topics[name].type), topics[name].type)
+            assert nanoseconds(copy.header.stamp) == k * MS
+            assert copy.header.frame_id == topics[name].frame
+            for field, (low, high) in topics[name].ranges.items():
+                value = copy
+                for part in field.split("."):
+                    value = getattr(value, part)
+                value = vector(value) if hasattr(value, "x") else np.asarray(value)
+                assert (value >= low).all(), (name, field)
+                assert (value <= high).all(), (name, field)
+
+
+def test_truth_tells_the_phantom():
+    case = scenario()
+    truth = create(case).start()["truth/phantom"]
+    truth = decode(encode(truth, "palpation_msgs/msg/PhantomTruth"), "palpation_msgs/msg/PhantomTruth")
+    model = build_phantom(case.phantom, case.seed)
+    assert truth.surface.header.frame_id == "abdomen"
+    np.testing.assert_allclose(truth.surface.vertices.reshape(-1, 3), model.vertices, atol=1e-7)
+    np.testing.assert_array_equal(truth.stiffness, model.stiffness)
+    np.testing.assert_array_equal(truth.lesion, model.lesion)
+    np.testing.assert_allclose(vector(truth.pose.position), (0.56, 0.0, 0.93))
+
+
+def test_wrench_and_depth_follow_the_true_pose_of_the_patient():
+    """Turning patient and tool together turns the wrench; the registration error changes nothing."""
+    turned = Pose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.2, -0.1, 0.5))
+    cases = [
+        scenario(),
+        scenario(pose=Registration(true=turned, error=Pose(xyz_m=(0.01, 0.02, 0.03), rpy_rad=(0.1, 0.0, 0.0)))),
+    ]
+    poses = [matrix(case.phantom.pose.true) for case in cases]
+    outs = [press(create(case), X_WA, at=(0.0053, 0.001)) for case, X_WA in zip(cases, poses, strict=True)]
+    forces = [X_WA[:3, :3].T @ vector(out["sim/contact_wrench"].wrench.force) for X_WA, out in zip(poses, outs, strict=True)]
+    assert forces[0][2] > 1
+    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6, atol=1e-8)
+    depths = [out["truth/indentation"].depth for out in outs]
+    assert depths[0] == pytest.approx(depths[1], abs=1e-9)
+    assert 0.006 < depths[0] < 0.0081
+
+
+def test_indentation_truth_is_consistent_with_the_wrench():
+    case = scenario()
+    out = press(create(case), matrix(case.phantom.pose.true))
+    truth, force = out["truth/indentation"], vector(out["sim/contact_wrench"].wrench.force)
+    assert truth.contacts > 5
+    assert np.hypot(truth.normal_force, truth.tangential_force) == pytest.approx(np.linalg.norm(force), rel=1e-9)
+    model = build_phantom(case.phantom, case.seed)
+    assert truth.stiffness == pytest.approx(model.stiffness[np.argmin(np.linalg.norm(model.vertices, axis=1))], rel=0.1)
+
+
+def test_surface_shows_the_dent():
+    case = scenario()
+    service, X_WA = create(case), matrix(case.phantom.pose.true)
+    out = press(service, X_WA, depth=0.010, ticks=100)
+    surface = out["sim/surface"]
+    vertices = surface.vertices.reshape(-1, 3)
+    rest = build_phantom(case.phantom, case.seed).vertices @ X_WA[:3, :3].T + X_WA[:3, 3]
+    moved = np.linalg.norm(vertices - rest, axis=1)
+    assert moved.max() == pytest.approx(0.010, abs=0.0008)
+    assert moved[np.linalg.norm(rest[:, :2] - (0.56, 0.0), axis=1) > 0.12].max() < 1e-4
+    np.testing.assert_allclose(np.linalg.norm(surface.normals.reshape(-1, 3), axis=1), 1, atol=1e-6)
+
+
+def test_without_a_tool_the_abdomen_breathes_and_exerts_nothing():
+    service = create(scenario(breathing=Breathing(amplitude_m=0.006, rate_per_min=15)))
+    inbox, tops = OneTopic(), []
+    for k in range(0, 4001):
+        out = service.step(k * MS, inbox)
+        assert not vector(out["sim/contact_wrench"].wrench.force).any()
+        if "sim/surface" in out:
+            tops.append(out["sim/surface"].vertices.reshape(-1, 3)[:, 2].max())
+    assert 0.010 < max(tops) - min(tops) <= 0.0121
+
+
+def test_report_counts_contact():
+    case = scenario()
+    service = create(case)
+    press(service, matrix(case.phantom.pose.true))
+    facts = service.finish()
+    assert facts["contact_onsets"] == 1
+    assert facts["contact_steps"] > 20
+    assert facts["peak_force_n"] > 0.5
+    assert facts["substeps"] >= 1
+
+
+def test_nearest_rest_point_against_brute_force():
+    model = build_phantom(Phantom(), 0)
+    surface = Surface(model)
+    rng = np.random.default_rng(0)
+    corners = model.vertices[model.triangles]
+    for p in np.column_stack((rng.uniform(-0.1, 0.1, (40, 2)), rng.uniform(-0.03, 0.05, 40))):
+        at = np.einsum("fk,fkx->fx", nearest_weights(p, corners), corners)
+        brute = np.linalg.norm(p - at, axis=1).min()
+        assert abs(surface.nearest(p).height) == pytest.approx(brute, abs=1e-5)
+
+
+def test_nearest_rest_point_breathes():
+    model = build_phantom(Phantom(), 0)
+    surface = Surface(model)
+    p = np.array((0.0, 0.02, 0.02))
+    assert surface.nearest(p).height - surface.nearest(p, 0.006).height == pytest.approx(0.006, rel=0.05)
+
+
+def test_normals_of_a_dent_are_those_of_the_mesh():
+    model = build_phantom(Phantom(), 0)
+    inward = 0.01 * np.exp(-(model.vertices[:, :2] ** 2).sum(axis=1) / (2 * 0.015**2))
+    moved = model.vertices - inward[:, None] * model.normals
+    corners = moved[model.triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    mesh = np.zeros_like(moved)
+    for k in range(3):
+        np.add.at(mesh, model.triangles[:, k], cross)
+    mesh /= np.linalg.norm(mesh, axis=1, keepdims=True)
+    near = (np.abs(model.vertices[:, :2]) < 0.08).all(axis=1) & (model.normals[:, 2] > 0)
+    angle = np.degrees(np.arccos(np.clip((Surface(model).normals(inward) * mesh).sum(axis=1), -1, 1)))
+    assert angle[near].max() < 2
+
+
+def test_bench_measures_a_step_in_contact():
+    result = bench.measure(steps=50)
+    assert result["vertices"] > 2700
+    assert result["contacts"] > 5
+    assert result["step_us_p50"] > 0
