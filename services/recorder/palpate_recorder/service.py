@@ -87,7 +87,5 @@ def create(scenario: Scenario) -> RecorderService:
     del scenario
     out = os.environ.get("PALPATE_OUT")
     if not out:
-        raise ValueError(
-            f"PALPATE_OUT is not set; the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder"
-        )
+        raise ValueError(f"PALPATE_OUT is not set; the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder")
     return RecorderService(Path(out) / FOLDER)

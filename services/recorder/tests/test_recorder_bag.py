@@ -26,9 +26,7 @@ TOPICS = contract().topics
 
 def joint_states(t: int) -> bytes:
     position = np.full(7, t / 1e9)
-    return codec.encode(
-        JointState(header(t), NAMES, position, position + 1, position + 2), "sensor_msgs/msg/JointState"
-    )
+    return codec.encode(JointState(header(t), NAMES, position, position + 1, position + 2), "sensor_msgs/msg/JointState")
 
 
 def surface(t: int) -> bytes:

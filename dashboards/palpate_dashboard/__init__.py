@@ -1,0 +1,1 @@
+"""Dashboard: what happens on the bus, drawn in rerun."""

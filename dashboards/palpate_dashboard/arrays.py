@@ -1,0 +1,61 @@
+"""Messages as the arrays that the drawing takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_bus.codec import Message
+from scipy.spatial.transform import Rotation
+
+
+def point(p: Message) -> NDArray[np.float64]:
+    """A Point or Vector3, shape (3,)."""
+    return np.array((p.x, p.y, p.z))
+
+
+def points(items: Any) -> NDArray[np.float64]:
+    """Points or Vector3s, shape (n, 3)."""
+    return np.array([(p.x, p.y, p.z) for p in items], dtype=np.float64).reshape(-1, 3)
+
+
+def transform(message: Message) -> NDArray[np.float64]:
+    """A Transform as x y z [m] qx qy qz qw, shape (7,)."""
+    p, q = message.translation, message.rotation
+    return np.array((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+
+
+def matrix(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """X y z qx qy qz qw, shape (7,), as a homogeneous matrix, shape (4, 4)."""
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_quat(pose[3:]).as_matrix()
+    X[:3, 3] = pose[:3]
+    return X
+
+
+def triples(flat: NDArray[Any]) -> NDArray[Any]:
+    """x0 y0 z0 x1 ... as shape (n, 3), a view."""
+    return flat.reshape(-1, 3)
+
+
+def depth_image(message: Message) -> NDArray[np.float32]:
+    """A 32FC1 image [m], shape (height, width). Raises ValueError for another encoding."""
+    if message.encoding != "32FC1":
+        raise ValueError(f"camera/depth/image_raw: encoding {message.encoding!r}, want 32FC1")
+    rows = np.asarray(message.data).reshape(message.height, message.step)[:, : 4 * message.width]
+    return np.ascontiguousarray(rows).view(">f4" if message.is_bigendian else "<f4").astype(np.float32, copy=False)
+
+
+def cloud(message: Message) -> NDArray[np.float32]:
+    """The x y z of a PointCloud2 of 32-bit floats [m], shape (n, 3), without invalid points."""
+    offsets = {field.name: field.offset for field in message.fields}
+    layout = np.dtype({
+        "names": ["x", "y", "z"],
+        "formats": [">f4" if message.is_bigendian else "<f4"] * 3,
+        "offsets": [offsets[name] for name in "xyz"],
+        "itemsize": message.point_step,
+    })  # fmt: skip
+    rows = np.frombuffer(np.ascontiguousarray(message.data), dtype=layout, count=message.width * message.height)
+    xyz = np.stack((rows["x"], rows["y"], rows["z"]), axis=1).astype(np.float32)
+    return np.asarray(xyz[np.isfinite(xyz).all(axis=1)])

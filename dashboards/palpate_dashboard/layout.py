@@ -1,0 +1,92 @@
+"""How the viewer is laid out: the scene large, maps and depth image under it, words and curves to its right."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import rerun.blueprint as rrb
+
+from palpate_dashboard.columns import TIMELINE
+
+
+def _eye(position: tuple[float, float, float], target: tuple[float, float, float], up: tuple[float, float, float]) -> Any:
+    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=up)
+
+
+def _scene() -> Any:
+    whole_past = rrb.VisibleTimeRange(
+        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
+    hidden = rrb.EntityBehavior(visible=False)
+    return rrb.Spatial3DView(
+        name="Examination (world frame, m)",
+        origin="/world",
+        contents=["+ $origin/**", "- /world/camera/depth"],
+        background=(24, 27, 33),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, color=(255, 255, 255, 18)),
+        eye_controls=_eye((1.42, -1.12, 1.58), (0.42, -0.02, 1.05), (0.0, 0.0, 1.0)),
+        overrides={
+            "/world/tool/travelled": rrb.VisibleTimeRanges([whole_past]),
+            "/world/perception/normals": hidden,
+            "/world/perception/surface": hidden,
+        },
+    )
+
+
+def _map(layer: str, name: str, region_m: tuple[float, float], centre_m: tuple[float, float]) -> Any:
+    x, y = centre_m[0] + 0.025, centre_m[1]
+    distance = 1.3 * max(region_m)
+    return rrb.Spatial3DView(
+        name=name,
+        origin=f"/map/{layer}",
+        background=(24, 27, 33),
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=_eye((x, y - 1e-3, distance), (x, y, 0.0), (0.0, 1.0, 0.0)),
+    )
+
+
+def _plot(name: str, origin: str, low: float, high: float) -> Any:
+    return rrb.TimeSeriesView(
+        name=name,
+        origin=origin,
+        axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+    )
+
+
+def blueprint(region_m: tuple[float, float], centre_m: tuple[float, float], depth_m: float, force_limit_n: float) -> Any:
+    """The layout for an exam of `region_m` about `centre_m` at `depth_m`, with its working limit."""
+    left = rrb.Vertical(
+        _scene(),
+        rrb.Horizontal(
+            _map("mean", "Stiffness / background", region_m, centre_m),
+            _map("band", "Half width of the 90 % band", region_m, centre_m),
+            rrb.Spatial2DView(name="Depth image", origin="/world/camera", contents=["/world/camera/depth"]),
+            column_shares=[1, 1, 1.2],
+        ),
+        row_shares=[2.2, 1],
+    )
+    right = rrb.Vertical(
+        rrb.Tabs(
+            rrb.TextDocumentView(name="Status", origin="/text/status"),
+            rrb.TextDocumentView(name="Services", origin="/text/services"),
+            rrb.TextLogView(name="Log", origin="/log"),
+        ),
+        rrb.StateTimelineView(name="Phase and driver", origin="/state"),
+        _plot("Normal force [N]", "/plots/force", -1.0, 1.1 * force_limit_n),
+        _plot("Depth [mm]", "/plots/depth", -5.0, 1.8e3 * depth_m),
+        rrb.Tabs(
+            _plot("Joint torque [% of limit]", "/plots/torque", -100.0, 100.0),
+            rrb.TimeSeriesView(name="Real-time factor [1]", origin="/plots/pace"),
+            _plot("Progress [%]", "/plots/progress", 0.0, 100.0),
+        ),
+        row_shares=[1.6, 0.85, 1.2, 1.2, 1.2],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=[1.7, 1]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        auto_layout=False,
+        auto_views=False,
+    )

@@ -1,0 +1,87 @@
+"""The stiffness map from above, in the abdomen frame A: mean and uncertainty, findings, true outlines, legend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from palpate_dashboard import palette
+from palpate_dashboard.columns import TIMELINE
+from palpate_dashboard.geometry import Array, Indices
+
+LAYERS: Final = ("mean", "band")
+
+
+class StiffnessMap:
+    """Draws the map into a recording. Positions are in A, metres; the third coordinate is dropped: it is seen from above."""
+
+    def __init__(self, recording: rr.RecordingStream, region_m: tuple[float, float], centre_m: tuple[float, float]) -> None:
+        """`region_m`: width and height of the examined region about `centre_m`."""
+        self._recording = recording
+        self._shape: tuple[NDArray[np.float32], Indices] | None = None
+        (w, h), (x, y) = region_m, centre_m
+        self._corner = np.array((x + w / 2 + 0.012, y - h / 2, 0.0))
+        self._height = h
+        recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._frame(w, h, x, y)
+        self._legend("mean", [f"{r:g} x" for r in palette.LEGEND], palette.stiffness_colors(np.array(palette.LEGEND)))
+        spreads = np.array((0.1, 0.2, 0.4, 0.6))
+        self._legend("band", [f"+-{100 * s:.0f} %" for s in spreads], palette.spread_colors(spreads))
+
+    def _frame(self, w: float, h: float, x: float, y: float) -> None:
+        cross = [
+            [(x - w / 2, y, 0.002), (x + w / 2, y, 0.002)],
+            [(x, y - h / 2, 0.002), (x, y + h / 2, 0.002)],
+        ]
+        outline = [(x + a * w / 2, y + b * h / 2, 0.002) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+        grey = (150, 150, 150, 255)
+        lines = rr.LineStrips3D([*cross, outline], colors=[grey], radii=[rr.Radius.ui_points(0.7)])
+        quadrants = {"RUQ": (-1, 1), "LUQ": (1, 1), "RLQ": (-1, -1), "LLQ": (1, -1)}
+        places = [(x + 0.42 * a * w, y + 0.56 * b * h, 0.003) for a, b in quadrants.values()]
+        names = rr.Points3D(places, labels=list(quadrants), radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
+        for layer in LAYERS:
+            self._recording.log(f"map/{layer}/frame", lines, static=True)
+            self._recording.log(f"map/{layer}/quadrants", names, static=True)
+
+    def _legend(self, layer: str, labels: list[str], colors: NDArray[np.uint32]) -> None:
+        step = self._height / len(labels)
+        places = self._corner + np.outer((np.arange(len(labels)) + 0.5) * step, (0.0, 1.0, 0.0))
+        swatches = rr.Boxes3D(centers=places, half_sizes=[(0.006, step / 2, 0.0005)], colors=colors, fill_mode="solid")
+        self._recording.log(f"map/{layer}/legend", swatches, static=True)
+        beside = places + np.array((0.03, 0.0, 0.0))
+        words = rr.Points3D(beside, labels=labels, radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
+        self._recording.log(f"map/{layer}/legend/words", words, static=True)
+
+    def update(
+        self, t: int, vertices: NDArray[np.float32], triangles: Indices, ratio: Array, spread: Array, scanned: NDArray[np.bool_]
+    ) -> None:
+        """The map: stiffness over background [1] and half width of its 90 % band over its mean [1], at the vertices."""
+        self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
+        flat = vertices * np.array((1, 1, 0), dtype=np.float32)
+        shape = self._shape
+        if shape is None or not (np.array_equal(shape[0], flat) and np.array_equal(shape[1], triangles)):
+            self._shape = (flat, triangles)
+            for layer in LAYERS:
+                mesh = rr.Mesh3D.from_fields(vertex_positions=flat, triangle_indices=triangles)
+                self._recording.log(f"map/{layer}/surface", mesh)
+        unknown = palette.packed((70, 72, 78, 255))
+        for layer, colors in (("mean", palette.stiffness_colors(ratio)), ("band", palette.spread_colors(spread))):
+            mesh = rr.Mesh3D.from_fields(vertex_colors=np.where(scanned, colors, unknown).astype(np.uint32))
+            self._recording.log(f"map/{layer}/surface", mesh)
+
+    def lesions(self, segments: Iterable[NDArray[np.float64]]) -> None:
+        """True outlines of the lesions, one (k, 2, 3) array of segments each."""
+        strips = [segment * (1, 1, 0) + (0, 0, 0.003) for outline in segments for segment in outline]
+        shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
+        self._recording.log("map/mean/truth", shape, static=True)
+
+    def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
+        """Centroids of the findings, shape (n, 3)."""
+        self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
+        places = centroids * (1, 1, 0) + (0, 0, 0.004)
+        shape = rr.Points3D(places, colors=[palette.FINDING], radii=[0.003], labels=labels, show_labels=True)
+        self._recording.log("map/mean/findings", shape)

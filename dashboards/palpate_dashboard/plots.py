@@ -1,0 +1,131 @@
+"""The curves and words beside the scene: force, depth, torque, pace, phase, log. Numbers in, rerun entities out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from palpate_dashboard.columns import TIMELINE, Columns, scalars
+
+PHASES: Final = (
+    ("home", (120, 130, 145)),
+    ("look", (70, 160, 255)),
+    ("plan", (150, 110, 240)),
+    ("approach", (90, 190, 190)),
+    ("indent", (240, 200, 60)),
+    ("scan", (255, 140, 40)),
+    ("retract", (90, 190, 190)),
+    ("return", (120, 130, 145)),
+    ("assess", (190, 60, 255)),
+    ("done", (70, 190, 90)),
+    ("aborted", (220, 40, 40)),
+)
+"""Phases of the exam by number (ExamState.PHASE_*), with a colour each."""
+
+MODES: Final = (("idle", (120, 130, 145)), ("active", (70, 190, 90)), ("safe hold", (220, 40, 40)))
+"""Driver modes by number (RobotStatus.MODE_*)."""
+
+JOINT_COLORS: Final = (
+    (230, 80, 80),
+    (240, 150, 50),
+    (220, 200, 60),
+    (110, 190, 90),
+    (70, 180, 200),
+    (80, 120, 230),
+    (170, 90, 220),
+)
+DEPTH_FLOOR_M: Final = -0.02
+"""Above the surface by more than this the depth curve pauses: free motion would flatten the contact to a line."""
+
+Series = tuple[str, tuple[int, int, int]]
+
+
+class Plots:
+    """Draws the curves and words into a recording."""
+
+    def __init__(self, recording: rr.RecordingStream, columns: Columns, force_limit_n: float) -> None:
+        """`force_limit_n`: the working limit [N], drawn as a line."""
+        self._recording = recording
+        self._columns = columns
+        self._limit = np.array([force_limit_n])
+        self._states: dict[str, str] = {}
+        self._texts: dict[str, str] = {}
+        self._series("plots/force/measured", [("measured [N]", (255, 110, 110))])
+        self._series("plots/force/true", [("true [N]", (150, 110, 240))])
+        self._series("plots/force/limit", [("working limit [N]", (240, 200, 60))], width=1.0)
+        self._series("plots/depth/measured", [("measured [mm]", (255, 170, 40))])
+        self._series("plots/depth/setpoint", [("set-point [mm]", (230, 230, 230))], width=1.0)
+        self._series("plots/depth/true", [("true [mm]", (150, 110, 240))])
+        names = [f"A{i + 1} [% of limit]" for i in range(7)]
+        self._series("plots/torque/joints", list(zip(names, JOINT_COLORS, strict=True)))
+        self._series("plots/pace/real_time_factor", [("real-time factor [1]", (70, 180, 200))])
+        self._series("plots/progress/targets", [("targets visited [%]", (70, 190, 90))])
+        for path, states in (("state/phase", PHASES), ("state/driver", MODES)):
+            shown = rr.StateConfiguration(values=[name for name, _ in states], colors=[color for _, color in states])
+            recording.log(path, shown, static=True)
+
+    def _series(self, path: str, series: Sequence[Series], width: float = 1.5) -> None:
+        names = [name for name, _ in series]
+        colors = [color for _, color in series]
+        lines = rr.SeriesLines(names=names, colors=colors, widths=[width] * len(series))
+        self._recording.log(path, lines, static=True)
+
+    def _add(self, path: str, t: int, *values: float) -> None:
+        self._columns.add(path, scalars, t, np.array(values, dtype=np.float64))
+
+    def force(self, t: int, measured_n: float) -> None:
+        """The tared normal force, with the limit it must keep."""
+        self._add("plots/force/measured", t, measured_n)
+        self._columns.add("plots/force/limit", scalars, t, self._limit)
+
+    def true_contact(self, t: int, depth_m: float, force_n: float) -> None:
+        """What the simulation knows of the contact."""
+        self._add("plots/force/true", t, force_n)
+        self._add("plots/depth/true", t, 1e3 * depth_m if depth_m > DEPTH_FLOOR_M else np.nan)
+
+    def depth(self, t: int, measured_m: float, setpoint_m: float) -> None:
+        """Measured depth and its set-point, along the inward normal from the perceived surface."""
+        self._add("plots/depth/measured", t, 1e3 * measured_m if measured_m > DEPTH_FLOOR_M else np.nan)
+        self._add("plots/depth/setpoint", t, 1e3 * setpoint_m if setpoint_m > DEPTH_FLOOR_M else np.nan)
+
+    def torques(self, t: int, share: NDArray[np.float64]) -> None:
+        """Applied torques over their limits [1], shape (7,)."""
+        self._columns.add("plots/torque/joints", scalars, t, 100.0 * share)
+
+    def progress(self, t: int, visited: int, total: int) -> None:
+        """How many of the targets are done."""
+        self._add("plots/progress/targets", t, 100.0 * visited / total if total else 0.0)
+
+    def pace(self, t: int, real_time_factor: float) -> None:
+        """Simulated over wall time, over the last simulated second."""
+        self._add("plots/pace/real_time_factor", t, real_time_factor)
+
+    def state(self, t: int, path: str, name: str) -> bool:
+        """A state, written when it changes; returns whether it did."""
+        if self._states.get(path) == name:
+            return False
+        self._states[path] = name
+        self._at(t)
+        self._recording.log(path, rr.StateChange(state=name))
+        return True
+
+    def say(self, t: int, path: str, text: str, level: str = "INFO") -> None:
+        """A line of the log, written when it differs from the one before on this path."""
+        if text and self._texts.get(path) != text:
+            self._texts[path] = text
+            self._at(t)
+            self._recording.log(path, rr.TextLog(text, level=level))
+
+    def document(self, t: int, path: str, markdown: str) -> None:
+        """A page of text, written when it changes."""
+        if self._texts.get(path) != markdown:
+            self._texts[path] = markdown
+            self._at(t)
+            self._recording.log(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+
+    def _at(self, t: int) -> None:
+        self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))

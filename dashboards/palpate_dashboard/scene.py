@@ -1,0 +1,205 @@
+"""The 3-D scene in world: table, robot, camera, abdomen, perception, plan, contact. Arrays in, rerun entities out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from palpate_dashboard import palette
+from palpate_dashboard.columns import TIMELINE, Columns, arrows, deformations, transforms
+from palpate_dashboard.geometry import Array, Carry, Indices, VertexNormals
+
+METRES_PER_NEWTON: Final = 0.015
+"""Length of the force arrow: 10 N are 15 cm."""
+RESOLUTION_M: Final = 1e-4
+"""Vertices move in steps of this, so that what stands still is bit for bit the same and compresses to nothing."""
+CLOUD_POINTS: Final = 6000
+"""At most so many points of the perceived cloud are drawn."""
+CARRY_M: Final = 0.012
+"""A vertex of the abdomen takes its colour from a vertex of the map within this distance [m]."""
+TRAIL_STEP_M: Final = 0.001
+"""The travelled path gets a new point when the tool has moved so far."""
+
+
+class Shaded(NamedTuple):
+    """A mesh ready to be drawn: positions [m] and unit normals, shapes (n, 3); triangles, shape (m, 3)."""
+
+    positions: NDArray[np.float32]
+    triangles: Indices
+    normals: NDArray[np.float32]
+    color: palette.Rgba
+
+
+class Scene:
+    """Draws the scene into a recording. Poses are X_WB; positions are in world, metres."""
+
+    def __init__(self, recording: rr.RecordingStream, columns: Columns) -> None:
+        self._recording = recording
+        self._columns = columns
+        self._poses: dict[str, NDArray[np.float64]] = {}
+        self._normals: VertexNormals | None = None
+        self._rest: NDArray[np.float32] | None = None
+        self._drawn: NDArray[np.float32] | None = None
+        self._map_vertices: NDArray[np.float32] | None = None
+        self._carry: Carry | None = None
+        self._force_shown = False
+        self._trail: list[NDArray[np.float64]] = []
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def at(self, t: int) -> None:
+        """Sets the simulated time [ns] of what is logged row by row."""
+        self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
+
+    def box(self, name: str, X_WB: Array, size: tuple[float, float, float], color: palette.Rgba) -> None:
+        """A box that stands still: centre pose, shape (4, 4), and edge lengths [m]."""
+        path = f"world/furniture/{name}"
+        self._recording.log(path, rr.Transform3D(translation=X_WB[:3, 3], mat3x3=X_WB[:3, :3]), static=True)
+        shape = rr.Boxes3D(sizes=[size], colors=[color], fill_mode="solid")
+        self._recording.log(path, shape, static=True)
+
+    def link_shape(self, link: str, meshes: Iterable[Shaded]) -> None:
+        """The shape of a robot link, in its own frame."""
+        for i, mesh in enumerate(meshes):
+            shape = rr.Mesh3D(
+                vertex_positions=mesh.positions,
+                triangle_indices=mesh.triangles,
+                vertex_normals=mesh.normals,
+                albedo_factor=mesh.color,
+            )
+            self._recording.log(f"world/robot/{link}/shape_{i}", shape, static=True)
+
+    def link_poses(self, t: int, poses: Mapping[str, NDArray[np.float64]]) -> None:
+        """Poses of links by name: x y z [m] qx qy qz qw, shape (7,). A link that stands still is not written again."""
+        for link, pose in poses.items():
+            before = self._poses.get(link)
+            if before is None or np.abs(pose - before).max() > 2e-5:
+                self._poses[link] = pose
+                self._columns.add(f"world/robot/{link}", transforms, t, pose)
+
+    def abdomen(self, t: int, vertices: NDArray[np.float32], triangles: Indices | None) -> None:
+        """The deformed surface: vertices, shape (n, 3); `triangles`, shape (m, 3), are needed the first time only."""
+        if self._normals is None:
+            if triangles is None:
+                return
+            self._normals = VertexNormals(triangles, len(vertices))
+            self._rest = vertices
+            skin = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
+            path = "world/abdomen"
+            self._recording.log(path, rr.Mesh3D.from_fields(triangle_indices=triangles), static=True)
+            self.at(t)
+            self._recording.log(path, rr.Mesh3D.from_fields(vertex_colors=skin))
+            self._recording.flush()  # a viewer that reads along must not meet vertices before triangles
+        rounded = np.round(vertices / RESOLUTION_M).astype(np.float32) * np.float32(RESOLUTION_M)
+        if self._drawn is not None and np.array_equal(rounded, self._drawn):
+            return
+        self._drawn = rounded
+        normals = np.round(self._normals(rounded), 2)
+        self._columns.add("world/abdomen", deformations, t, (rounded, normals))
+
+    def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Array, scanned: NDArray[np.bool_]) -> None:
+        """Colours the abdomen by the map: its vertices, shape (k, 3), stiffness over background [1] and where it knows."""
+        if self._rest is None:
+            return
+        if self._carry is None or self._map_vertices is None or not np.array_equal(vertices, self._map_vertices):
+            self._map_vertices = vertices
+            self._carry = Carry(vertices, self._rest, CARRY_M)
+        skin = palette.packed(palette.SKIN)
+        colors = self._carry(np.where(scanned, palette.stiffness_colors(ratio), skin), skin)
+        self.at(t)
+        self._recording.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)))
+
+    def lesions(self, segments: Iterable[NDArray[np.float64]]) -> None:
+        """True outlines of the lesions, one (k, 2, 3) array of segments each. They stand still."""
+        strips = [segment for outline in segments for segment in outline]
+        shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
+        self._recording.log("world/truth/lesions", shape, static=True)
+
+    def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
+        """Centroids of the findings, shape (n, 3), with what to say of each."""
+        self.at(t)
+        shape = rr.Points3D(centroids, colors=[palette.FINDING], radii=[0.006], labels=labels, show_labels=True)
+        self._recording.log("world/findings", shape)
+
+    def camera(self, X_WC: Array) -> None:
+        """Pose of the camera's optical frame, shape (4, 4), as calibrated."""
+        pose = rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3])
+        self._recording.log("world/camera", pose, static=True)
+
+    def lens(self, k: Array, width: int, height: int) -> None:
+        """Intrinsics of the camera, shape (3, 3) [px]."""
+        view = rr.Pinhole(
+            image_from_camera=k, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.3
+        )
+        self._recording.log("world/camera", view, static=True)
+
+    def depth(self, t: int, image: NDArray[np.float32]) -> None:
+        """A depth image [m], shape (height, width), NaN where invalid; kept in whole millimetres."""
+        self.at(t)
+        millimetres = np.nan_to_num(image * 1000.0, nan=0.0).astype(np.uint16)
+        shape = rr.DepthImage(millimetres, meter=1000.0, colormap="viridis", depth_range=(500.0, 1700.0))
+        self._recording.log("world/camera/depth", shape)
+
+    def cloud(self, t: int, points: NDArray[np.float32]) -> None:
+        """The perceived point cloud, shape (n, 3), thinned to what can be seen."""
+        self.at(t)
+        thinned = points[:: max(1, -(-len(points) // CLOUD_POINTS))]
+        shape = rr.Points3D(thinned, colors=[palette.POINTS], radii=[0.0012])
+        self._recording.log("world/perception/points", shape)
+
+    def perceived(self, t: int, vertices: NDArray[np.float32], triangles: Indices) -> None:
+        """The perceived rest surface."""
+        self.at(t)
+        normals = VertexNormals(triangles, len(vertices))(vertices)
+        shape = rr.Mesh3D(
+            vertex_positions=vertices, triangle_indices=triangles, vertex_normals=normals, albedo_factor=palette.POINTS
+        )
+        self._recording.log("world/perception/surface", shape)
+
+    def targets(self, t: int, positions: Array, normals: Array) -> None:
+        """Palpation points and outward normals, shapes (n, 3)."""
+        self.at(t)
+        points = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.0015])
+        self._recording.log("world/perception/targets", points)
+        needles = rr.Arrows3D(origins=positions, vectors=0.02 * normals, colors=[palette.TARGETS], radii=[0.0004])
+        self._recording.log("world/perception/normals", needles)
+
+    def planned(self, t: int, positions: Array) -> None:
+        """The planned path of the tool, shape (n, 3)."""
+        self.at(t)
+        shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(1.5)])
+        self._recording.log("world/plan/path", shape)
+
+    def tool(self, t: int, position: NDArray[np.float64], in_contact: bool) -> None:
+        """The tool's position, shape (3,): extends the travelled path."""
+        if self._trail and np.abs(position - self._trail[-1]).max() < TRAIL_STEP_M:
+            return
+        self._trail.append(position)
+        if len(self._trail) >= 10:
+            self.extend_trail(t, in_contact)
+
+    def extend_trail(self, t: int, in_contact: bool) -> None:
+        """Draws the piece of the travelled path since the last."""
+        if len(self._trail) < 2:
+            return
+        self.at(t)
+        color = palette.PRESSED if in_contact else palette.TRAVELLED
+        shape = rr.LineStrips3D([np.array(self._trail)], colors=[color], radii=[rr.Radius.ui_points(1.2)])
+        self._recording.log("world/tool/travelled", shape)
+        del self._trail[:-1]
+
+    def force(self, t: int, position: NDArray[np.float64], force: NDArray[np.float64]) -> None:
+        """The contact force [N], shape (3,), that the tissue exerts on the indenter at `position`."""
+        shown = bool(np.abs(force).max() > 0.05)
+        if shown or self._force_shown:
+            vector = METRES_PER_NEWTON * force if shown else np.zeros(3)
+            self._columns.add("world/tool/force", arrows, t, np.concatenate((position, vector)))
+        self._force_shown = shown
+
+    def style(self) -> None:
+        """What does not change about entities that do."""
+        shape = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004])
+        self._recording.log("world/tool/force", shape, static=True)

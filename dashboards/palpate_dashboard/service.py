@@ -1,0 +1,298 @@
+"""The dashboard as a service: it takes the latest of every topic it observes and draws what changed.
+
+It sends nothing, so nothing that it does can change a run; it skips what it is too late for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Final
+
+import numpy as np
+from palpate_bus.codec import Message
+from palpate_bus.messages import RobotStatus
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models import lbr, table
+from palpate_models.frames import apply
+from palpate_models.lbr_visual import visual_meshes
+from palpate_models.load import exam_input
+from palpate_models.scenario import Robot, Scenario
+
+from palpate_dashboard import arrays, palette, plots, words
+from palpate_dashboard.columns import Columns
+from palpate_dashboard.geometry import VertexNormals, creased, level_lines
+from palpate_dashboard.layout import blueprint
+from palpate_dashboard.map import StiffnessMap
+from palpate_dashboard.plots import Plots
+from palpate_dashboard.scene import Scene, Shaded
+from palpate_dashboard.sinks import Live, open_recording
+
+FILE: Final = "recording.rrd"
+MS: Final = 1_000_000
+MESH_PERIOD: Final = 100 * MS
+PLOT_PERIOD: Final = 50 * MS
+TEXT_PERIOD: Final = 500 * MS
+IMAGE_PERIOD: Final = 500 * MS
+MAP_PERIOD: Final = 1000 * MS
+SEND_PERIOD: Final = 1000 * MS
+"""Simulated time that is collected into one chunk of the file."""
+SEND_PERIOD_LIVE: Final = 100 * MS
+"""The same while someone watches."""
+ABOVE_SKIN_M: Final = 0.002
+"""Outlines are drawn so far outside the surface."""
+FURNITURE: Final = {"table_top": palette.SHEET, "table_column": palette.STEEL, "robot_base": palette.PLINTH}
+
+
+@cache
+def _shapes(robot: Robot) -> dict[str, list[Shaded]]:
+    """The robot's links as they are drawn."""
+    return {
+        link: [Shaded(*creased(mesh.vertices, mesh.triangles), _rgba(mesh.rgba)) for mesh in meshes]
+        for link, meshes in visual_meshes(robot).items()
+    }
+
+
+def _rgba(color: tuple[float, float, float, float]) -> palette.Rgba:
+    r, g, b, a = (round(255 * channel) for channel in color)
+    return r, g, b, a
+
+
+class DashboardService(Service):
+    """Draws a run into `path`, and into a viewer as `live` says."""
+
+    role = "dashboard"
+
+    def __init__(self, scenario: Scenario, path: Path, live: Live) -> None:
+        """Uses the exam's input and the robot of `scenario`, not its phantom. Raises OSError if `path` is not writable."""
+        given = exam_input(scenario)
+        self._name = scenario.name
+        self._path = path
+        self._X_WA = np.array(given.X_WA)
+        exam, limit = given.exam, given.limits.force_working_n
+        layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, limit)
+        self._recording = open_recording(path, live, layout, scenario.name)
+        self._send_period = SEND_PERIOD if live == Live() else SEND_PERIOD_LIVE
+        self._columns = Columns(self._recording)
+        self._scene = Scene(self._recording, self._columns)
+        self._map = StiffnessMap(self._recording, exam.region_m, exam.centre_m)
+        self._plots = Plots(self._recording, self._columns, limit)
+        self._shapes = dict(_shapes(given.robot))
+        for box in table.boxes(given.robot):
+            self._scene.box(box.name, box.X_WB, box.size, FURNITURE.get(box.name, palette.STEEL))
+        self._seen: dict[str, Message] = {}
+        self._due: dict[str, int] = {}
+        self._in_contact = False
+        self._found: list[str] = []
+        self._robot = "no status yet"
+        self._pace: float | None = None
+        self._pace_mark = (0, perf_counter())
+        self._steps = 0
+        self._busy_s = 0.0
+        self._drawing: tuple[tuple[str, int, Callable[[int, Message], None]], ...] = (
+            ("sim/link_poses", PLOT_PERIOD, self._link_poses),
+            ("sim/surface", MESH_PERIOD, self._surface),
+            ("truth/phantom", 0, self._phantom),
+            ("tf_static", 0, self._tf_static),
+            ("camera/depth/camera_info", IMAGE_PERIOD, self._camera_info),
+            ("camera/depth/image_raw", IMAGE_PERIOD, self._depth),
+            ("perception/points", IMAGE_PERIOD, self._points),
+            ("perception/surface", IMAGE_PERIOD, self._perceived),
+            ("perception/targets", 0, self._targets),
+            ("planning/path", 0, self._path_planned),
+            ("exam/state", PLOT_PERIOD, self._exam),
+            ("truth/indentation", PLOT_PERIOD, self._indentation),
+            ("robot/status", PLOT_PERIOD, self._robot_status),
+            ("assessment/map", MAP_PERIOD, self._stiffness),
+            ("assessment/findings", 0, self._findings),
+            ("diagnostics", TEXT_PERIOD, self._diagnostics),
+        )
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Draws what is new and due at `t` [ns]. The outbox is empty."""
+        start = perf_counter()
+        for topic, period, draw in self._drawing:
+            if inbox.stamp(topic) is not None and self._is_due(topic, t, period):
+                message = inbox.latest(topic)
+                if message is not None and message is not self._seen.get(topic):
+                    self._seen[topic] = message
+                    self._due[topic] = t + period
+                    draw(t, message)
+        if self._is_due("sim/tool_state", t, PLOT_PERIOD):
+            self._due["sim/tool_state"] = t + PLOT_PERIOD
+            self._tool(t, inbox)
+        if self._is_due("pace", t, 1000 * MS):
+            self._due["pace"] = t + 1000 * MS
+            self._measure_pace(t)
+        if self._is_due("send", t, self._send_period):
+            self._due["send"] = t + self._send_period
+            self._columns.send()
+        self._steps += 1
+        self._busy_s += perf_counter() - start
+        return {}
+
+    def finish(self) -> Mapping[str, Any]:
+        """Completes the recording."""
+        self._columns.send()
+        self._recording.flush()
+        self._recording.disconnect()
+        return {
+            "file": self._path.name,
+            "file_bytes": self._path.stat().st_size,
+            "steps": self._steps,
+            "step_ms": 1e3 * self._busy_s / max(1, self._steps),
+        }
+
+    def _is_due(self, key: str, t: int, period: int) -> bool:
+        return period == 0 or t >= self._due.get(key, 0)
+
+    def _measure_pace(self, t: int) -> None:
+        """Simulated over wall time since the last call: the only use of a wall clock, and it goes to the screen alone."""
+        before, then = self._pace_mark
+        now = perf_counter()
+        self._pace_mark = (t, now)
+        if t > before > 0:
+            self._pace = (t - before) / 1e9 / (now - then)
+            self._plots.pace(t, self._pace)
+
+    def _link_poses(self, t: int, message: Message) -> None:
+        poses = {item.child_frame_id: arrays.transform(item.transform) for item in message.transforms}
+        for link in poses.keys() & self._shapes.keys():
+            self._scene.link_shape(link, self._shapes.pop(link))
+        self._scene.link_poses(t, poses)
+
+    def _surface(self, t: int, message: Message) -> None:
+        self._scene.abdomen(t, arrays.triples(message.vertices), arrays.triples(message.triangles))
+
+    def _tool(self, t: int, inbox: Inbox) -> None:
+        tool = inbox.latest("sim/tool_state")
+        if tool is None:
+            return
+        position = arrays.point(tool.pose.position)
+        self._scene.tool(t, position, self._in_contact)
+        wrench = inbox.latest("sim/contact_wrench")
+        if wrench is not None:
+            self._scene.force(t, position, arrays.point(wrench.wrench.force))
+
+    def _phantom(self, _t: int, message: Message) -> None:
+        vertices = arrays.triples(message.surface.vertices)
+        triangles = arrays.triples(message.surface.triangles)
+        raised = vertices + ABOVE_SKIN_M * VertexNormals(triangles, len(vertices))(vertices)
+        ratio = np.asarray(message.stiffness) / np.asarray(message.background)
+        lesion = np.asarray(message.lesion)
+        outlines = []
+        for index in range(int(lesion.max(initial=-1)) + 1):
+            inside = lesion == index
+            if inside.any():  # half contrast, on the part of the field that is not another lesion's
+                own = np.where(inside | (lesion < 0), ratio, 1.0)
+                outlines.append(level_lines(raised, triangles, own, (1.0 + float(own[inside].max())) / 2.0))
+        q, p = message.pose.orientation, message.pose.position
+        X_WA = arrays.matrix(np.array((p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
+        self._map.lesions(outlines)
+        self._scene.lesions([apply(X_WA, outline.reshape(-1, 3)).reshape(-1, 2, 3) for outline in outlines])
+
+    def _tf_static(self, _t: int, message: Message) -> None:
+        for item in message.transforms:
+            if item.child_frame_id == "camera_depth_optical_frame":
+                self._scene.camera(arrays.matrix(arrays.transform(item.transform)))
+
+    def _camera_info(self, _t: int, message: Message) -> None:
+        self._scene.lens(np.asarray(message.k).reshape(3, 3), message.width, message.height)
+
+    def _depth(self, t: int, message: Message) -> None:
+        self._scene.depth(t, arrays.depth_image(message))
+
+    def _points(self, t: int, message: Message) -> None:
+        self._scene.cloud(t, arrays.cloud(message))
+
+    def _perceived(self, t: int, message: Message) -> None:
+        self._scene.perceived(t, arrays.triples(message.vertices), arrays.triples(message.triangles))
+
+    def _targets(self, t: int, message: Message) -> None:
+        self._scene.targets(t, arrays.points(message.positions), arrays.points(message.normals))
+        count, frames = len(message.positions), message.frames_fused
+        self._plots.say(t, "log/perception", message.message or f"{count} targets from {frames} frames")
+
+    def _path_planned(self, t: int, message: Message) -> None:
+        self._scene.planned(t, arrays.points(pose.pose.position for pose in message.poses))
+
+    def _exam(self, t: int, message: Message) -> None:
+        phase = plots.PHASES[message.phase][0]
+        if self._plots.state(t, "state/phase", phase):
+            self._scene.extend_trail(t, self._in_contact)
+        self._in_contact = bool(message.in_contact)
+        self._plots.say(t, "log/exam", message.message, "ERROR" if phase == "aborted" else "INFO")
+        self._plots.force(t, message.normal_force)
+        self._plots.depth(t, message.depth, message.depth_setpoint)
+        self._plots.progress(t, message.target_index, message.target_count)
+        if not self._is_due("text", t, TEXT_PERIOD):
+            return
+        self._due["text"] = t + TEXT_PERIOD
+        names = ("in_contact", "steady", "force_limited", "view_blocked")
+        flags = [name.replace("_", " ") for name in names if getattr(message, name)]
+        counts = (message.target_index, message.target_count, message.targets_skipped)
+        depth_mm = 1e3 * message.depth
+        page = words.status(
+            self._name, phase, message.message, counts, depth_mm, message.normal_force, flags, self._robot, self._pace
+        )
+        self._plots.document(t, "text/status", page)
+
+    def _indentation(self, t: int, message: Message) -> None:
+        self._plots.true_contact(t, message.depth, message.normal_force)
+
+    def _robot_status(self, t: int, message: Message) -> None:
+        self._plots.torques(t, np.asarray(message.applied_torque) / lbr.TORQUE_LIMIT)
+        mode = plots.MODES[message.mode][0]
+        self._robot = f"{mode}: {message.reason}" if message.reason else mode
+        level = "ERROR" if message.mode == RobotStatus.MODE_SAFE_HOLD else "INFO"
+        self._plots.state(t, "state/driver", mode)
+        self._plots.say(t, "log/robot", self._robot, level)
+
+    def _stiffness(self, t: int, message: Message) -> None:
+        vertices = arrays.triples(message.vertices)
+        scanned = np.asarray(message.scanned, dtype=bool)
+        mean = np.asarray(message.stiffness, dtype=np.float64)
+        if not scanned.any():
+            return
+        background = message.background if message.background > 0 else float(np.median(mean[scanned]))
+        ratio = mean / background
+        half = (np.asarray(message.stiffness_upper) - np.asarray(message.stiffness_lower)) / 2.0
+        spread = half / np.maximum(mean, 1e-9)
+        self._map.update(t, vertices, arrays.triples(message.triangles), ratio, spread, scanned)
+        self._scene.stiffness(t, apply(self._X_WA, vertices.astype(np.float64)).astype(np.float32), ratio, scanned)
+
+    def _findings(self, t: int, message: Message) -> None:
+        lines = [
+            words.finding(f.quadrant, f.stiffness_ratio, f.stiffness_ratio_lower, f.stiffness_ratio_upper, f.area, f.confidence)
+            for f in message.findings
+        ]
+        if lines != self._found:
+            self._found = lines
+            centroids = arrays.points(f.centroid for f in message.findings)
+            labels = [f"{f.quadrant} {f.stiffness_ratio:.1f} x" for f in message.findings]
+            self._map.findings(t, centroids, labels)
+            self._scene.findings(t, apply(self._X_WA, centroids), labels)
+        if message.final:
+            self._plots.say(t, "log/findings", "; ".join(lines) or "no stiff area found", "WARN" if lines else "INFO")
+
+    def _diagnostics(self, t: int, message: Message) -> None:
+        rows = []
+        for status in message.status:
+            level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
+            rows.append((status.name, level, status.message, [(item.key, item.value) for item in status.values]))
+        self._plots.document(t, "text/services", words.services(rows))
+
+
+def create(scenario: Scenario) -> DashboardService:
+    """The dashboard of a run.
+
+    The run's folder is in the environment variable PALPATE_OUT; PALPATE_VIEWER, if set, says how to show it live (see
+    `Live.parse`). Raises ValueError if the first is missing or the second not understood.
+    """
+    out = os.environ.get("PALPATE_OUT")
+    if not out:
+        raise ValueError(f"PALPATE_OUT is not set; the dashboard writes $PALPATE_OUT/{FILE}, so give it the run's folder")
+    return DashboardService(scenario, Path(out) / FILE, Live.parse(os.environ.get("PALPATE_VIEWER", "")))

@@ -1,0 +1,61 @@
+"""Where a recording goes: into a file, to a viewer that runs, or to viewers that will come, in a browser too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import rerun as rr
+
+APPLICATION = "palpate"
+MEMORY_LIMIT = "512MiB"
+"""What a served recording keeps for viewers that join late; then the oldest data goes, static data never."""
+
+
+@dataclass(frozen=True)
+class Live:
+    """How to show a run while it runs.
+
+    `serve:PORT` hosts the recording for viewers that connect, in the browser at PORT + 1; `connect:URL` sends it to a
+    viewer that listens, by default one on this machine.
+    """
+
+    serve_port: int | None = None
+    connect_url: str | None = None
+
+    @staticmethod
+    def parse(text: str) -> Live:
+        """From the value of PALPATE_VIEWER; empty is no live view. Raises ValueError that says what is allowed."""
+        kind, _, rest = text.partition(":")
+        if not text:
+            return Live()
+        if kind == "serve":
+            if rest and not (rest.isdigit() and 1024 <= int(rest) <= 65534):
+                raise ValueError(f"PALPATE_VIEWER={text}: want serve:PORT with PORT in 1024..65534")
+            return Live(serve_port=int(rest or 9876))
+        if kind == "connect":
+            return Live(connect_url=rest or "rerun+http://127.0.0.1:9876/proxy")
+        raise ValueError(f"PALPATE_VIEWER={text}: want serve, serve:PORT, connect or connect:URL")
+
+
+def open_recording(path: Path, live: Live, blueprint: Any, name: str) -> rr.RecordingStream:
+    """A recording named `name` that goes to the file `path`, and to viewers as `live` says.
+
+    Its rows carry simulated time and nothing else. Raises OSError if the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    recording = rr.RecordingStream(APPLICATION, recording_id=uuid4())
+    recording.set_log_tick_enabled(False)
+    recording.set_log_time_enabled(False)
+    sinks: list[Any] = [rr.FileSink(path)]
+    if live.serve_port is not None:
+        server = rr.GrpcServerSink(port=live.serve_port, server_memory_limit=MEMORY_LIMIT)
+        sinks.append(server)
+        rr.serve_web_viewer(web_port=live.serve_port + 1, open_browser=False, connect_to=server.uri)
+    if live.connect_url is not None:
+        sinks.append(rr.GrpcSink(live.connect_url))
+    recording.set_sinks(*sinks, default_blueprint=blueprint)
+    recording.send_recording_name(name)
+    return recording

@@ -1,0 +1,46 @@
+"""What the status and services pages say, in markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+LEVELS = ("ok", "warning", "ERROR", "stale")
+"""diagnostic_msgs/DiagnosticStatus levels."""
+
+
+def status(
+    scenario: str, phase: str, message: str, counts: tuple[int, int, int], depth_mm: float, force_n: float,
+    flags: Sequence[str], robot: str, real_time_factor: float | None,
+) -> str:  # fmt: skip
+    """The state of the exam. `counts`: targets visited, in all, and skipped."""
+    visited, total, skipped = counts
+    pace = "-" if real_time_factor is None else f"{real_time_factor:.1f} x real time"
+    depth = f"{depth_mm:.1f} mm" if depth_mm > -20 else "not in contact"
+    return "\n".join((
+        f"**{scenario}: {phase}.** {message}",
+        "",
+        f"| targets | {visited} of {total}, {skipped} skipped |",
+        "|---|---|",
+        f"| depth | {depth} |",
+        f"| normal force | {force_n:.1f} N |",
+        f"| contact | {', '.join(flags) or 'none'} |",
+        f"| driver | {robot} |",
+        f"| pace | {pace} |",
+    ))  # fmt: skip
+
+
+def services(rows: Iterable[tuple[str, int, str, Sequence[tuple[str, str]]]]) -> str:
+    """Health of every service: name, level, message, and further values by key."""
+    lines = ["| service | state | | |", "|---|---|---|---|"]
+    for name, level, message, values in rows:
+        word = LEVELS[level] if 0 <= level < len(LEVELS) else str(level)
+        lines.append(f"| {name} | {word} | {message} | {', '.join(f'{key} {value}' for key, value in values)} |")
+    return "\n".join(lines)
+
+
+def finding(quadrant: str, ratio: float, lower: float, upper: float, area_m2: float, confidence: float) -> str:
+    """A finding in one line."""
+    return (
+        f"{quadrant}: {ratio:.1f} x stiffer ({lower:.1f}-{upper:.1f}), {1e4 * area_m2:.1f} cm2, "
+        f"confidence {100 * confidence:.0f} %"
+    )

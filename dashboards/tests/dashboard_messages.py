@@ -1,0 +1,255 @@
+"""A short plausible run, as messages: the arm moves, a dome is pressed, a map grows, a finding is made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_bus import messages as m
+from palpate_bus.codec import message_type
+from palpate_bus.stamps import header, time_message
+from palpate_models import lbr
+from palpate_models.scenario import Robot
+from scipy.spatial.transform import Rotation
+
+MS = 1_000_000
+Messages = dict[str, Any]
+X_WA = np.array((0.56, 0.0, 0.93))
+_Point = message_type("geometry_msgs/msg/Point")
+_Vector = message_type("geometry_msgs/msg/Vector3")
+_Quaternion = message_type("geometry_msgs/msg/Quaternion")
+_Pose = message_type("geometry_msgs/msg/Pose")
+
+
+class FakeInbox:
+    """An inbox that holds what it is given."""
+
+    def __init__(self) -> None:
+        self.messages: Messages = {}
+        self.stamps: dict[str, int] = {}
+
+    def put(self, t: int, messages: Messages) -> None:
+        self.messages.update(messages)
+        self.stamps.update(dict.fromkeys(messages, t))
+
+    def latest(self, topic: str) -> Any:
+        return self.messages.get(topic)
+
+    def new(self, topic: str) -> list[Any]:
+        return [self.messages[topic]] if topic in self.messages else []
+
+    def stamp(self, topic: str) -> int | None:
+        return self.stamps.get(topic)
+
+    def lost(self, role: str) -> bool:
+        return False
+
+
+def forward(joints: NDArray[np.float64], robot: Robot) -> dict[str, tuple[NDArray[np.float64], Rotation]]:
+    """Link positions and rotations in world."""
+    position = np.array((*robot.base_xy_m, robot.base_height_m))
+    rotation = Rotation.from_euler("z", robot.base_yaw_rad)
+    poses = {"lbr_link_0": (position, rotation)}
+    for i in range(7):
+        position = position + rotation.apply(lbr.JOINT_ORIGIN[i])
+        rotation = rotation * Rotation.from_rotvec(np.array(lbr.JOINT_AXIS[i]) * joints[i])
+        poses[f"lbr_link_{i + 1}"] = (position, rotation)
+    for link, step in (
+        ("lbr_link_ee", lbr.LINK_7_TO_FLANGE_M),
+        ("ft_sensor", lbr.FLANGE_TO_FT_M),
+        ("indenter", lbr.FT_TO_INDENTER_M),
+    ):
+        position = position + rotation.apply((0.0, 0.0, step))
+        poses[link] = (position, rotation)
+    return poses
+
+
+def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """A smooth belly in A with n x n vertices."""
+    x, y = np.meshgrid(np.linspace(-0.17, 0.17, n), np.linspace(-0.21, 0.21, n))
+    z = 0.1 * (np.cos(x / 0.18 * 1.3) * np.cos(y / 0.24 * 1.1) - 1.0) - 0.0
+    vertices = np.stack((x, y, z), axis=-1).reshape(-1, 3).astype(np.float32)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (k.ravel() for k in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
+    triangles = np.vstack((np.stack((a, b, d), 1), np.stack((a, d, c), 1))).astype(np.uint32)
+    return vertices, triangles
+
+
+def surface(t: int, vertices: NDArray[np.float32], triangles: NDArray[np.uint32], frame: str) -> Any:
+    return m.SurfaceMesh(header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
+
+
+def pose(position: NDArray[np.float64], rotation: Rotation | None = None) -> Any:
+    q = (0.0, 0.0, 0.0, 1.0) if rotation is None else rotation.as_quat()
+    return _Pose(_Point(*map(float, position)), _Quaternion(*map(float, q)))
+
+
+def transforms(t: int, poses: dict[str, tuple[NDArray[np.float64], Rotation]]) -> Any:
+    stamped, transform = m.TransformStamped, message_type("geometry_msgs/msg/Transform")
+    items = [
+        stamped(header(t, "world"), link, transform(_Vector(*map(float, p)), _Quaternion(*map(float, r.as_quat()))))
+        for link, (p, r) in poses.items()
+    ]
+    return message_type("tf2_msgs/msg/TFMessage")(items)
+
+
+def ratio_field(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
+    d = np.hypot(vertices[:, 0] + 0.05, vertices[:, 1] + 0.05)
+    return np.asarray(1.0 + 3.0 / (1.0 + np.exp(np.minimum((d - 0.03) / 0.003, 50.0))))
+
+
+def latched(scenario_robot: Robot) -> Messages:
+    del scenario_robot
+    vertices, triangles = dome()
+    ratio = ratio_field(vertices)
+    lesion = np.where(ratio > 2.5, 0, -1).astype(np.int32)
+    background = np.full(len(vertices), 1.7e5)
+    truth = m.PhantomTruth(surface(0, vertices, triangles, "abdomen"), ratio * background, background, lesion, pose(X_WA))
+    camera = np.array((0.95, -0.45, 1.85))
+    z = (np.array((0.56, 0.0, 0.9)) - camera) / np.linalg.norm(np.array((0.56, 0.0, 0.9)) - camera)
+    x = np.cross(z, (0, 0, 1.0))
+    x /= np.linalg.norm(x)
+    rotation = Rotation.from_matrix(np.column_stack((x, np.cross(z, x), z)))
+    return {"truth/phantom": truth, "tf_static": transforms(0, {"camera_depth_optical_frame": (camera, rotation)})}
+
+
+def look(t: int) -> Messages:
+    image = np.full((480, 640), 1.05, dtype=np.float32)
+    image += 0.1 * np.hypot(*np.meshgrid(np.linspace(-1, 1, 640), np.linspace(-1, 1, 480))).astype(np.float32)
+    image[:20] = np.nan
+    k = np.array((585.0, 0, 319.5, 0, 585.0, 239.5, 0, 0, 1))
+    info = message_type("sensor_msgs/msg/CameraInfo")
+    roi = message_type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+    frame = "camera_depth_optical_frame"
+    vertices, triangles = dome()
+    world = (vertices + X_WA).astype(np.float32)
+    field = message_type("sensor_msgs/msg/PointField")
+    fields = [field(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
+    cloud = world.repeat(5, axis=0)
+    cloud[0] = np.nan
+    packed = np.ascontiguousarray(cloud).view(np.uint8).ravel()
+    targets = world[(np.abs(vertices[:, :2]) < 0.1).all(axis=1)][::3]
+    return {
+        "camera/depth/camera_info": info(
+            header(t, frame), 480, 640, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), np.zeros(12), 0, 0, roi
+        ),
+        "camera/depth/image_raw": message_type("sensor_msgs/msg/Image")(
+            header(t, frame), 480, 640, "32FC1", 0, 2560, image.view(np.uint8).ravel()
+        ),
+        "perception/points": message_type("sensor_msgs/msg/PointCloud2")(
+            header(t, "world"), 1, len(cloud), fields, False, 12, 12 * len(cloud), packed, False
+        ),
+        "perception/surface": surface(t, world, triangles, "world"),
+        "perception/targets": m.PalpationTargets(
+            header(t, "world"),
+            [_Point(*map(float, p)) for p in targets],
+            [_Vector(0.0, 0.0, 1.0)] * len(targets),
+            np.zeros(len(targets), np.uint32),
+            0.001,
+            20,
+            1.0,
+            "",
+        ),
+        "planning/path": message_type("nav_msgs/msg/Path")(
+            header(t, "world"),
+            [m.PoseStamped(header(t, "world"), pose(p + np.array((0, 0, 0.02)))) for p in targets],
+        ),
+    }
+
+
+def stiffness_map(t: int, share: float) -> Any:
+    vertices, triangles = dome(41)
+    scanned = (np.abs(vertices[:, :2]) < 0.1).all(axis=1) & (vertices[:, 1] < -0.1 + 0.2 * share)
+    mean = (1.7e5 * ratio_field(vertices)).astype(np.float32)
+    none = np.full(len(vertices), -1, np.int32)
+    return m.StiffnessMap(
+        header(t, "abdomen"),
+        vertices.ravel(),
+        triangles.ravel(),
+        mean * 1e-5,
+        mean,
+        0.8 * mean,
+        1.2 * mean,
+        scanned,
+        none,
+        0.01,
+        1.7e5,
+        100,
+    )
+
+
+def findings(t: int) -> Any:
+    item = m.Finding(_Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99)
+    return m.Findings(header(t, "abdomen"), [item], True)
+
+
+def wrench(t: int, force: NDArray[np.float64]) -> Any:
+    inner = message_type("geometry_msgs/msg/Wrench")(_Vector(*map(float, force)), _Vector(0.0, 0.0, 0.0))
+    return m.WrenchStamped(header(t, "world"), inner)
+
+
+def robot_status(t: int, torque: NDArray[np.float64]) -> Any:
+    """The rest of the message is not drawn."""
+    zero = np.zeros(7)
+    rest = {
+        "position": zero,
+        "velocity": zero,
+        "wrench": wrench(t, np.zeros(3)).wrench,
+        "applied_torque": torque,
+        "commands_rejected": 0,
+    }
+    return m.RobotStatus(header=header(t), mode=1, cause=0, reason="", **rest)
+
+
+def exam(t: int, phase: int, message: str, depth: float, force: float, visited: int) -> Any:
+    pressed = force > 0.1
+    return m.ExamState(
+        header(t, "world"), phase, message, visited, 200, 1, pressed, pressed, False, False, 0.01 if pressed else 0.0,
+        depth, force, _Point(0.0, 0.0, 0.0), _Vector(0.0, 0.0, 1.0), -1,
+    )  # fmt: skip
+
+
+def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, Messages]]:
+    """(time [ns], messages that arrived since the step before)."""
+    rest, triangles = dome()
+    world = rest + X_WA
+    for t in range(0, int(seconds * 1000) * MS, step_ms * MS):
+        s = t / (seconds * 1e9)
+        new: Messages = latched(robot) if t == 0 else {}
+        joints = lbr.HOME + np.array((0.4 * np.sin(6.28 * s), 0.5 * s, 0, 0.2 * s, 0, 0, 0))
+        poses = forward(joints, robot)
+        pressing = s > 0.3
+        centre = np.array((-0.1 + 0.2 * s, 0.09 * np.sin(12 * s)))
+        dent = 0.01 * np.exp(-((rest[:, :2] - centre) ** 2).sum(axis=1) / 2 / 0.02**2) if pressing else 0.0
+        moved = world - np.array((0.0, 0.0, 1.0)) * np.reshape(dent, (-1, 1))
+        near = np.argmin(((rest[:, :2] - centre) ** 2).sum(axis=1))
+        force = np.array((0.3, 0.0, 2.5 * ratio_field(rest[near : near + 1])[0])) if pressing else np.zeros(3)
+        tool = moved[near] + np.array((0, 0, 0.015)) if pressing else poses["indenter"][0]
+        depth = 0.01 if pressing else -0.2
+        phase = 5 if pressing else (1 if s > 0.1 else 0)
+        twist = message_type("geometry_msgs/msg/Twist")(_Vector(0.0, 0.0, 0.0), _Vector(0.0, 0.0, 0.0))
+        new |= {
+            "sim/link_poses": transforms(t, poses),
+            "sim/surface": surface(t, moved.astype(np.float32), triangles, "world"),
+            "sim/tool_state": m.ToolState(header(t, "world"), pose(tool), twist, 0.015),
+            "sim/contact_wrench": wrench(t, force),
+            "exam/state": exam(t, phase, "scanning line 3" if pressing else "", depth, float(force[2]), int(200 * s)),
+            "truth/indentation": m.IndentationTruth(
+                header(t, "world"), depth, float(force[2]), 0.3, 9, _Point(0.0, 0.0, 0.0), 1.7e5
+            ),
+            "robot/status": robot_status(t, 20.0 * np.sin(6 * s + np.arange(7.0))),
+            "clock": message_type("rosgraph_msgs/msg/Clock")(time_message(t)),
+        }
+        if 0.1 < s < 0.3:
+            new |= look(t)
+        if pressing:
+            new["assessment/map"] = stiffness_map(t, (s - 0.3) / 0.6)
+        if s > 0.95:
+            new["assessment/findings"] = findings(t)
+        if t % (1000 * MS) == 0:
+            status, pair = m.DiagnosticStatus, message_type("diagnostic_msgs/msg/KeyValue")
+            rows = [status(0, role, "running", "", [pair("step", "0.1 ms")]) for role in ("robot", "tissue", "control")]
+            new["diagnostics"] = message_type("diagnostic_msgs/msg/DiagnosticArray")(header(t), rows)
+        yield t, new

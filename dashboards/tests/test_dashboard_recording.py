@@ -1,0 +1,246 @@
+"""The recording, read back from its file: what is in it, how much, and when."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+from dashboard_messages import FakeInbox, Messages, latched, run
+from palpate_bus.contract import contract
+from palpate_dashboard.columns import TIMELINE
+from palpate_dashboard.service import FILE, DashboardService, create
+from palpate_dashboard.sinks import Live
+from palpate_models import lbr
+from palpate_models.scenario import Scenario
+from rerun.chunk import RrdReader
+
+SECONDS = 12.0
+
+
+class Recording:
+    """A .rrd file by entity and component."""
+
+    def __init__(self, path: Path) -> None:
+        self.reader = RrdReader(path)
+        self.temporal: dict[str, int] = defaultdict(int)
+        self.static: set[str] = set()
+        self.timelines: set[str] = set()
+        self._cells: dict[tuple[str, str], list[tuple[float, Any]]] = defaultdict(list)
+        for chunk in self.reader.stream():
+            if chunk.is_static:
+                self.static.add(chunk.entity_path)
+            else:
+                self.temporal[chunk.entity_path] += chunk.num_rows
+            self.timelines |= set(chunk.timeline_names)
+            batch = chunk.to_record_batch()
+            names = batch.schema.names
+            times = [0.0] * chunk.num_rows
+            if TIMELINE in names:
+                times = [value.as_py().total_seconds() for value in batch.column(TIMELINE)]
+            for name in names:
+                if ":" in name:
+                    for time, value in zip(times, batch.column(name), strict=True):
+                        if value.is_valid:
+                            self._cells[chunk.entity_path, name].append((time, value))
+
+    def cells(self, entity: str, component: str) -> list[tuple[float, Any]]:
+        """(time [s], Arrow value) of every row, in order of time."""
+        found = [rows for (path, name), rows in self._cells.items() if path == entity and name.endswith(component)]
+        assert len(found) == 1, (entity, component, [key for key in self._cells if key[0] == entity])
+        return sorted(found[0], key=lambda row: row[0])
+
+
+def draw(path: Path, messages: Iterable[tuple[int, Messages]], without: tuple[str, ...] = ()) -> dict[str, Any]:
+    rr.set_strict_mode(True)  # else the library logs its errors and goes on
+    service = DashboardService(Scenario(name="test"), path, Live())
+    inbox = FakeInbox()
+    for t, new in messages:
+        inbox.put(t, {topic: message for topic, message in new.items() if topic not in without})
+        assert service.step(t, inbox) == {}
+    return dict(service.finish())
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, dict[str, Any]]:
+    path = tmp_path_factory.mktemp("dashboard") / FILE
+    facts = draw(path, run(SECONDS, Scenario().robot))
+    return Recording(path), facts
+
+
+def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    expected = {
+        "/world/abdomen", "/world/tool/force", "/world/tool/travelled", "/world/camera/depth", "/world/findings",
+        "/world/perception/points", "/world/perception/surface", "/world/perception/targets",
+        "/world/perception/normals", "/world/plan/path", "/plots/force/measured", "/plots/force/true",
+        "/plots/force/limit", "/plots/depth/measured", "/plots/depth/setpoint", "/plots/depth/true",
+        "/plots/torque/joints", "/plots/pace/real_time_factor", "/plots/progress/targets", "/state/phase",
+        "/state/driver", "/text/status", "/text/services", "/log/robot", "/log/exam", "/log/findings",
+        "/log/perception", "/map/mean/surface", "/map/band/surface", "/map/mean/findings",
+    }  # fmt: skip
+    assert expected <= recording.temporal.keys()
+    for box in ("table_top", "table_column", "robot_base"):
+        assert f"/world/furniture/{box}" in recording.static
+    assert {"/world/truth/lesions", "/map/mean/truth", "/map/mean/legend", "/world/camera"} <= recording.static
+
+
+def test_the_only_timeline_is_simulated_time(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    assert recording.timelines == {TIMELINE}
+
+
+def test_every_link_has_a_shape_and_moves(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    for link in lbr.LINK_NAMES[1:]:
+        assert f"/world/robot/{link}/shape_0" in recording.static, link
+        assert recording.temporal[f"/world/robot/{link}"] > 0.9 * SECONDS * 20, link
+    assert recording.temporal["/world/robot/lbr_link_0"] == 1  # the base stands still: written once
+
+
+def test_a_pose_is_where_the_message_had_it(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    messages = dict(run(SECONDS, Scenario().robot))
+    drawn = recording.cells("/world/robot/indenter", "Transform3D:translation")
+    for time, value in drawn[::40]:
+        sent = messages[round(time * 1e9)]["sim/link_poses"].transforms
+        p = next(item for item in sent if item.child_frame_id == "indenter").transform.translation
+        assert value.as_py()[0] == pytest.approx((p.x, p.y, p.z), abs=1e-6)
+
+
+def test_curves_have_twenty_points_a_second(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    rows = recording.cells("/plots/force/measured", "Scalars:scalars")
+    assert len(rows) == SECONDS * 20
+    times = np.array([time for time, _ in rows])
+    assert np.diff(times) == pytest.approx(0.05)
+    assert len(recording.cells("/plots/torque/joints", "Scalars:scalars")[0][1]) == 7
+
+
+def test_the_abdomen_is_written_only_while_it_changes(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    rows = recording.cells("/world/abdomen", "Mesh3D:vertex_positions")
+    pressed = [time for time, _ in rows if time > 0.1]
+    assert min(pressed) > 0.29 * SECONDS
+    assert np.diff(pressed).min() > 0.099
+    assert len(rows) <= 10 * SECONDS
+    still = np.array(rows[0][1].as_py())
+    dented = np.array(rows[-1][1].as_py())
+    assert (still - dented)[:, 2].max() == pytest.approx(0.01, abs=1e-3)
+
+
+def test_the_abdomen_is_coloured_where_it_was_scanned(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    rows = recording.cells("/world/abdomen", "Mesh3D:vertex_colors")
+    assert len(set(rows[0][1].as_py())) == 1  # skin
+    assert len(rows) <= SECONDS + 1
+    final = rows[-1][1].as_py()
+    assert 0.2 < np.mean(np.array(final) != rows[0][1].as_py()[0]) < 0.9
+    assert len(set(final)) > 5
+
+
+def test_the_phases_are_written_as_they_change(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    states = [(time, value.as_py()[0]) for time, value in recording.cells("/state/phase", "StateChange:state")]
+    assert [name for _, name in states] == ["home", "look", "scan"]
+    assert states[1][0] == pytest.approx(0.1 * SECONDS, abs=0.06)
+
+
+def test_the_arrow_is_the_force_and_vanishes_with_it(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    rows = recording.cells("/world/tool/force", "Arrows3D:vectors")
+    assert all(0.029 < value.as_py()[0][2] < 0.17 for _, value in rows)  # 15 mm a newton, 2.5 N to 10 N
+    assert min(time for time, _ in rows) > 0.29 * SECONDS
+
+
+def test_the_true_outline_is_at_half_contrast(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    segments = np.array([s for _, v in recording.cells("/map/mean/truth", "LineStrips3D:strips") for s in v.as_py()])
+    radius = np.hypot(segments[..., 0] + 0.05, segments[..., 1] + 0.05)
+    assert radius == pytest.approx(0.03, abs=2e-3)  # the edge is 3 mm wide, the mesh 6 mm
+
+
+def test_it_stays_small(whole: tuple[Recording, dict[str, Any]], tmp_path: Path) -> None:
+    """At most 60 MB for an examination of 150 s, extrapolated from runs that are in contact most of their time."""
+    _, facts = whole
+    half = draw(tmp_path / FILE, run(SECONDS / 2, Scenario().robot))
+    growth = (facts["file_bytes"] - half["file_bytes"]) / (SECONDS / 2)
+    assert 0 < half["file_bytes"] + growth * (150 - SECONDS / 2) < 60e6
+
+
+def test_the_file_has_the_layout(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    (layout,) = recording.reader.blueprints()
+    assert layout.application_id == "palpate"
+    origins, kinds = set(), set()
+    for chunk in recording.reader.stream(store=layout):
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith("ViewBlueprint:space_origin"):
+                origins |= {v[0] for v in batch.column(name).to_pylist() if v}
+            if name.endswith("ViewBlueprint:class_identifier"):
+                kinds |= {v[0] for v in batch.column(name).to_pylist() if v}
+    assert {"/world", "/map/mean", "/map/band", "/world/camera", "/plots/force", "/plots/depth", "/state"} <= origins
+    assert {"3D", "2D", "TimeSeries", "TextDocument", "TextLog", "StateTimeline"} <= kinds
+    logged = recording.temporal.keys() | recording.static
+    for origin in origins:
+        assert any(path == origin or path.startswith(origin + "/") for path in logged), origin
+
+
+OBSERVED = sorted(topic.name for topic, _ in contract().inputs("dashboard"))
+
+
+@pytest.mark.parametrize("topic", OBSERVED)
+def test_any_topic_may_be_missing(tmp_path: Path, topic: str) -> None:
+    draw(tmp_path / FILE, run(1.0, Scenario().robot), without=(topic,))
+    assert Recording(tmp_path / FILE).temporal
+
+
+def test_nothing_at_all(tmp_path: Path) -> None:
+    draw(tmp_path / FILE, [(t * 50_000_000, {}) for t in range(40)])
+    assert "/world/furniture/table_top" in Recording(tmp_path / FILE).static
+
+
+def test_starting_late_shows_what_is_latched(tmp_path: Path) -> None:
+    robot = Scenario().robot
+    late = [(t, new) for t, new in run(4.0, robot) if t > 2_500_000_000]
+    late[0] = (late[0][0], late[0][1] | latched(robot))
+    draw(tmp_path / FILE, late)
+    recording = Recording(tmp_path / FILE)
+    assert "/world/truth/lesions" in recording.static
+    assert "/world/robot/lbr_link_3/shape_0" in recording.static
+    assert min(time for time, _ in recording.cells("/world/abdomen", "Mesh3D:vertex_positions")) > 2.5
+
+
+def test_steps_that_are_missed_or_come_twice(tmp_path: Path) -> None:
+    steps = [pair for i, pair in enumerate(run(4.0, Scenario().robot)) if i % 7]
+    twice = [pair for pair in steps for _ in range(2)]
+    draw(tmp_path / FILE, twice)
+    times = [time for time, _ in Recording(tmp_path / FILE).cells("/plots/force/measured", "Scalars:scalars")]
+    assert len(times) == len(set(times))
+
+
+def test_the_last_messages_are_drawn_even_at_the_same_time(tmp_path: Path) -> None:
+    """A distributed observer may step again at a time at which it has stepped: what came in between must not be lost."""
+    steps = list(run(2.0, Scenario().robot))
+    last, new = steps[-1]
+    findings = {"assessment/findings": new.pop("assessment/findings")}
+    steps = [(t, {k: v for k, v in m.items() if k != "assessment/findings"}) for t, m in steps]
+    draw(tmp_path / FILE, [*steps, (last, findings)])
+    assert Recording(tmp_path / FILE).temporal["/world/findings"] == 1
+
+
+def test_create_wants_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_OUT", str(tmp_path / "new"))
+    create(Scenario()).finish()
+    assert (tmp_path / "new" / FILE).stat().st_size > 0
+    monkeypatch.setenv("PALPATE_VIEWER", "hologram")
+    with pytest.raises(ValueError, match="PALPATE_VIEWER=hologram"):
+        create(Scenario())
+    monkeypatch.delenv("PALPATE_OUT")
+    with pytest.raises(ValueError, match="PALPATE_OUT"):
+        create(Scenario())
