@@ -15,6 +15,7 @@ from rich.table import Table
 
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
+from palpate_conductor.bench import bench as run_bench
 from palpate_conductor.conductor import RunFailed
 from palpate_conductor.run import OBSERVERS, run_composed, run_distributed
 
@@ -122,6 +123,15 @@ def topics() -> None:
             readers,
         )
     Console(width=max(160, Console().width)).print(table)
+
+
+@app.command()
+def bench(
+    scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "rlq_guarding",
+    out: Annotated[Path, typer.Option(help="File for the figures.")] = Path("bench.json"),
+) -> None:
+    """Measure the bus, the parts of a tick and whole runs; print tables and write bench.json."""
+    run_bench(scenario, out, Console())
 
 
 @app.command()

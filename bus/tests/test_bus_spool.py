@@ -1,0 +1,37 @@
+"""Chunks for the recorder."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from palpate_bus.codec import CodecError
+from palpate_bus.spool import CHUNK_PERIOD, Recorded, Spool, unpack_chunk
+
+TOPICS = ("joint_states", "ft/wrench")
+messages = st.lists(
+    st.builds(Recorded, st.sampled_from(TOPICS), st.binary(max_size=300), st.integers(0, 2**40), st.integers(0, 2**32 - 1)),
+    max_size=40,
+)
+
+
+@given(messages)
+def test_what_goes_in_comes_out(sent: list[Recorded]) -> None:
+    spool = Spool("robot", TOPICS)
+    for message in sent:
+        spool.add(message.topic, message.payload, message.stamp, message.sequence)
+    chunk = spool.chunk(7, final=True)
+    assert chunk is not None
+    tick, received = unpack_chunk(chunk)
+    assert tick == 7
+    assert list(received) == sent
+
+
+def test_a_chunk_is_due_once_a_period() -> None:
+    spool = Spool("robot", TOPICS)
+    assert spool.chunk(CHUNK_PERIOD - 1) is None
+    assert spool.chunk(CHUNK_PERIOD) is not None
+    assert spool.chunk(CHUNK_PERIOD + 1) is None
+
+
+def test_garbage_is_an_error_of_the_codec() -> None:
+    with pytest.raises(CodecError):
+        unpack_chunk(b"\x00\x01\x00\x00garbage")

@@ -1,0 +1,102 @@
+"""`palpate bench`: what the bus, the parts and whole runs cost, as a table and as bench.json.
+
+Machines differ and are noisy, so what counts are ratios within one call: simulated over wall time, our bus over raw zenoh, the
+parts of a tick.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import tempfile
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from palpate_bus.bench import measure as measure_bus
+from palpate_models.load import load_scenario
+from palpate_models.scenario import Scenario
+from rich.console import Console
+from rich.table import Table
+
+from palpate_conductor.platforms import fingerprint
+from palpate_conductor.run import OBSERVERS, RunResult, run_composed, run_distributed
+
+
+def _figures(result: RunResult) -> dict[str, Any]:
+    return {
+        "sim_time_s": result.sim_time_s,
+        "wall_time_s": result.wall_time_s,
+        "real_time_factor": result.sim_time_s / result.wall_time_s,
+        "command_to_first_tick_s": result.start_time_s,
+        "run_hash": result.run_hash,
+        "failure": result.failure,
+        "blame": result.blame,
+    }
+
+
+def measure(scenario: Scenario, console: Console) -> dict[str, Any]:
+    """All figures, by name. Takes a few minutes."""
+    figures: dict[str, Any] = {"platform": fingerprint()}
+    with console.status("bus round trip against raw zenoh"):
+        figures["bus"] = measure_bus()
+    parts: dict[str, Any] = {}
+    for point in sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name):
+        with console.status(f"{point.name}: cost of a step"):
+            parts[point.name] = point.load()()
+    figures["parts"] = parts
+    runs: dict[str, Any] = {}
+    cases = (
+        ("composed", lambda out: run_composed(scenario, out, lambda _: None, ())),
+        ("distributed", lambda out: run_distributed(scenario, out, lambda _: None, ())),
+        ("distributed, recorder and viewer", lambda out: run_distributed(scenario, out, lambda _: None, OBSERVERS)),
+    )
+    for name, case in cases:
+        with console.status(f"{scenario.name}, {name}"), tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
+            runs[name] = _figures(case(Path(folder)))
+    figures["runs"] = runs
+    return figures
+
+
+def tables(figures: dict[str, Any]) -> list[Table]:
+    """The figures as tables."""
+    runs = Table(
+        "run",
+        "sim [s]",
+        "wall [s]",
+        "real-time factor",
+        "to first tick [s]",
+        "run hash",
+        title="Whole examinations",
+        title_justify="left",
+    )
+    for name, run in figures["runs"].items():
+        runs.add_row(
+            name,
+            f"{run['sim_time_s']:.1f}",
+            f"{run['wall_time_s']:.1f}",
+            f"{run['real_time_factor']:.2f}",
+            f"{run['command_to_first_tick_s']:.1f}",
+            (run["run_hash"] or run["failure"] or "")[:12],
+        )
+    columns = ("compute", "decode", "encode", "send", "transport", "wait")
+    blame = Table("run", "service", *columns, "waits most for", title="Blame: mean wall time a step [us]", title_justify="left")
+    for name, run in figures["runs"].items():
+        for role, row in run["blame"].items():
+            if row:
+                most = next(iter(row["waited_for"]), "")
+                blame.add_row(name, role, *(f"{row[column]:.0f}" for column in columns), most)
+    small = Table("what", "figure", "value", title="Bus and parts", title_justify="left")
+    for group, values in (("bus", figures["bus"]), *figures["parts"].items()):
+        for figure, value in values.items():
+            small.add_row(group, figure, f"{value:.4g}" if isinstance(value, int | float) else str(value))
+    return [runs, blame, small]
+
+
+def bench(scenario: str, out: Path, console: Console) -> None:
+    """Measures, prints the tables and writes bench.json."""
+    figures = measure(load_scenario(scenario), Console(stderr=True))
+    for table in tables(figures):
+        console.print(table)
+    console.print(f"{platform.platform()}, written to {out}", highlight=False)
+    out.write_text(json.dumps(figures, indent=2), encoding="utf-8")

@@ -1,0 +1,53 @@
+"""What a run hash depends on besides scenario, seed and code: the platform's fingerprint."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "dartpy",
+    "pin",
+    "coal",
+    "open3d-cpu",
+    "casadi",
+    "ompl",
+    "ruckig",
+    "rosbags",
+    "eclipse-zenoh",
+    "scikit-learn",
+)
+"""Libraries whose version can change a result."""
+
+
+def _cpu() -> str:
+    path = Path("/proc/cpuinfo")
+    if path.is_file():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def fingerprint() -> dict[str, Any]:
+    """Operating system, processor, Python and library versions."""
+    return {
+        "system": platform.platform(),
+        "libc": " ".join(platform.libc_ver()),
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "packages": {package: found for package in PACKAGES if (found := _version(package))},
+    }

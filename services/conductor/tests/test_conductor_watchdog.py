@@ -1,0 +1,42 @@
+"""Who blocks whom."""
+
+from palpate_conductor.watchdog import Watchdog
+
+PRODUCERS = {"joint_states": "robot", "control/joint_torque": "control", "sim/contact_wrench": "tissue", "exam/state": "planning"}
+
+
+def watchdog() -> Watchdog:
+    return Watchdog(("robot", "control", "tissue", "planning", "assessment"), PRODUCERS)
+
+
+def test_the_one_that_waits_for_nobody_is_the_culprit() -> None:
+    w = watchdog()
+    w.report("control", 5_000_000, "joint_states")
+    w.report("robot", 5_000_000, "sim/contact_wrench")
+    w.report("tissue", 4_000_000, "")
+    role, sentence = w.culprit()
+    assert role == "tissue"
+    assert "control (for joint_states)" in sentence
+    assert "robot (for sim/contact_wrench)" in sentence
+
+
+def test_a_circle_is_named_as_one() -> None:
+    w = watchdog()
+    w.report("control", 1, "joint_states")
+    w.report("robot", 1, "control/joint_torque")
+    assert "circle of waiting" in w.culprit()[1]
+
+
+def test_waiting_for_a_grant_is_waiting_for_nobody() -> None:
+    w = watchdog()
+    w.report("robot", 1, "grant")
+    assert "nobody waits for it" in w.culprit()[1]
+
+
+def test_only_a_finished_tick_counts_as_movement() -> None:
+    w = watchdog()
+    w.report("robot", 1_000_000, "")
+    before = w.progress["robot"].moved
+    w.report("robot", 1_000_000, "control/joint_torque")
+    assert w.progress["robot"].moved == before
+    w.report("nobody", 5, "")
