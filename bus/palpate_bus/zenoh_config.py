@@ -8,7 +8,7 @@
 | `PALPATE_MODE` | `peer` (default) or `client` (everything through the router: for a service behind NAT) |
 | `PALPATE_LOWLATENCY` | `1`: the low-latency transport, see below |
 | `PALPATE_SHARED_MEMORY` | `0`: none (default on: messages over 3 KiB between processes of one host go through it) |
-| `PALPATE_RUNTIME` | `wallclock`: a publisher never waits for a frozen reader, see below |
+| `PALPATE_RUNTIME` | `wallclock`: a publisher does not wait for a reader that does not keep up, see below |
 | `PALPATE_ZENOH_CONFIG` | a zenoh configuration file (JSON5), used as it is; nothing else above applies |
 
 Nothing is ever found by multicast: a run must not meet another run's peers on the same network.
@@ -19,9 +19,9 @@ time-out of its own: a frozen reader blocks its writers as soon as the socket's 
 one host, where the barrier bounds what is in flight, and only between blocking roles; a pair of which either side does not offer
 it gets the usual transport.
 
-**A frozen reader** (its process stopped) stalls a publisher that drops on congestion once, for a whole second, with zenoh's
-default `wait_before_drop` of 1000, and for at most 0.4 ms with 100 (measured at 1 kHz; the file calls the unit microseconds). A
-second is too long for a driver, so in wall-clock mode we wait 100; in lockstep, where a drop ends the run, we keep the default.
+**A reader that does not keep up.** Where a publisher drops on congestion, a put waits for room before it drops. In lockstep that
+wait is a second, since a lost message ends the run; a reader that stays frozen costs its publishers that second once (measured:
+1000 ms) and is skipped from then on. In wall-clock mode it is a millisecond (measured at 1 kHz: 1.1 ms once).
 
 Round trip of 300 bytes between two Python processes (SimpleQueue receivers, five interleaved repeats of 3,500, two busy cores):
 
@@ -54,8 +54,8 @@ UNIX_PATH_MAX = 107
 _PRIORITIES = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
-WALL_CLOCK_DROP_WAIT = 100
-"""`BusOptions.drop_wait` in wall-clock mode."""
+LOCKSTEP_DROP_WAIT_US = 1_000_000
+WALL_CLOCK_DROP_WAIT_US = 1_000
 
 
 class BusConfigError(ValueError):
@@ -78,8 +78,8 @@ class BusOptions:
     """Whether to offer the low-latency transport."""
     shared_memory: bool = True
     """Whether large messages go through shared memory where both ends are on one host."""
-    drop_wait: int = 1000
-    """The `wait_before_drop` of zenoh: how long a put waits for room before it drops a message."""
+    drop_wait_us: int = LOCKSTEP_DROP_WAIT_US
+    """How long a put waits for room before it drops a message [us]."""
     file: Path | None = None
     """A zenoh configuration file that is used as it is."""
 
@@ -102,14 +102,14 @@ class BusOptions:
             mode=environ.get("PALPATE_MODE") or "peer",
             lowlatency=_flag(environ, "PALPATE_LOWLATENCY", default=False),
             shared_memory=_flag(environ, "PALPATE_SHARED_MEMORY", default=True),
-            drop_wait=WALL_CLOCK_DROP_WAIT if environ.get("PALPATE_RUNTIME") == "wallclock" else cls.drop_wait,
+            drop_wait_us=(WALL_CLOCK_DROP_WAIT_US if environ.get("PALPATE_RUNTIME") == "wallclock" else LOCKSTEP_DROP_WAIT_US),
             file=Path(file) if file else None,
         )
 
     def to_env(self) -> dict[str, str]:
         """The variables that make `from_env` return these options in another process; empty ones undo inherited ones.
 
-        `drop_wait` is not among them: the other process takes it from PALPATE_RUNTIME.
+        `drop_wait_us` is not among them: the other process takes it from PALPATE_RUNTIME.
         """
         return {
             "PALPATE_LISTEN": ",".join(self.listen),
@@ -177,11 +177,9 @@ def _settings(options: BusOptions) -> dict[str, Any]:
         "open/return_conditions/connect_scouted": options.router is not None,
         # Late joiners of latched topics are served by time stamp, as in rmw_zenoh.
         "timestamping/enabled": True,
-        # Where a queue is full for a moment (a reader that was not scheduled), wait rather than lose: in lockstep a lost message
-        # ends the run. A reader that stays frozen costs this once, then its messages are dropped at once.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 1_000_000,
+        # Room for a reader that was not scheduled for a moment (the default is 2 batches).
         "transport/link/tx/queue/size": dict.fromkeys(_PRIORITIES, 16),
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": options.drop_wait,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": options.drop_wait_us,
         "transport/shared_memory/enabled": options.shared_memory,
     }
     if options.mode != "client":
