@@ -6,7 +6,7 @@
 | `PALPATE_CONNECT` | endpoints of peers, comma-separated; those not there yet are tried again until they are |
 | `PALPATE_ROUTER` | endpoint of a router, e.g. `tcp/host:7447`: peers find each other through it and then talk directly |
 | `PALPATE_MODE` | `peer` (default) or `client` (everything through the router: for a service behind NAT) |
-| `PALPATE_LOWLATENCY` | `1`: the low-latency transport, see below |
+| `PALPATE_LOWLATENCY` | `1`: the low-latency transport, see below; not in wall-clock mode |
 | `PALPATE_SHARED_MEMORY` | `0`: none (default on: messages over 3 KiB between processes of one host go through it) |
 | `PALPATE_RUNTIME` | `wallclock`: a publisher does not wait for a reader that does not keep up, see below |
 | `PALPATE_ZENOH_CONFIG` | a zenoh configuration file (JSON5), used as it is; nothing else above applies |
@@ -95,14 +95,15 @@ class BusOptions:
     def from_env(cls, environ: Mapping[str, str] = os.environ) -> BusOptions:
         """The options that the environment asks for. Raises BusConfigError that names the variable."""
         file = environ.get("PALPATE_ZENOH_CONFIG")
+        wall_clock = environ.get("PALPATE_RUNTIME") == "wallclock"
         return cls(
             listen=_split(environ.get("PALPATE_LISTEN", "")),
             connect=_split(environ.get("PALPATE_CONNECT", "")),
             router=environ.get("PALPATE_ROUTER") or None,
             mode=environ.get("PALPATE_MODE") or "peer",
-            lowlatency=_flag(environ, "PALPATE_LOWLATENCY", default=False),
+            lowlatency=_flag(environ, "PALPATE_LOWLATENCY", default=False) and not wall_clock,
             shared_memory=_flag(environ, "PALPATE_SHARED_MEMORY", default=True),
-            drop_wait_us=(WALL_CLOCK_DROP_WAIT_US if environ.get("PALPATE_RUNTIME") == "wallclock" else LOCKSTEP_DROP_WAIT_US),
+            drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wall_clock else LOCKSTEP_DROP_WAIT_US,
             file=Path(file) if file else None,
         )
 
