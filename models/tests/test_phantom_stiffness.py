@@ -11,14 +11,14 @@ from palpate_models.scenario import Background, Lesion, Phantom
 
 def test_background_has_the_asked_mean_variation_and_correlation():
     rng = np.random.default_rng(0)
-    points = np.column_stack((rng.uniform(-0.1, 0.1, (60, 2)), np.zeros(60)))
+    points = np.column_stack((rng.uniform(-0.1, 0.1, (40, 2)), np.zeros(40)))
     shifted = points + np.array([0.05, 0.0, 0.0])
     background = Background(cv=0.2, correlation_m=0.05, margins=1.0)
-    factors = np.array([background_factor(points, background, 0.23, seed) for seed in range(400)])
+    factors = np.array([background_factor(points, background, 0.23, seed) for seed in range(200)])
     assert factors.mean() == pytest.approx(1.0, abs=0.02)
     assert factors.std() == pytest.approx(0.2, abs=0.015)
-    here = np.array([gaussian_field(points, 0.05, seed) for seed in range(400)])
-    there = np.array([gaussian_field(shifted, 0.05, seed) for seed in range(400)])
+    here = np.array([gaussian_field(points, 0.05, seed) for seed in range(200)])
+    there = np.array([gaussian_field(shifted, 0.05, seed) for seed in range(200)])
     assert (here * there).mean() == pytest.approx(np.exp(-0.5), abs=0.05)
 
 

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from palpate_models.phantom import build_phantom, flat_phantom
+from palpate_models import phantom as phantoms
+from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Breathing, Lesion, Phantom, Stiffness
 from palpate_tissue.mechanics import MOST_SUBSTEPS, StabilityError, assemble
 from palpate_tissue.tissue import Tissue
 
 ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
 STILL = np.zeros(3)
+flat_phantom = cache(phantoms.flat_phantom)
 OFFSETS = ((0.0, 0.0), (0.0025, 0.0), (0.0, 0.0029), (0.0013, 0.0008), (0.0031, 0.0017))
 
 
-def hold(tissue, depth, radius, xy=(0.0, 0.0), seconds=0.4):
+def hold(tissue, depth, radius, xy=(0.0, 0.0), seconds=0.3):
     """Force after holding the sphere at a depth below z = 0."""
     p = np.array((*xy, radius - depth))
     for k in range(round(seconds / tissue.dt)):
@@ -93,7 +97,7 @@ def test_no_closed_cycle_yields_work(seed):
     path = loop(rng, int(rng.integers(600, 2500)))
     work = touched = 0.0
     last = np.zeros(3)
-    for a, b in zip(path[:-1], path[1:], strict=True):
+    for a, b in pairwise(path):
         force, _ = tissue.step(0, b, (b - a) / tissue.dt, 0.015)
         work -= 0.5 * (force + last) @ (b - a)
         touched += tissue.touching
@@ -273,9 +277,8 @@ def test_a_sharp_contrast_does_not_cost_stability():
 
 def test_runs_repeat_bit_by_bit():
     def run():
-        tissue = Tissue(
-            build_phantom(Phantom(lesions=(Lesion(centre_m=(-0.03, 0.0)),)), 4), Stiffness(), Breathing(amplitude_m=0.003)
-        )
+        model = build_phantom(Phantom(lesions=(Lesion(centre_m=(-0.03, 0.0)),)), 4)
+        tissue = Tissue(model, Stiffness(), Breathing(amplitude_m=0.003))
         forces = []
         for k in range(600):
             p = np.array((-0.05 + 6e-5 * k, 0.01, 0.006))

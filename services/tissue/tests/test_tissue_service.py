@@ -112,7 +112,7 @@ def test_wrench_and_depth_follow_the_true_pose_of_the_patient():
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6, atol=1e-8)
     depths = [out["truth/indentation"].depth for out in outs]
     assert depths[0] == pytest.approx(depths[1], abs=1e-9)
-    assert 0.006 < depths[0] < 0.0081
+    assert 0.007 < depths[0] < 0.009  # beside the umbilicus the surface is a little higher
 
 
 def test_indentation_truth_is_consistent_with_the_wrench():
