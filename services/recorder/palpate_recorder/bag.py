@@ -81,7 +81,7 @@ class BagWriter:
         channels: Iterable[Channel],
         *,
         flush_every: int = 1_000_000_000,
-        compression: CompressionType = CompressionType.LZ4,
+        compression: CompressionType = CompressionType.ZSTD,
     ) -> None:
         """Opens `folder` (created, parents included) for `channels`. Raises OSError if it cannot be written."""
         folder.mkdir(parents=True, exist_ok=True)

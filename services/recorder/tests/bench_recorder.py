@@ -1,0 +1,92 @@
+"""What recording costs: time a message and bytes on disk, by compression, for the traffic of an examination in contact.
+
+python services/recorder/tests/bench_recorder.py [SIMULATED SECONDS]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType
+from palpate_bus import codec
+from palpate_bus.contract import contract
+from palpate_bus.messages import JointState, SurfaceMesh, ToolState, WrenchStamped
+from palpate_bus.stamps import header
+from palpate_recorder.bag import BagWriter
+from palpate_recorder.service import channels
+
+MS = 1_000_000
+_Vector: Any = codec.message_type("geometry_msgs/msg/Vector3")
+_Point: Any = codec.message_type("geometry_msgs/msg/Point")
+_Pose: Any = codec.message_type("geometry_msgs/msg/Pose")
+_Twist: Any = codec.message_type("geometry_msgs/msg/Twist")
+_Wrench: Any = codec.message_type("geometry_msgs/msg/Wrench")
+_Quaternion: Any = codec.message_type("geometry_msgs/msg/Quaternion")
+_Torque: Any = codec.message_type("palpation_msgs/msg/JointTorqueCommand")
+_Duration: Any = codec.message_type("builtin_interfaces/msg/Duration")
+
+
+def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:
+    """Five 1 kHz topics with noise in every digit, and a surface of 3,000 vertices at 20 Hz that a dent moves over."""
+    random = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.linspace(-0.18, 0.18, 50), np.linspace(-0.2, 0.2, 60)), axis=-1).reshape(-1, 2)
+    triangles = random.integers(0, 3000, 17_700).astype(np.uint32)
+    names = [f"lbr_A{i}" for i in range(1, 8)]
+    found = []
+
+    def add(topic: str, message: Any, t: int, sequence: int) -> None:
+        found.append((f"/{topic}", codec.encode(message, contract().topics[topic].type), t, sequence))
+
+    def vector() -> Any:
+        return _Vector(*random.normal(size=3))
+
+    for i in range(int(seconds * 1000)):
+        t = i * MS
+        joints = np.sin(t / 1e9 + np.arange(7)) + 1e-6 * random.normal(size=7)
+        wrench = _Wrench(vector(), vector())
+        pose = _Pose(_Point(*random.normal(size=3)), _Quaternion(0.0, 0.0, 0.0, 1.0))
+        add("joint_states", JointState(header(t), names, joints, 1e-4 * random.normal(size=7), 10 * joints), t, i)
+        add("ft/wrench", WrenchStamped(header(t, "ft_sensor"), wrench), t, i)
+        add("sim/contact_wrench", WrenchStamped(header(t, "world"), wrench), t, i)
+        add("sim/tool_state", ToolState(header(t, "world"), pose, _Twist(vector(), vector()), 0.015), t, i)
+        add("control/joint_torque", _Torque(header(t), random.normal(size=7), _Duration(0, 50 * MS)), t, i)
+        if i % 50 == 0:
+            dent = 0.01 * np.exp(-((grid - (0.1 * np.sin(t / 1e9), 0)) ** 2).sum(axis=1) / 8e-4)
+            vertices = np.column_stack((grid, -dent)).astype(np.float32).ravel()
+            mesh = SurfaceMesh(header(t, "world"), vertices, np.empty(0, np.float32), triangles)
+            add("sim/surface", mesh, t, i // 50)
+    return found
+
+
+def main() -> None:
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
+    messages = traffic(seconds)
+    size = sum(len(payload) for _, payload, _, _ in messages)
+    print(f"{len(messages)} messages, {size / 1e6 / seconds:.2f} MB a simulated second")
+    print("| compression | us a message | us a message, p99.9 | ms a simulated second | MB a simulated second |")
+    print("|---|---|---|---|---|")
+    for compression in (CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD):
+        with tempfile.TemporaryDirectory() as folder:
+            bag = BagWriter(Path(folder) / "bag", channels(contract()), compression=compression)
+            spent = np.empty(len(messages))
+            cpu = process_time()
+            for i, (topic, payload, stamp, sequence) in enumerate(messages):
+                start = perf_counter()
+                bag.write(topic, payload, stamp, sequence)
+                spent[i] = perf_counter() - start
+            bag.close()
+            cpu = process_time() - cpu
+            written = bag.path.stat().st_size
+        print(
+            f"| {compression.name.lower()} | {1e6 * cpu / len(messages):.1f} | {1e6 * np.quantile(spent, 0.999):.0f} "
+            f"| {1e3 * cpu / seconds:.0f} | {written / 1e6 / seconds:.2f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()
