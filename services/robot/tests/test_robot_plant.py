@@ -5,6 +5,7 @@ import pinocchio as pin
 import pytest
 from palpate_models import lbr
 from palpate_models.scenario import Robot
+from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, GRAVITY, STICK_RADPS, Plant
 
 NOTHING = np.zeros(3)
@@ -155,3 +156,20 @@ def test_arm_comes_to_rest_on_the_table_not_in_it() -> None:
         assert p_WI[2] > 0.73 + robot.indenter_radius_m - 2e-3
     wrist, _ = plant.link_pose("lbr_link_7")
     assert wrist[2] > 0.73
+
+
+def test_hold_stops_a_moving_tool_within_a_millimetre() -> None:
+    """Straight down at 30 mm/s, the scan's speed, when the hold begins; no tissue helps to stop it."""
+    robot = Robot()
+    model, data = _model(robot)
+    frame = model.getFrameId("indenter")
+    q = np.deg2rad([0.0, 30.0, 0.0, -80.0, 0.0, 70.0, 0.0])
+    J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+    plant = Plant(robot)
+    plant.reset(q, np.linalg.pinv(J) @ [0.0, 0.0, -0.03, 0.0, 0.0, 0.0])
+    start, _ = plant.tool_pose()
+    for _ in range(300):
+        plant.step(plant.gravity_torque(), NOTHING, NOTHING, HOLD_DAMPING)
+    end, _ = plant.tool_pose()
+    assert 0 < start[2] - end[2] < 1e-3
+    assert np.abs(plant.v).max() < 1e-3
