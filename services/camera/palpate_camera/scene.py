@@ -101,18 +101,17 @@ class Caster:
 
 
 class Scene:
-    """Layers of meshes before one camera. A layer is cast anew only when a vertex moved by more than `tolerance_m`."""
+    """Layers of meshes before one camera."""
 
-    def __init__(self, caster: Caster, tolerance_m: float = 1e-5) -> None:
+    def __init__(self, caster: Caster) -> None:
         self._caster = caster
-        self._tolerance = tolerance_m
         self._layers: dict[str, tuple[Mesh, View]] = {}
         self._merged: View | None = None
 
-    def put(self, name: str, mesh: Mesh) -> None:
-        """Sets a layer's mesh."""
+    def put(self, name: str, mesh: Mesh, tolerance_m: float = 1e-5) -> None:
+        """Sets a layer's mesh. It is cast anew only if a vertex is further than `tolerance_m` from where it was cast."""
         old = self._layers.get(name)
-        if old is not None and self._same(old[0], mesh):
+        if old is not None and _same(old[0], mesh, tolerance_m):
             return
         self._layers[name] = (mesh, self._caster.cast(mesh))
         self._merged = None
@@ -129,9 +128,10 @@ class Scene:
             self._merged = merged
         return self._merged
 
-    def _same(self, old: Mesh, new: Mesh) -> bool:
-        return (
-            old.vertices.shape == new.vertices.shape
-            and np.array_equal(old.triangles, new.triangles)
-            and bool(np.abs(old.vertices - new.vertices).max(initial=0.0) <= self._tolerance)
-        )
+
+def _same(old: Mesh, new: Mesh, tolerance: float) -> bool:
+    return (
+        old.vertices.shape == new.vertices.shape
+        and np.array_equal(old.triangles, new.triangles)
+        and bool(np.abs(old.vertices - new.vertices).max(initial=0.0) <= tolerance)
+    )

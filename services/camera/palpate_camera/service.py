@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 from zlib import crc32
 
 import numpy as np
@@ -21,6 +21,8 @@ from palpate_camera.pinhole import Pinhole
 from palpate_camera.scene import Array, Caster, Image, Mesh, Scene
 
 FRAME = "camera_depth_optical_frame"
+ROBOT_TOLERANCE_M: Final = 1e-4
+"""The arm's picture is kept while it trembles by less: it only hides, nobody measures it."""
 
 _CameraInfo: Any = message_type("sensor_msgs/msg/CameraInfo")
 _Image: Any = message_type("sensor_msgs/msg/Image")
@@ -69,7 +71,7 @@ class CameraService(Service):
         poses = inbox.latest("sim/link_poses")
         robot = None if poses is None else surroundings.placed(self._links, link_poses(poses))
         if robot is not None:
-            self._scene.put("robot", robot)
+            self._scene.put("robot", robot, ROBOT_TOLERANCE_M)
         image = self._noise.image(self._scene.view())
         return {
             "camera/depth/image_raw": depth_image(t, image),

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import trimesh
-from palpate_models import lbr, table
+from palpate_models import lbr_visual, table
 from palpate_models.frames import Array, apply
 from palpate_models.scenario import Robot
 
@@ -32,18 +32,12 @@ def furniture(robot: Robot) -> Mesh:
     )
 
 
-def _capsule(capsule: lbr.Capsule) -> Mesh:
-    start, end = np.array(capsule.start), np.array(capsule.end)
-    length = float(np.linalg.norm(end - start))
-    shape = trimesh.creation.capsule(height=length, radius=capsule.radius, count=(12, 12))
-    turn = trimesh.geometry.align_vectors((0, 0, 1), (end - start) / length) if length > 0 else np.eye(4)
-    turn[:3, 3] = start
-    return Mesh(apply(turn, np.asarray(shape.vertices, np.float64)), shape.faces.astype(np.uint32))
-
-
 def links(robot: Robot) -> dict[str, Mesh]:
     """Shape of each link, by link name, in the link's frame."""
-    return {name: merge(map(_capsule, shapes)) for name, shapes in lbr.capsules(robot).items()}
+    return {
+        name: merge(Mesh(part.vertices, part.triangles.astype(np.uint32)) for part in parts)
+        for name, parts in lbr_visual.visual_meshes(robot).items()
+    }
 
 
 def placed(shapes: dict[str, Mesh], X_WL: dict[str, Array]) -> Mesh | None:

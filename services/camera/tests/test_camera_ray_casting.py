@@ -86,7 +86,7 @@ def test_only_layers_that_moved_are_cast_again(monkeypatch: pytest.MonkeyPatch) 
     casts: list[Mesh] = []
     cast = caster.cast
     monkeypatch.setattr(caster, "cast", lambda mesh: casts.append(mesh) or cast(mesh))
-    scene = Scene(caster, tolerance_m=1e-5)
+    scene = Scene(caster)
     scene.put("floor", plate(0.0))
     scene.put("plate", plate(0.3, half=0.05))
     first = scene.view()
@@ -99,7 +99,7 @@ def test_only_layers_that_moved_are_cast_again(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_creeping_adds_up_to_a_new_cast() -> None:
-    scene = Scene(Caster(PINHOLE, X_WC), tolerance_m=1e-5)
+    scene = Scene(Caster(PINHOLE, X_WC))
     for k in range(30):
         scene.put("floor", plate(4e-6 * k))
     assert 1 / scene.view().w[60, 80] == pytest.approx((1.2 - 4e-6 * 29) / -rays()[60, 80, 2], abs=2e-5)

@@ -13,7 +13,7 @@ from palpate_models.table import TABLE_TOP_M
 
 from palpate_perception import cloud, pattern, surface, visibility
 from palpate_perception.cloud import Array, Box, Cloud
-from palpate_perception.fusion import DepthFusion
+from palpate_perception.fusion import DepthFusion, FusedDepth
 
 MARGIN_M: Final = 0.03
 """The cloud is cropped this much wider than the region, so that the surface at its edge has data on both sides."""
@@ -119,11 +119,7 @@ class Pipeline:
         seen = visibility.seen(p_A, self._exam)
         coverage = float(np.mean(seen))
         if coverage < MIN_COVERAGE:
-            missing, _ = visibility.cells(self._exam)
-            missing = missing[~seen]
-            missing = np.column_stack((missing, visibility.quadric(p_A, missing)))
-            X_CA = inverse(camera.X_WC) @ self._X_WA
-            why = visibility.explain(missing, len(seen), X_CA, camera.K, depth, origin, camera.shape)
+            why = self._reasons(seen, p_A, depth, origin, camera)
             message = f"{100 * coverage:.0f} % of the region of interest seen, {100 * MIN_COVERAGE:.0f} % needed: {why}"
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
 
@@ -133,11 +129,26 @@ class Pipeline:
         sequence = pattern.order(len(x), len(y), self._exam.pattern)  # 5
         p_W, n_W = self._on(field, nodes[sequence])
         targets = Targets(p_W, n_W, (sequence // len(y)).astype(np.uint32))
-        region = points.pixel[self._region.holds(p_A)]
-        motion = fusion.motion(fused.depth, region)
+
+        motion = self._motion(fusion, fused, points, p_A, camera)
         sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
         message = _remarks(int(np.count_nonzero(~known)), len(nodes), motion)
         return Perceived(points, self._mesh(field, p_A), targets, sigma, fused.frames, coverage, message)
+
+    def _reasons(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> str:
+        """Why the region's other cells were not seen."""
+        xy, _ = visibility.cells(self._exam)
+        missing = np.column_stack((xy[~seen], visibility.quadric(p_A, xy[~seen])))
+        X_CA = inverse(camera.X_WC) @ self._X_WA
+        return visibility.explain(missing, len(seen), X_CA, camera.K, depth, origin, camera.shape)
+
+    def _motion(self, fusion: DepthFusion, fused: FusedDepth, points: Cloud, p_A: Array, camera: Intrinsics) -> float:
+        """Standard deviation over the frames of the surface's height in the region [m]."""
+        inside = self._region.holds(p_A)
+        pixel = points.pixel[inside]
+        drop = apply(self._X_AW, camera.X_WC[np.newaxis, :3, 3])[0, 2] - p_A[inside, 2]
+        height_per_depth = float(np.mean(np.abs(drop / fused.depth[pixel[:, 0], pixel[:, 1]])))
+        return height_per_depth * fusion.motion(fused.depth, pixel)
 
     def _on(self, field: surface.HeightField, xy: Array) -> tuple[Array, Array]:
         """Positions and normals in world of the surface at `xy` in A, shape (n, 2)."""

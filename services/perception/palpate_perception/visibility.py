@@ -54,7 +54,7 @@ def quadric(p_A: Array, xy: Array) -> Array:
         return np.stack((np.ones(len(q)), x, y, x * x, x * y, y * y), axis=1)
 
     # A weak prior of a flat wall at the umbilicus' height keeps the guess sane when only a corner was seen.
-    prior = np.diag(np.sqrt(len(p_A)) * np.array([0.01, 0.02, 0.02, 0.005, 0.005, 0.005]))
+    prior = np.diag(np.sqrt(len(p_A)) * np.array([1e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4]))
     system, right = np.vstack((rows(p_A), prior)), np.concatenate((p_A[:, 2], np.zeros(6)))
     return np.asarray(rows(xy) @ np.linalg.lstsq(system, right)[0])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from palpate_models.frames import apply, inverse, look_at
 from palpate_models.scenario import Exam
@@ -19,6 +19,7 @@ BOX = Box.of(Exam(), 0.03, (-0.16, 0.06))
 coordinate = st.floats(-0.3, 0.3)
 
 
+@settings(deadline=None)
 @given(st.tuples(coordinate, coordinate, st.floats(0.5, 4.0)), st.integers(0, 200), st.integers(0, 200))
 def test_projection_and_deprojection_are_inverse(p: tuple[float, float, float], row: int, column: int) -> None:
     p_C = np.array([p])

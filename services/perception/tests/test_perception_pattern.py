@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from palpate_models.scenario import Exam, Pattern
 from palpate_perception import pattern
@@ -16,6 +16,7 @@ exams = st.builds(
 )
 
 
+@settings(deadline=None)
 @given(exams)
 def test_the_lattice_covers_the_region_with_both_ends(exam: Exam) -> None:
     for axis, station in enumerate(pattern.lattice(exam)):
@@ -37,6 +38,7 @@ def test_the_default_region_has_seventeen_lines_of_seventeen_points() -> None:
 sizes = st.tuples(st.integers(1, 12), st.integers(2, 12))
 
 
+@settings(deadline=None)
 @given(sizes, st.sampled_from(Pattern))
 def test_every_node_is_visited_once_line_by_line(size: tuple[int, int], kind: Pattern) -> None:
     sequence = pattern.order(*size, kind)
@@ -46,6 +48,7 @@ def test_every_node_is_visited_once_line_by_line(size: tuple[int, int], kind: Pa
     assert lines[0] == 0
 
 
+@settings(deadline=None)
 @given(sizes)
 def test_a_snake_alternates_and_never_jumps(size: tuple[int, int]) -> None:
     sequence = pattern.order(*size, Pattern.SNAKE)
@@ -55,6 +58,7 @@ def test_a_snake_alternates_and_never_jumps(size: tuple[int, int]) -> None:
     assert (direction == np.where(np.arange(size[0]) % 2 == 0, 1, -1)[:, np.newaxis]).all()
 
 
+@settings(deadline=None)
 @given(sizes)
 def test_a_raster_goes_the_same_way_on_every_line(size: tuple[int, int]) -> None:
     point = pattern.order(*size, Pattern.RASTER) % size[1]

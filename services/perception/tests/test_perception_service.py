@@ -1,0 +1,358 @@
+"""Perception with the real camera on the real phantom: accuracy, occlusion, calibration error, order, determinism."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from palpate_bus import codec
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import CameraTrigger, Image, SurfaceMesh, TFMessage
+from palpate_bus.stamps import header
+from palpate_camera.service import CameraService, transform
+from palpate_models.frames import apply, inverse, matrix
+from palpate_models.load import exam_input, load_scenario
+from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.scenario import Scenario
+from palpate_perception import cloud, pattern
+from palpate_perception.service import PerceptionService, create, depth_in_metres
+from scipy.interpolate import LinearNDInterpolator
+
+TICK = 100 * MS
+
+
+class FakeInbox:
+    """New messages of one step, and the latest of all steps."""
+
+    def __init__(self, **latest: Any) -> None:
+        self._latest = {topic.replace("__", "/"): message for topic, message in latest.items()}
+        self._new: dict[str, list[Any]] = {}
+        self.gone: set[str] = set()
+
+    def put(self, messages: dict[str, Any]) -> FakeInbox:
+        """Messages by topic; what was new before no longer is."""
+        self._new = {topic: [message] for topic, message in messages.items()}
+        self._latest |= messages
+        return self
+
+    def latest(self, topic: str) -> Any:
+        return self._latest.get(topic)
+
+    def new(self, topic: str) -> Iterable[Any]:
+        return self._new.get(topic, [])
+
+    def stamp(self, topic: str) -> int | None:
+        return None
+
+    def lost(self, role: str) -> bool:
+        return role in self.gone
+
+
+@cache
+def phantom() -> PhantomModel:
+    return build_phantom(Scenario().phantom, 0)
+
+
+def scenario(*settings: str, seed: int = 0) -> Scenario:
+    return load_scenario("rlq_guarding", settings, seed)
+
+
+def skin(case: Scenario, rise: float = 0.0) -> Any:
+    """sim/surface of the phantom at rest, lifted by `rise` [m]."""
+    p_W = apply(matrix(case.phantom.pose.true), phantom().vertices) + np.array((0, 0, rise))
+    triangles = phantom().triangles.astype(np.uint32).ravel()
+    return SurfaceMesh(header(0, "world"), p_W.astype(np.float32).ravel(), np.empty(0, np.float32), triangles)
+
+
+@cache
+def default_look() -> dict[str, Any]:
+    """What the default scenario shows: several tests look at it."""
+    return look(scenario())
+
+
+def look(case: Scenario, frames: int | None = None, links: Any = None, rises: tuple[float, ...] = (0.0,)) -> dict[str, Any]:
+    """What perception publishes after a burst by the camera: topics to messages."""
+    exam = exam_input(case)
+    camera, perception = CameraService(exam), PerceptionService(exam)
+    wanted = frames or case.camera.frames
+    seen = FakeInbox(**({"sim__link_poses": links} if links else {}))
+    heard = FakeInbox(tf_static=camera.start()["tf_static"])
+    trigger = {"planning/camera_trigger": CameraTrigger(header(5 * MS), wanted)}
+    images: dict[str, Any] = {}
+    for k in range(1, wanted + 3):
+        start = trigger if k == 1 else {}
+        sent = perception.step(k * TICK, heard.put({**start, **images}))
+        if sent:
+            return dict(sent)
+        images = dict(camera.step(k * TICK, seen.put({"sim/surface": skin(case, rises[k % len(rises)]), **start})))
+    raise AssertionError("perception published nothing")
+
+
+def vertices(message: Any) -> np.ndarray:
+    return np.asarray(message.vertices, np.float64).reshape(-1, 3)
+
+
+def xyz(items: Iterable[Any]) -> np.ndarray:
+    return np.array([(p.x, p.y, p.z) for p in items])
+
+
+def surface_error(case: Scenario, sent: dict[str, Any]) -> np.ndarray:
+    """Perceived minus true height along z_A [m] at the phantom's vertices in the region."""
+    perceived = apply(inverse(matrix(case.phantom.pose.true)), vertices(sent["perception/surface"]))
+    width, height = case.exam.region_m
+    true = phantom().vertices[phantom().normals[:, 2] > 0.3]
+    true = true[(np.abs(true[:, 0]) <= width / 2) & (np.abs(true[:, 1]) <= height / 2)]
+    assert len(true) > 1000
+    return np.asarray(LinearNDInterpolator(perceived[:, :2], perceived[:, 2])(true[:, :2]) - true[:, 2])
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_surface_is_far_better_than_a_millimetre(seed: int) -> None:
+    case = scenario(seed=seed)
+    sent = look(case) if seed else default_look()
+    error = surface_error(case, sent)
+    targets = sent["perception/targets"]
+    assert rms(error) < 0.15e-3  # asked for: 1 mm
+    assert np.abs(error).max() < 0.8e-3
+    assert abs(error.mean()) < 0.04e-3
+    assert targets.frames_fused == 20
+    assert targets.coverage == 1.0
+    assert targets.message == ""
+    assert 0.3 < targets.surface_noise / rms(error) < 3
+
+
+@pytest.mark.parametrize(
+    "place", ["[0.56, -0.6, 1.75]", "[0.75, -0.35, 1.8]", "[0.95, 0.45, 1.85]", "[1.1, 0.0, 1.6]", "[0.95, -0.45, 2.3]"]
+)
+def test_other_places_of_the_camera_do_as_well(place: str) -> None:
+    case = scenario(f"camera.position_m={place}")
+    assert rms(surface_error(case, look(case, 10))) < 0.3e-3
+
+
+def test_fewer_frames_are_noisier_and_the_estimate_says_so() -> None:
+    case = scenario()
+    few, many = look(case, 2), default_look()
+    assert rms(surface_error(case, few)) > 1.5 * rms(surface_error(case, many))
+    assert few["perception/targets"].surface_noise > 1.5 * many["perception/targets"].surface_noise
+    assert few["perception/targets"].frames_fused == 2
+
+
+def test_targets_lie_on_the_lattice_and_the_surface_with_unit_outward_normals() -> None:
+    case = scenario()
+    targets = default_look()["perception/targets"]
+    p_A = apply(inverse(matrix(case.phantom.pose.true)), xyz(targets.positions))
+    normals = xyz(targets.normals)
+    x, y = pattern.lattice(case.exam)
+    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    nodes[1::2] = nodes[1::2, ::-1]
+    np.testing.assert_allclose(p_A[:, :2], nodes.reshape(-1, 2), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
+    assert (normals[:, 2] > 0.6).all()
+    assert targets.lines.tolist() == np.repeat(np.arange(17), 17).tolist()
+    # The true normals at the nearest vertices, away from the navel, where five millimetres turn the normal.
+    true = phantom().vertices
+    front = np.flatnonzero(phantom().normals[:, 2] > 0.3)
+    nearest = front[np.argmin(np.linalg.norm(p_A[:, np.newaxis] - true[front], axis=2), axis=1)]
+    away = np.hypot(p_A[:, 0], p_A[:, 1]) > 0.025
+    angle = np.arccos(np.clip(np.sum(normals * phantom().normals[nearest], axis=1), -1, 1))
+    assert np.rad2deg(angle[away]).max() < 4
+
+
+def test_the_mesh_covers_region_and_margin_counter_clockwise_from_outside() -> None:
+    mesh = default_look()["perception/surface"]
+    p, n = vertices(mesh), np.asarray(mesh.normals, np.float64).reshape(-1, 3)
+    triangles = mesh.triangles.reshape(-1, 3)
+    np.testing.assert_allclose(p.min(axis=0)[:2], (0.56 - 0.125, -0.125), atol=1e-6)
+    np.testing.assert_allclose(p.max(axis=0)[:2], (0.56 + 0.125, 0.125), atol=1e-6)
+    assert len(triangles) == 2 * 50 * 50
+    a, b, c = (p[triangles[:, k]] for k in range(3))
+    face = np.cross(b - a, c - a)
+    assert (np.sum(face * n[triangles[:, 0]], axis=1) > 0).all()
+
+
+def test_the_cloud_is_cropped_to_the_abdomen() -> None:
+    sent = default_look()["perception/points"]
+    points = np.frombuffer(sent.data, "<f4").reshape(-1, 3)
+    assert [(f.name, f.offset, f.datatype) for f in sent.fields] == [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
+    assert (sent.width, sent.point_step, sent.row_step) == (len(points), 12, 12 * len(points))
+    assert np.isfinite(points).all()
+    assert (np.abs(points[:, 0] - 0.56) < 0.131).all()
+    assert (np.abs(points[:, 1]) < 0.131).all()
+    assert (points[:, 2] > 0.75).all()
+
+
+def test_messages_fit_the_contract() -> None:
+    sent = default_look()
+    assert set(sent) == {topic.name for topic in contract().outputs("perception")}
+    for name, message in sent.items():
+        kind = contract().topics[name].type
+        again = codec.decode(codec.encode(message, kind), kind)
+        assert again.header.frame_id == "world"
+
+
+def test_the_robot_in_the_way_is_noticed_and_named() -> None:
+    X = np.eye(4)
+    X[:3, 3] = 0.62, -0.08, 1.15
+    sent = look(scenario(), links=TFMessage([transform(0, "world", "lbr_link_4", X)]))
+    targets = sent["perception/targets"]
+    assert len(targets.positions) == len(targets.normals) == len(targets.lines) == 0
+    assert 0.2 < targets.coverage < 0.95
+    assert "view blocked: something, likely the arm" in targets.message
+    assert "perception/surface" not in sent
+
+
+def test_the_robot_beside_the_region_does_no_harm() -> None:
+    X = np.eye(4)
+    X[:3, 3] = 0.40, 0.0, 1.0
+    case = scenario()
+    sent = look(case, links=TFMessage([transform(0, "world", "indenter", X)]))
+    assert sent["perception/targets"].coverage > 0.95
+    assert rms(surface_error(case, sent)) < 0.2e-3
+
+
+def test_a_camera_that_looks_aside_is_told_so() -> None:
+    targets = look(scenario("camera.look_at_m=[2.0, -1.0, 1.5]"), 1)["perception/targets"]
+    assert len(targets.positions) == 0
+    assert targets.coverage == 0.0
+    assert "outside the image" in targets.message
+
+
+def test_a_region_past_the_abdomen_has_no_targets() -> None:
+    targets = look(scenario("exam.region_m=[0.6, 0.3]"), 4)["perception/targets"]
+    assert len(targets.positions) == 0
+    assert "no abdomen there" in targets.message
+
+
+def test_a_wrong_extrinsic_calibration_shifts_the_surface_accordingly() -> None:
+    # The optical frame told is 4 mm too far back along its axis, so everything is seen 4 mm nearer to it.
+    case, shift = scenario("camera.extrinsic_error.xyz_m=[0.0, 0.0, -0.004]"), 0.004
+    error = surface_error(case, look(case))
+    towards = np.array(case.camera.position_m) - np.array(case.camera.look_at_m)
+    rise = shift * towards / np.linalg.norm(towards)
+    true = phantom()
+    region = (np.abs(true.vertices[:, :2]) <= 0.1).all(axis=1) & (true.normals[:, 2] > 0.3)
+    n = true.normals[region]
+    expected = n @ rise / n[:, 2]  # height above a fixed xy changes by the shift across the surface
+    assert rms(error - expected) < 0.25e-3
+    assert error.mean() == pytest.approx(expected.mean(), abs=0.05e-3)
+
+
+def test_a_wrong_registration_moves_the_targets_but_not_the_surface() -> None:
+    case = scenario("phantom.pose.error.xyz_m=[0.01, -0.008, 0.012]")
+    sent = look(case)
+    p_W = xyz(sent["perception/targets"].positions)
+    np.testing.assert_allclose(p_W[:, :2].mean(axis=0), (0.57, -0.008), atol=1e-6)
+    perceived = apply(inverse(matrix(case.phantom.pose.true)), vertices(sent["perception/surface"]))
+    true = phantom().vertices[(phantom().normals[:, 2] > 0.3) & (np.abs(phantom().vertices[:, :2]) < 0.1).all(axis=1)]
+    error = LinearNDInterpolator(perceived[:, :2], perceived[:, 2])(true[:, :2]) - true[:, 2]
+    assert rms(error) < 0.15e-3
+
+
+def test_breathing_is_noticed_and_averaged() -> None:
+    case = scenario()
+    rises = tuple(4e-3 * np.sin(2 * np.pi * k / 10) for k in range(10))
+    sent = look(case, 20, rises=rises)
+    targets = sent["perception/targets"]
+    assert "the surface moved" in targets.message
+    assert len(targets.positions) == 289
+    assert targets.surface_noise == pytest.approx(4e-3 / np.sqrt(2), rel=0.15)
+    assert abs(surface_error(case, sent).mean()) < 0.2e-3
+
+
+def test_two_runs_give_the_same_bytes_and_another_seed_does_not() -> None:
+    def run(seed: int) -> list[bytes]:
+        sent = look(scenario(seed=seed), 3)
+        return [codec.encode(sent[name], contract().topics[name].type) for name in sorted(sent)]
+
+    assert run(4) == run(4)
+    assert run(4) != run(5)
+
+
+def test_the_five_steps_run_in_the_papers_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    for module, names in ((cloud, ("to_world", "remove_invalid", "crop")), (pattern, ("downsample", "order"))):
+        for name in names:
+            step = getattr(module, name)
+            monkeypatch.setattr(module, name, lambda *a, _s=step, _n=name: calls.append(_n) or _s(*a))
+    look(scenario(), 1)
+    assert list(dict.fromkeys(calls)) == ["to_world", "remove_invalid", "crop", "downsample", "order"]
+
+
+def test_frames_older_than_the_trigger_do_not_count() -> None:
+    case = scenario()
+    exam = exam_input(case)
+    camera, perception = CameraService(exam), PerceptionService(exam)
+    inbox = FakeInbox(tf_static=camera.start()["tf_static"])
+    old = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 9)}
+    stale = dict(camera.step(TICK, FakeInbox().put(old)))
+    again = CameraTrigger(header(TICK + 50 * MS), 1)
+    assert perception.step(2 * TICK, inbox.put({**stale, "planning/camera_trigger": again})) == {}
+    fresh = dict(camera.step(2 * TICK, FakeInbox().put({"planning/camera_trigger": again, "sim/surface": skin(case)})))
+    assert perception.step(3 * TICK, inbox.put(fresh))["perception/targets"].frames_fused == 1
+
+
+def test_without_a_trigger_nothing_is_published() -> None:
+    perception, camera = PerceptionService(exam_input(scenario())), CameraService(exam_input(scenario()))
+    inbox = FakeInbox(tf_static=camera.start()["tf_static"])
+    wake = {"sim/surface": skin(scenario()), "planning/camera_trigger": CameraTrigger(header(0), 2)}
+    frame = dict(camera.step(0, FakeInbox().put(wake)))
+    assert [perception.step(k * TICK, inbox.put(frame)) for k in range(3)] == [{}, {}, {}]
+
+
+def test_a_burst_without_frames_is_answered_in_words() -> None:
+    perception, inbox = PerceptionService(exam_input(scenario())), FakeInbox()
+    inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 5)})
+    sent = [perception.step(TICK, inbox)]
+    sent += [perception.step(k * TICK, inbox.put({})) for k in range(2, 20)]
+    (answer,) = [outbox for outbox in sent if outbox]
+    targets = answer["perception/targets"]
+    assert (len(targets.positions), targets.coverage, targets.frames_fused) == (0, 0.0, 0)
+    assert "no depth frame within 1 s" in targets.message
+
+
+def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
+    perception, inbox = PerceptionService(exam_input(scenario())), FakeInbox()
+    perception.step(TICK, inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 5)}))
+    inbox.gone.add("camera")
+    targets = perception.step(2 * TICK, inbox.put({}))["perception/targets"]
+    assert targets.message == "nothing seen: the camera's service is gone"
+
+
+def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
+    case = scenario()
+    camera, perception = CameraService(exam_input(case)), create(case)
+    wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 1)}
+    frame = dict(camera.step(TICK, FakeInbox().put(wake)))
+    inbox = FakeInbox()
+    sent = [perception.step(TICK, inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
+    sent += [perception.step(k * TICK, inbox.put(frame if k == 2 else {})) for k in range(2, 15)]
+    (answer,) = [outbox for outbox in sent if outbox]
+    assert "no tf_static" in answer["perception/targets"].message
+
+
+def image(encoding: str, data: np.ndarray, width: int, step: int, bigendian: int = 0) -> Any:
+    return Image(header(0, "c"), 2, width, encoding, bigendian, step, data.view(np.uint8).reshape(-1))
+
+
+def test_depth_in_metres_and_in_millimetres_with_padding_and_either_byte_order() -> None:
+    truth = np.array([[0.5, np.nan, 1.25], [2.0, 0.75, np.nan]])
+    metres = np.zeros((2, 4), "<f4")
+    metres[:, :3] = truth
+    metres[1, 2] = 0.0
+    np.testing.assert_array_equal(depth_in_metres(image("32FC1", metres, 3, 16)), truth.astype(np.float32))
+    millimetres = np.nan_to_num(1000 * truth).astype(">u2")
+    np.testing.assert_allclose(depth_in_metres(image("16UC1", millimetres, 3, 6, 1)), truth, rtol=1e-6)
+
+
+def test_a_strange_image_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="encoding = 'rgb8', want one of"):
+        depth_in_metres(image("rgb8", np.zeros(18, np.uint8), 3, 9))
+    with pytest.raises(ValueError, match="18 bytes for 2 rows of 16, 3 pixels each"):
+        depth_in_metres(image("32FC1", np.zeros(18, np.uint8), 3, 16))
