@@ -10,11 +10,6 @@ from palpate_bus.codec import Message
 from scipy.spatial.transform import Rotation
 
 
-def point(p: Message) -> NDArray[np.float64]:
-    """A Point or Vector3, shape (3,)."""
-    return np.array((p.x, p.y, p.z))
-
-
 def points(items: Any) -> NDArray[np.float64]:
     """Points or Vector3s, shape (n, 3)."""
     return np.array([(p.x, p.y, p.z) for p in items], dtype=np.float64).reshape(-1, 3)

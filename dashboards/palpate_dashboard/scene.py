@@ -192,7 +192,7 @@ class Scene:
         del self._trail[:-1]
 
     def force(self, t: int, position: NDArray[np.float64], force: NDArray[np.float64]) -> None:
-        """The contact force [N], shape (3,), that the tissue exerts on the indenter at `position`."""
+        """The contact force [N], shape (3,), that presses on the indenter at `position`."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:
             vector = METRES_PER_NEWTON * force if shown else np.zeros(3)

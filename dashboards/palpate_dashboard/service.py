@@ -86,6 +86,7 @@ class DashboardService(Service):
         self._seen: dict[str, Message] = {}
         self._due: dict[str, int] = {}
         self._in_contact = False
+        self._pressed_n = 0.0
         self._found: list[str] = []
         self._robot = "no status yet"
         self._pace: float | None = None
@@ -93,7 +94,6 @@ class DashboardService(Service):
         self._steps = 0
         self._busy_s = 0.0
         self._drawing: tuple[tuple[str, int, Callable[[int, Message], None]], ...] = (
-            ("sim/link_poses", PLOT_PERIOD, self._link_poses),
             ("sim/surface", MESH_PERIOD, self._surface),
             ("truth/phantom", 0, self._phantom),
             ("tf_static", 0, self._tf_static),
@@ -105,6 +105,7 @@ class DashboardService(Service):
             ("planning/path", 0, self._path_planned),
             ("exam/state", PLOT_PERIOD, self._exam),
             ("truth/indentation", PLOT_PERIOD, self._indentation),
+            ("sim/link_poses", PLOT_PERIOD, self._link_poses),
             ("robot/status", PLOT_PERIOD, self._robot_status),
             ("assessment/map", MAP_PERIOD, self._stiffness),
             ("assessment/findings", 0, self._findings),
@@ -121,9 +122,6 @@ class DashboardService(Service):
                     self._seen[topic] = message
                     self._due[topic] = t + period
                     draw(t, message)
-        if self._is_due("sim/tool_state", t, PLOT_PERIOD):
-            self._due["sim/tool_state"] = t + PLOT_PERIOD
-            self._tool(t, inbox)
         if self._is_due("pace", t, 1000 * MS):
             self._due["pace"] = t + 1000 * MS
             self._measure_pace(t)
@@ -163,19 +161,13 @@ class DashboardService(Service):
         for link in poses.keys() & self._shapes.keys():
             self._scene.link_shape(link, self._shapes.pop(link))
         self._scene.link_poses(t, poses)
+        if lbr.LINK_NAMES[-1] in poses:
+            X_WI = arrays.matrix(poses[lbr.LINK_NAMES[-1]])
+            self._scene.tool(t, X_WI[:3, 3], self._in_contact)
+            self._scene.force(t, X_WI[:3, 3], -self._pressed_n * X_WI[:3, 2])
 
     def _surface(self, t: int, message: Message) -> None:
         self._scene.abdomen(t, arrays.triples(message.vertices), arrays.triples(message.triangles))
-
-    def _tool(self, t: int, inbox: Inbox) -> None:
-        tool = inbox.latest("sim/tool_state")
-        if tool is None:
-            return
-        position = arrays.point(tool.pose.position)
-        self._scene.tool(t, position, self._in_contact)
-        wrench = inbox.latest("sim/contact_wrench")
-        if wrench is not None:
-            self._scene.force(t, position, arrays.point(wrench.wrench.force))
 
     def _phantom(self, _t: int, message: Message) -> None:
         vertices = arrays.triples(message.surface.vertices)
@@ -241,6 +233,7 @@ class DashboardService(Service):
         self._plots.document(t, "text/status", page)
 
     def _indentation(self, t: int, message: Message) -> None:
+        self._pressed_n = message.normal_force
         self._plots.true_contact(t, message.depth, message.normal_force)
 
     def _robot_status(self, t: int, message: Message) -> None:

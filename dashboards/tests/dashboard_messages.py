@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from palpate_bus import messages as m
 from palpate_bus.codec import message_type
+from palpate_bus.contract import contract
 from palpate_bus.stamps import header, time_message
 from palpate_models import lbr
 from palpate_models.scenario import Robot
 from scipy.spatial.transform import Rotation
 
 MS = 1_000_000
+OBSERVED = frozenset(topic.name for topic, _ in contract().inputs("dashboard"))
 Messages = dict[str, Any]
 X_WA = np.array((0.56, 0.0, 0.93))
 _Point = message_type("geometry_msgs/msg/Point")
@@ -35,12 +37,14 @@ class FakeInbox:
         self.stamps.update(dict.fromkeys(messages, t))
 
     def latest(self, topic: str) -> Any:
+        assert topic in OBSERVED, f"{topic} is not for the dashboard"
         return self.messages.get(topic)
 
     def new(self, topic: str) -> list[Any]:
         return [self.messages[topic]] if topic in self.messages else []
 
     def stamp(self, topic: str) -> int | None:
+        assert topic in OBSERVED, f"{topic} is not for the dashboard"
         return self.stamps.get(topic)
 
     def lost(self, role: str) -> bool:
@@ -185,18 +189,13 @@ def findings(t: int) -> Any:
     return m.Findings(header(t, "abdomen"), [item], True)
 
 
-def wrench(t: int, force: NDArray[np.float64]) -> Any:
-    inner = message_type("geometry_msgs/msg/Wrench")(_Vector(*map(float, force)), _Vector(0.0, 0.0, 0.0))
-    return m.WrenchStamped(header(t, "world"), inner)
-
-
 def robot_status(t: int, torque: NDArray[np.float64]) -> Any:
     """The rest of the message is not drawn."""
     zero = np.zeros(7)
     rest = {
         "position": zero,
         "velocity": zero,
-        "wrench": wrench(t, np.zeros(3)).wrench,
+        "wrench": message_type("geometry_msgs/msg/Wrench")(_Vector(0.0, 0.0, 0.0), _Vector(0.0, 0.0, 0.0)),
         "applied_torque": torque,
         "commands_rejected": 0,
     }
@@ -225,20 +224,16 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
         dent = 0.01 * np.exp(-((rest[:, :2] - centre) ** 2).sum(axis=1) / 2 / 0.02**2) if pressing else 0.0
         moved = world - np.array((0.0, 0.0, 1.0)) * np.reshape(dent, (-1, 1))
         near = np.argmin(((rest[:, :2] - centre) ** 2).sum(axis=1))
-        force = np.array((0.3, 0.0, 2.5 * ratio_field(rest[near : near + 1])[0])) if pressing else np.zeros(3)
-        tool = moved[near] + np.array((0, 0, 0.015)) if pressing else poses["indenter"][0]
+        force = 2.5 * float(ratio_field(rest[near : near + 1])[0]) if pressing else 0.0
+        if pressing:
+            poses["indenter"] = (moved[near] + np.array((0, 0, 0.015)), Rotation.from_euler("x", np.pi))
         depth = 0.01 if pressing else -0.2
         phase = 5 if pressing else (1 if s > 0.1 else 0)
-        twist = message_type("geometry_msgs/msg/Twist")(_Vector(0.0, 0.0, 0.0), _Vector(0.0, 0.0, 0.0))
         new |= {
             "sim/link_poses": transforms(t, poses),
             "sim/surface": surface(t, moved.astype(np.float32), triangles, "world"),
-            "sim/tool_state": m.ToolState(header(t, "world"), pose(tool), twist, 0.015),
-            "sim/contact_wrench": wrench(t, force),
-            "exam/state": exam(t, phase, "scanning line 3" if pressing else "", depth, float(force[2]), int(200 * s)),
-            "truth/indentation": m.IndentationTruth(
-                header(t, "world"), depth, float(force[2]), 0.3, 9, _Point(0.0, 0.0, 0.0), 1.7e5
-            ),
+            "exam/state": exam(t, phase, "scanning line 3" if pressing else "", depth, force, int(200 * s)),
+            "truth/indentation": m.IndentationTruth(header(t, "world"), depth, force, 0.3, 9, _Point(0.0, 0.0, 0.0), 1.7e5),
             "robot/status": robot_status(t, 20.0 * np.sin(6 * s + np.arange(7.0))),
             "clock": message_type("rosgraph_msgs/msg/Clock")(time_message(t)),
         }
