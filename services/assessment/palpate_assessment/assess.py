@@ -134,5 +134,6 @@ def felt_modulus(z: Array, grid: MapGrid, contact: ReferenceContact) -> Array:
     r, weight = contact.footprint(contact.common_depth, grid.pitch)
     kernel = np.interp(np.hypot(*np.meshgrid(axis, axis)), r, weight, right=0.0)
     power = np.exp(POWER * z).reshape(grid.z.shape)
-    total = fftconvolve(np.pad(power, n, mode="edge"), kernel, mode="valid") / kernel.sum()
+    padded = np.pad(power, n, mode="edge")
+    total: Array = fftconvolve(padded, np.asarray(kernel / kernel.sum(), dtype=np.float64), mode="valid")
     return np.asarray(total.ravel() ** (1.0 / POWER))

@@ -1,9 +1,10 @@
 """Sphere on a Winkler-Pasternak foundation: force, footprint and memory at unit foundation modulus.
 
-The wall resists a normal displacement u [m] with the pressure p = k_w (u - l^2 lap u) [Pa] (Kerr 1964, "Elastic and viscoelastic
-foundation models"). Under a sphere of radius R pressed to depth d the displacement is prescribed, w(r) = d - (R - sqrt(R^2 - r^2)),
-up to the contact radius a; outside it decays as K0(r / l). The obstacle problem's solution is C^1, which gives a; force, footprint
-and overlap follow in closed form or by quadrature. Everything scales with k_w, so that k_w = F / f(d).
+The wall resists a normal displacement u [m] with the pressure p = k_w (u - l^2 lap u) [Pa] (Kerr 1964, "Elastic and
+viscoelastic foundation models"). Under a sphere of radius R pressed to depth d the displacement is prescribed,
+w(r) = d - (R - sqrt(R^2 - r^2)), up to the contact radius a; outside it decays as K0(r / l). The obstacle problem's solution
+is C^1, which gives a; force, footprint and overlap follow in closed form or by quadrature. Everything scales with k_w, so
+that k_w = F / f(d).
 """
 
 from __future__ import annotations
@@ -12,11 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.scenario import Stiffness
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 from scipy.special import k0, k0e, k1, k1e
-
-from palpate_models.scenario import Stiffness
 
 Array = NDArray[np.float64]
 
@@ -137,7 +137,7 @@ class ReferenceContact:
             raster = gaussian_filter(raster, pitch / np.sqrt(12.0) / _PIXEL)
             raster /= raster.sum() * _PIXEL**2
             self._footprints[key] = raster[n, n:].copy()
-        return np.arange(n + 1) * _PIXEL, self._footprints[key]
+        return np.asarray(np.arange(n + 1) * _PIXEL), self._footprints[key]
 
     def overlap(self, distance: Array) -> Array:
         """Part of the pressure of an indentation that loads one at `distance` [m] beside it [1]; 1 at zero distance."""
@@ -155,7 +155,7 @@ class ReferenceContact:
     def advance(self, velocity: Array) -> Array:
         """How far the footprint runs ahead of a sliding sphere, shape as `velocity` [m/s] -> [m].
 
-        The dashpot makes the stress that of u + tau du/dt, which is u moved ahead by tau v; unilateral contact takes a fifth of it
-        (fitted on a transient solution of the sliding contact at 10-60 mm/s, see README).
+        The dashpot makes the stress that of u + tau du/dt, which is u moved ahead by tau v; unilateral contact takes a fifth
+        of it (fitted on a transient solution of the sliding contact at 10-60 mm/s, see README).
         """
         return np.asarray(0.8 * self.material.dashpot_s * velocity)

@@ -1,8 +1,9 @@
 """From the posterior stiffness to findings: stiff areas that a healthy wall's variation does not explain.
 
-Candidates are connected areas that stand out of their surroundings. Each is tested on the data, not on the map: under "healthy" the
-log-moduli are the healthy field alone, under "lesion" the area's log-modulus is raised by c. Generalised least squares gives c, its
-variance and the Bayes factor; so a smooth rise towards the costal margin, which the healthy field explains, does not count.
+Candidates are connected areas that stand out of their surroundings. Each is tested on the data, not on the map: under
+"healthy" the log-moduli are the healthy field alone, under "lesion" the area's log-modulus is raised by c. Generalised least
+squares gives c, its variance and the Bayes factor; so a smooth rise towards the costal margin, which the healthy field
+explains, does not count.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The map's mesh: a regular grid over the examined region in the xy plane of the abdomen frame, lifted to the perceived surface."""
+"""The map's mesh: a regular grid over the examined region in the xy plane of A, lifted to the perceived surface."""
 
 from __future__ import annotations
 
@@ -92,4 +92,4 @@ def map_grid(surface: Array, centre: tuple[float, float], size: tuple[float, flo
     z = smooth + LinearNDInterpolator(near[:, :2], rest, fill_value=0.0)(xx, yy)
     zy, zx = np.gradient(smooth, pitch)
     area = pitch**2 * np.sqrt(1 + zx**2 + zy**2)
-    return MapGrid(x, y, z, area.ravel(), shape)
+    return MapGrid(x, y, z, area.ravel(), np.asarray(shape, dtype=np.float64))

@@ -1,7 +1,7 @@
 """Relaxation of the wall along the indenter's path: how much of the instantaneous force is left.
 
-With a Prony series the stress is that of u - sum g_i q_i, dq_i/dt = (u - q_i) / tau_i. What the wall remembers of an indentation at
-another place and time acts on the present contact through the overlap of their pressures, so
+With a Prony series the stress is that of u - sum g_i q_i, dq_i/dt = (u - q_i) / tau_i. What the wall remembers of an
+indentation at another place and time acts on the present contact through the overlap of their pressures, so
 
     F / k_w = f(d) - sum_i g_i / tau_i  int exp(-(t - s) / tau_i) f(d(s)) overlap(|x(t) - x(s)|) ds
 

@@ -1,7 +1,8 @@
 """What is known of an abdomen's stiffness before it is touched: Gaussian fields of log k_w on the map grid.
 
-A field is a sum of squared-exponential components, c(r) = sd^2 exp(-r^2 / (2 l^2)) in the xy plane, each optionally scaled by an
-envelope over the nodes. On the regular grid a component is a Kronecker product, so its product with a matrix costs two small ones.
+A field is a sum of squared-exponential components, c(r) = sd^2 exp(-r^2 / (2 l^2)) in the xy plane, each optionally scaled by
+an envelope over the nodes. On the regular grid a component is a Kronecker product, so its product with a matrix costs two
+small ones.
 """
 
 from __future__ import annotations
@@ -39,7 +40,10 @@ LESION = (Component(0.35, 0.010), Component(0.55, 0.022))
 
 
 class Field:
-    """A Gaussian field of log k_w over the nodes of a grid. Fields add: `Field(grid, HEALTHY) + Field(grid, LESION, envelope)`."""
+    """A Gaussian field of log k_w over the nodes of a grid.
+
+    Fields add: `Field(grid, HEALTHY) + Field(grid, LESION, envelope)`.
+    """
 
     def __init__(self, grid: MapGrid, components: tuple[Component, ...], envelope: Array | None = None) -> None:
         """`envelope`: factor on the standard deviation at each node, shape (ny * nx,)."""
