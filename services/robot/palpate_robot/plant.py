@@ -99,6 +99,9 @@ class Plant:
         self._world = dart.simulation.World()
         self._world.setTimeStep(DT)
         self._world.setGravity([0.0, 0.0, -GRAVITY])
+        awake = self._world.getDeactivationOptions()
+        awake.mEnabled = False  # DART may put to sleep what moves slower than 1 cm/s: palpation does
+        self._world.setDeactivationOptions(awake)
         # DART's own detector knows capsules and boxes exactly and is the cheapest here; FCL has no capsules.
         self._world.getConstraintSolver().setCollisionDetector(dart.collision.DARTCollisionDetector())
         self._world.addSkeleton(self._arm)

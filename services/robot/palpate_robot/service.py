@@ -71,7 +71,7 @@ class RobotService(Service):
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
         self._applied = np.zeros(7)
-        self._sums = np.zeros(20)
+        self._sums = np.zeros(20)  # of position, velocity and F/T reading since the last status
         self._summed = 0
         self._external_force = 0.0
         self._peak_force = 0.0

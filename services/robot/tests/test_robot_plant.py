@@ -133,6 +133,20 @@ def test_coulomb_friction_sticks_below_its_limit_and_slides_against_it_above(joi
             assert plant.v[joint] == pytest.approx(speed, rel=0.15)
 
 
+def test_slow_motion_is_motion() -> None:
+    """2 mrad/s, a millimetre a second at the tool, for seconds, and from rest: nothing falls asleep."""
+    robot = Robot(joint_friction_nm=0.0)
+    plant = Plant(robot)
+    push = np.zeros(7)
+    for _ in range(1000):
+        plant.step(plant.gravity_torque(), NOTHING, NOTHING, NO_DAMPING)
+    push[0] = 2e-3 * robot.joint_damping_nms
+    for _ in range(2500):
+        plant.step(plant.gravity_torque() + push, NOTHING, NOTHING, NO_DAMPING)
+    assert plant.v[0] == pytest.approx(2e-3, rel=1e-3)
+    assert plant.q[0] == pytest.approx(2e-3 * 2.5, rel=0.05)
+
+
 def test_end_stop_stops_the_joint() -> None:
     plant = Plant(Robot())
     push = np.zeros(7)

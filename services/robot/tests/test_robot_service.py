@@ -136,6 +136,20 @@ def test_sensor_topic_carries_weight_and_bias_until_tared(rig: Rig) -> None:
     assert np.std(readings, axis=0) == pytest.approx([Robot().ft_noise_n] * 3, rel=0.2)
 
 
+def test_status_carries_the_means_since_the_last_one(rig: Rig) -> None:
+    rig.tick()
+    seen = []
+    for _ in range(10):
+        rig.servo(1, lbr.HOME + 0.05)
+        joints, wrench = rig.outbox["joint_states"], rig.outbox["ft/wrench"].wrench
+        seen.append([*joints.position, *joints.velocity, wrench.force.x, wrench.force.z, wrench.torque.y])
+    mean = np.mean(seen, axis=0)
+    np.testing.assert_allclose(rig.status.position, mean[:7], atol=1e-12)
+    np.testing.assert_allclose(rig.status.velocity, mean[7:14], atol=1e-12)
+    wrench = rig.status.wrench
+    np.testing.assert_allclose([wrench.force.x, wrench.force.z, wrench.torque.y], mean[14:], atol=1e-12)
+
+
 def test_obeys_torque_and_tells_it(rig: Rig) -> None:
     rig.servo(600, lbr.HOME + 0.02)
     assert rig.mode == (STATUS.MODE_ACTIVE, STATUS.CAUSE_NONE)
