@@ -111,7 +111,6 @@ class Plant:
         self._indenter = self._links["indenter"]
         self._viscous = robot.joint_damping_nms
         self._coulomb = robot.joint_friction_nm
-        self._damping = np.empty(7)
         self._origin = np.zeros(3)
         self.q: Array
         """Joint positions [rad], a fresh array at every step."""
@@ -144,13 +143,9 @@ class Plant:
         `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step.
         """
-        total = np.abs(self.v, out=self._damping)
-        np.maximum(total, STICK_RADPS, out=total)
-        np.divide(self._coulomb, total, out=total)
-        total += self._viscous
-        total += damping
-        for set_damping, value in zip(self._set_damping, total.tolist(), strict=True):
-            set_damping(value)
+        viscous, coulomb = self._viscous, self._coulomb
+        for set_damping, v, extra in zip(self._set_damping, self.v.tolist(), damping.tolist(), strict=True):
+            set_damping(viscous + extra + coulomb / max(v, -v, STICK_RADPS))
         self._arm.setForces(torque)
         self._indenter.addExtForce(force_W, self._origin, False, True)
         self._indenter.addExtTorque(moment_W, False)
