@@ -1,0 +1,75 @@
+"""A short examination through the command, distributed and composed."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from examination import SHORT, Finished, palpate_run
+
+
+@pytest.fixture(scope="module")
+def distributed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    return palpate_run("rlq_guarding", tmp_path_factory.mktemp("distributed"), settings=SHORT)
+
+
+@pytest.fixture(scope="module")
+def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    return palpate_run("rlq_guarding", tmp_path_factory.mktemp("composed"), "--composed", settings=SHORT)
+
+
+def test_it_completes(distributed: Finished) -> None:
+    assert distributed.status == 0, distributed.output
+    report = distributed.report
+    assert report["runtime"] == "distributed"
+    assert report["samples"] > 50
+    assert report["skipped_targets"] == 0
+    assert set(report["blame"]) >= {"robot", "tissue", "control", "planning", "camera", "perception", "assessment"}
+
+
+def test_depth_is_true_and_force_within_its_limit(distributed: Finished) -> None:
+    report = distributed.report
+    assert report["max_force_N"] < 15.0
+    assert report["depth_rms_error_m"] < 0.002
+    assert report["surface_rms_error_m"] < 0.001
+
+
+def test_both_lockstep_runtimes_give_the_same_run_hash(distributed: Finished, composed: Finished) -> None:
+    assert composed.status == 0, composed.output
+    assert distributed.report["run_hash"] == composed.report["run_hash"]
+    assert distributed.report["findings"] == composed.report["findings"]
+
+
+def test_the_results_folder_is_complete(distributed: Finished) -> None:
+    folder = distributed.folder
+    for name in ("report.json", "map.png", "recording.rrd", "samples.csv", "scenario.yaml"):
+        assert (folder / name).stat().st_size > 100, name
+    for role in distributed.report["blame"]:
+        assert (folder / "logs" / f"{role}.log").exists(), role
+    with (folder / "samples.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == distributed.report["samples"]
+
+
+@pytest.mark.parametrize(
+    ("options", "settings", "words"),
+    [
+        ((), ("exam.depth_m=0.5",), ("exam.depth_m", "0.5", "less than or equal to 0.02")),
+        ((), ("exam.colour=red",), ("exam.colour", "red")),
+        ((), ("phantom.mesh=missing.stl",), ("mesh",)),
+        (("--composed", "--realtime"), (), ("--composed", "--realtime")),
+    ],
+)
+def test_bad_input_ends_with_status_2_and_says_what_is_wrong(
+    tmp_path: Path, options: tuple[str, ...], settings: tuple[str, ...], words: tuple[str, ...]
+) -> None:
+    finished = palpate_run("rlq_guarding", tmp_path, *options, settings=settings)
+    assert finished.status == 2, finished.output
+    for word in words:
+        assert word in finished.output
+
+
+def test_an_unknown_scenario_is_answered_with_the_known_ones(tmp_path: Path) -> None:
+    finished = palpate_run("no_such", tmp_path)
+    assert finished.status == 2
+    assert "rlq_guarding" in finished.output
