@@ -1,11 +1,13 @@
 """The order of things on the surface: from targets to strokes, each a smooth curve in the abdomen's xy plane.
 
 Snake: lines joined by arcs, one stroke in contact. Raster: a stroke a line, retracted in between. Mode point: a stroke a
-target. A skipped target ends a stroke: what the arm can't reach it must not slide over either.
+target. A skipped target ends a stroke: what the arm can't reach it must not slide over either. So does a break: the way
+between two targets that are themselves in reach may lead out of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -62,12 +64,12 @@ def arc(p0: Array, t0: Array, p1: Array, t1: Array) -> Array:
     return np.asarray((1 - u) ** 3 * p0 + 3 * u * (1 - u) ** 2 * b1 + 3 * u**2 * (1 - u) * b2 + u**3 * p1)
 
 
-def _runs(lines: Ints, usable: Bools, *, pointwise: bool) -> list[Ints]:
+def _runs(lines: Ints, usable: Bools, breaks: Set[int], *, pointwise: bool) -> list[Ints]:
     """Unbroken runs of usable targets within one line, in order."""
     runs: list[list[int]] = []
     for i in np.flatnonzero(usable):
         joined = runs and not pointwise and runs[-1][-1] == i - 1 and lines[i - 1] == lines[i]
-        if joined:
+        if joined and i - 1 not in breaks:
             runs[-1].append(int(i))
         else:
             runs.append([int(i)])
@@ -78,7 +80,15 @@ def _direction(a: Array, b: Array) -> Array:
     return np.asarray((b - a) / max(float(np.linalg.norm(b - a)), 1e-9))
 
 
-def strokes(xy: Array, lines: Ints, usable: Bools, pattern: Pattern, mode: Mode, spacing: float) -> list[Stroke]:
+def strokes(
+    xy: Array,
+    lines: Ints,
+    usable: Bools,
+    pattern: Pattern,
+    mode: Mode,
+    spacing: float,
+    breaks: Set[int] = frozenset(),
+) -> list[Stroke]:
     """Strokes that visit all usable targets in their order.
 
     Args:
@@ -88,9 +98,10 @@ def strokes(xy: Array, lines: Ints, usable: Bools, pattern: Pattern, mode: Mode,
         pattern: joins line ends (snake) or not (raster).
         mode: continuous, or a stroke a target.
         spacing: distance of the lines [m].
+        breaks: targets after which the stroke ends.
     """
     pieces = []
-    for run in _runs(lines, usable, pointwise=mode is Mode.POINT):
+    for run in _runs(lines, usable, breaks, pointwise=mode is Mode.POINT):
         samples, visits = line_through(xy[run])
         pieces.append(Stroke(samples, run, visits))
     if pattern is not Pattern.SNAKE or mode is Mode.POINT:
@@ -99,7 +110,8 @@ def strokes(xy: Array, lines: Ints, usable: Bools, pattern: Pattern, mode: Mode,
     for piece in pieces:
         last = joined[-1] if joined else None
         near = last is not None and np.linalg.norm(piece.xy[0] - last.xy[-1]) <= JOIN_SPACINGS * spacing
-        if last is None or not near or last.targets[-1] != piece.targets[0] - 1 or min(len(last.xy), len(piece.xy)) < 2:
+        follows = last is not None and last.targets[-1] == piece.targets[0] - 1 and last.targets[-1] not in breaks
+        if last is None or not near or not follows or min(len(last.xy), len(piece.xy)) < 2:
             joined.append(piece)
             continue
         t0, t1 = _direction(last.xy[-2], last.xy[-1]), _direction(piece.xy[0], piece.xy[1])

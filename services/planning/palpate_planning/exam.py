@@ -216,8 +216,10 @@ class Exam:
 
     def _move(self, now: Observation, goal: Array) -> bool:
         """Moves to a posture: plans, then follows. Returns whether it is there. Raises NoPathError."""
+        if not self._follower.arrived:
+            return False
         if self._motion is None:
-            if float(np.abs(self._follower.q - goal).max()) < AT_HOME_RAD and self._follower.arrived:
+            if float(np.abs(self._follower.q - goal).max()) < AT_HOME_RAD:
                 return True
             start, seen = self._follower.q.copy(), self._seen
             self._motion = Thought(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen))

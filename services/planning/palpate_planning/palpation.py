@@ -23,7 +23,7 @@ TRANSFER_M = 0.015
 SLOW_M = 0.006
 """Nearer to the surface than this the indenter descends slowly."""
 DESCEND_MPS = 0.08
-PLUNGE_MPS = 0.02
+PLUNGE_MPS = 0.015
 LIFT_MPS = 0.12
 TRANSFER_MPS = 0.15
 DEPTH_ACCELERATION = 0.5

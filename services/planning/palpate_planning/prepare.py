@@ -28,8 +28,6 @@ HOVER_M = 0.025
 """Height of the sphere's deepest point above the surface between free motion and contact phase."""
 POSTURE_EVERY = 4
 """A posture is solved at every so many samples of a stroke."""
-ROUNDS = 4
-"""How often strokes are laid anew after targets dropped out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,16 +101,15 @@ class Planner:
         xy = apply(inverse(np.array(self._known.X_WA)), seen.positions)[:, :2]
         postures, skipped = self._reachable(seen, xy, q_now, contact)
         legs: list[Leg] = []
-        for _ in range(ROUNDS):
+        breaks: set[int] = set()
+        exam, troubled = self._known.exam, True
+        while troubled:  # ends: each round takes targets or joints away
             usable = np.array([i not in skipped for i in range(len(xy))], dtype=bool)
-            exam = self._known.exam
-            pieces = strokes(xy, seen.lines, usable, exam.pattern, exam.mode, exam.spacing_m)
-            legs, dropped = self._legs(seen.surface, xy, pieces, postures, contact)
+            pieces = strokes(xy, seen.lines, usable, exam.pattern, exam.mode, exam.spacing_m, breaks)
+            legs, parted, dropped = self._legs(seen.surface, pieces, postures, contact)
+            troubled = bool(parted or dropped)
+            breaks |= parted
             skipped |= dropped
-            if not dropped:
-                break
-        else:
-            raise NoPathError(f"strokes still collide after {ROUNDS} rounds of skipping: {skipped}")
         if not legs:
             reasons = "; ".join(sorted(set(skipped.values()))) or "there are none"
             raise NoPathError(f"no target is left of {len(xy)}: {reasons}")
@@ -155,59 +152,52 @@ class Planner:
         return chosen.q, skipped
 
     def _legs(
-        self, surface: Surface, xy: Array, pieces: list[Stroke], postures: Array, scene: Scene
-    ) -> tuple[list[Leg], dict[int, str]]:
-        """Strokes as paths, with transfers between them; and targets that drop out because the way to them fails."""
+        self, surface: Surface, pieces: list[Stroke], postures: Array, scene: Scene
+    ) -> tuple[list[Leg], set[int], dict[int, str]]:
+        """Strokes as paths with transfers between them; targets after which to break a stroke; targets to skip, and why."""
         legs: list[Leg] = []
+        breaks: set[int] = set()
         dropped: dict[int, str] = {}
         R = self._kinematics.pose(postures[pieces[0].targets[0]])[:3, :3] if pieces else np.eye(3)
         for k, piece in enumerate(pieces):
+            first = int(piece.targets[0])
             if k:
                 before = pieces[k - 1]
                 way = transfer(before.xy[-1], piece.xy[0])
-                ends = postures[[before.targets[-1], piece.targets[0]]]
-                visits = np.array([0, len(way) - 1])
-                path, bad = self._path(surface, way, R, ends, visits, visits, -HOVER_M, scene)
+                ends = np.array([before.targets[-1], first])
+                path, bad = self._path(surface, Stroke(way, ends, np.array([0, len(way) - 1])), R, postures, -HOVER_M, scene)
                 if bad:
-                    dropped[int(piece.targets[0])] = bad[1]
+                    dropped[first] = f"the way to it: {bad[0][1]}"
                 legs.append(Leg(path, contact=False))
                 R = path.R[-1]
-            path, bad = self._path(surface, piece.xy, R, postures[piece.targets], piece.visits, piece.targets, self._depth, scene)
-            if bad:
-                nearest = int(np.abs(piece.visits - bad[0]).argmin())
-                dropped[int(piece.targets[nearest])] = bad[1]
+            path, bad = self._path(surface, piece, R, postures, self._depth, scene)
+            for sample, why in bad:
+                after = int(np.searchsorted(piece.visits, sample, side="right")) - 1
+                if sample in piece.visits:
+                    dropped[int(piece.targets[after])] = why
+                else:
+                    breaks.add(int(piece.targets[after]))
             legs.append(Leg(path, contact=True))
             R = path.R[-1]
-        return legs, dropped
+        return legs, breaks, dropped
 
     def _path(
-        self,
-        surface: Surface,
-        xy: Array,
-        R_first: Array,
-        known: Array,
-        visits: Ints,
-        targets: Ints,
-        depth: float,
-        scene: Scene,
-    ) -> tuple[SurfacePath, tuple[int, str] | None]:
-        """A curve with postures at `depth`; and the first sample that is out of reach or collides, with the reason.
-
-        Postures follow those known at samples `visits`, shapes (m, 7) and (m,).
-        """
-        s, p, n, R = lay(surface, xy, R_first)
+        self, surface: Surface, stroke: Stroke, R_first: Array, postures: Array, depth: float, scene: Scene
+    ) -> tuple[SurfacePath, list[tuple[int, str]]]:
+        """A stroke with postures at `depth`, near those of its targets; and samples out of reach or in collision, with why."""
+        s, p, n, R = lay(surface, stroke.xy, R_first)
         centres = centre(p, n, self._radius, depth)
-        near = np.column_stack([np.interp(s, s[visits], known[:, j]) for j in range(7)])
-        failed = SurfacePath(s, p, n, R, near, targets, visits)
-        solved = np.unique(np.append(np.arange(0, len(s), POSTURE_EVERY), len(s) - 1))
+        known = postures[stroke.targets]
+        near = np.column_stack([np.interp(s, s[stroke.visits], known[:, j]) for j in range(7)])
+        solved = np.unique(np.concatenate((np.arange(0, len(s), POSTURE_EVERY), stroke.visits, [len(s) - 1])))
         q = np.empty((len(solved), 7))
+        bad: list[tuple[int, str]] = []
         for row, i in enumerate(solved):
             solution = self._kinematics.solve(pose(R[i], centres[i]), near[i], near[i])
             q[row] = solution.q
             if not solution.ok:
-                return failed, (int(i), "the way to it is out of the arm's reach")
-            if not scene.free(solution.q):
-                names = ", ".join(scene.collisions(solution.q))
-                return failed, (int(i), f"on the way the arm would collide: {names}")
+                bad.append((int(i), "out of the arm's reach"))
+            elif not scene.free(solution.q):
+                bad.append((int(i), f"the arm would collide: {', '.join(scene.collisions(solution.q))}"))
         between = np.asarray(CubicSpline(s[solved], q, bc_type="natural")(s)) if len(solved) > 1 else q
-        return SurfacePath(s, p, n, R, between, targets, visits), None
+        return SurfacePath(s, p, n, R, between, stroke.targets, stroke.visits), bad

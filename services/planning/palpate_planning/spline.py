@@ -33,8 +33,7 @@ class UniformField:
         u, v = u - i, v - j
         wu = np.array((1.0, u, u * u, u * u * u)) @ _BASIS
         wv = np.array((1.0, v, v * v, v * v * v)) @ _BASIS
-        patch = self._c[i : i + 4, j : j + 4]
-        return np.asarray(wv @ np.tensordot(wu, patch, axes=1))
+        return np.asarray(np.einsum("a,b,abm->m", wu, wv, self._c[i : i + 4, j : j + 4]))
 
     def many(self, xy: Array) -> Array:
         """Values at points of shape (n, 2): shape (n, m)."""

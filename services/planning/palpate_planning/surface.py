@@ -92,7 +92,7 @@ class Surface:
             distance = float(gap @ n_A)
             slide = gap - distance * n_A
             size = max(abs(float(slide[0])), abs(float(slide[1])))
-            if size < 1e-7 or k == iterations - 1:
+            if size < 1e-6 or k == iterations - 1:
                 break
             limit = min(1.0, 0.02 / size)
             x, y = x + limit * float(slide[0]), y + limit * float(slide[1])

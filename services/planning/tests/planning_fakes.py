@@ -1,0 +1,144 @@
+"""A world in which planning's tests close the loop: an ideal robot on set-points, a spring tissue, a perfect view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models import lbr
+from palpate_models.frames import apply
+from palpate_models.load import exam_input
+from palpate_models.scenario import Exam as ExamSettings
+from palpate_models.scenario import ExamInput, Robot, Scenario
+from palpate_planning.exam import Exam, Observation, Outcome, Phase, Unseen
+from palpate_planning.kinematics import Kinematics
+from palpate_planning.measure import Reading
+from palpate_planning.prepare import Seen
+from palpate_planning.setpoint import CARTESIAN_STIFFNESS, ControlMode, Setpoint
+from palpate_planning.surface import Surface
+from palpate_planning.weight import ToolWeight
+
+Array = NDArray[np.float64]
+MS = 1_000_000
+
+BASE = Robot(base_xy_m=(-0.08, 0.0))
+"""A placement from which all of the small regions of the tests are in reach."""
+
+
+def known(robot: Robot = BASE, **exam: object) -> ExamInput:
+    """Exam input with a small region, so that an examination takes seconds."""
+    settings = {"region_m": (0.05, 0.0375), "spacing_m": 0.0125, **exam}
+    return exam_input(Scenario(seed=3, robot=robot, exam=ExamSettings(**settings)))
+
+
+def height(xy: Array) -> Array:
+    """A dome over A's xy plane [m]."""
+    return -(xy[:, 0] ** 2) / (2 * 0.25) - xy[:, 1] ** 2 / (2 * 0.6)
+
+
+def grid_mesh(half: tuple[float, float], step: float = 0.006) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (in A) and triangles of the dome over +-half."""
+    x, y = (np.arange(-h, h + step / 2, step) for h in half)
+    xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    i = np.arange(len(x) * len(y)).reshape(len(x), len(y))
+    a, b, c, d = (k.ravel() for k in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    return np.column_stack((xy, height(xy))), np.concatenate((np.column_stack((a, b, c)), np.column_stack((a, c, d))))
+
+
+def seen_dome(settings: ExamInput) -> Seen:
+    """What a perfect perception gives: surface and targets in snake or raster order."""
+    X_WA = np.array(settings.X_WA)
+    exam = settings.exam
+    half = (exam.region_m[0] / 2 + 0.04, exam.region_m[1] / 2 + 0.04)
+    vertices, triangles = grid_mesh(half)
+    p_W = apply(X_WA, vertices)
+    surface = Surface.from_mesh(p_W, None, X_WA)
+    nx, ny = (round(size / exam.spacing_m) + 1 for size in exam.region_m)
+    xy, lines = [], []
+    for j, y in enumerate(np.linspace(-exam.region_m[1] / 2, exam.region_m[1] / 2, ny)):
+        x = np.linspace(-exam.region_m[0] / 2, exam.region_m[0] / 2, nx)
+        for value in x[:: -1 if exam.pattern == "snake" and j % 2 else 1]:
+            xy.append((value, y))
+            lines.append(j)
+    points, _ = surface.at(np.array(xy))
+    return Seen(points, np.array(lines), p_W, triangles, surface)
+
+
+def hertz(newton_at_10mm: float) -> Callable[[float], float]:
+    """Force [N] by depth [m] as facts.md has it."""
+    return lambda depth: newton_at_10mm * (max(depth, 0.0) / 0.01) ** 1.45
+
+
+class World:
+    """Closes the loop about an `Exam`, one planning period a step."""
+
+    def __init__(self, settings: ExamInput, force: Callable[[float], float] | None = None, offset: float = 0.0) -> None:
+        """`force` by true depth; the true surface lies `offset` [m] along the normal above the perceived one."""
+        self.settings, self.force, self.offset = settings, force or hertz(2.4), offset
+        self.exam = Exam(settings)
+        self.kinematics = Kinematics(settings.robot, settings.limits)
+        self.weight = ToolWeight.of(settings.robot)
+        self.bias = np.array([0.7, -0.4, 1.1, 0.02, -0.03, 0.01])
+        self.q = np.array(lbr.HOME)
+        self.dome = seen_dome(settings)
+        self.t = 0
+        self.depth = self.pressed = 0.0
+        self.answers: list[Seen | Unseen] = [self.dome]
+        self.stop, self.lost = "", ()
+        self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
+        self.setpoints: list[Setpoint] = []
+        self._answer_at: int | None = None
+        self._touch(self.kinematics.pose(self.q))
+
+    def _touch(self, X_WI: Array) -> Array:
+        """Contact force on the tool at a pose, world axes; sets true depth and force."""
+        _, n, distance = self.dome.surface.nearest(X_WI[:3, 3])
+        self.depth = self.settings.robot.indenter_radius_m - distance + self.offset
+        self.pressed = self.force(self.depth)
+        return n * self.pressed
+
+    def _obey(self, setpoint: Setpoint) -> None:
+        if setpoint.mode is ControlMode.JOINT:
+            if not setpoint.limp:
+                self.q = self.q + 0.6 * (setpoint.q - self.q)
+            return
+        for _ in range(3):  # an impedance that settles within a few steps
+            X = self.kinematics.pose(self.q)
+            pull = setpoint.F_W + self._touch(X)
+            sag = setpoint.X_WI[:3, :3] @ ((setpoint.X_WI[:3, :3].T @ pull) / CARTESIAN_STIFFNESS[:3])
+            gap = setpoint.X_WI[:3, 3] + sag - X[:3, 3]
+            turn = np.cross(X[:3, :3].T, setpoint.X_WI[:3, :3].T).sum(axis=0) / 2
+            J = self.kinematics.jacobian(self.q)
+            pinv = np.linalg.pinv(J)
+            null = (np.eye(7) - pinv @ J) @ (setpoint.q - self.q)
+            self.q = self.q + 0.25 * (pinv @ np.concatenate((gap, turn)) + null)
+
+    def step(self) -> Outcome:
+        """One planning period."""
+        X_WI, R_WS = self.kinematics.poses(self.q)
+        contact = R_WS.T @ self._touch(X_WI)
+        arm = np.array((0.0, 0.0, lbr.FT_TO_INDENTER_M))
+        wrench = np.concatenate((contact, np.cross(arm, contact))) + self.weight.wrench(R_WS) + self.bias
+        answer = None
+        if self._answer_at is not None and self.t >= self._answer_at:
+            answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
+        final = self.exam.status.phase is Phase.ASSESS
+        reading = Reading(self.q.copy(), wrench)
+        outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.lost))
+        if outcome.trigger:
+            self._answer_at = self.t + 300 * MS
+        status = self.exam.status
+        self.rows.append((status.phase, status.steady, status.force_limited, status.depth_setpoint, self.depth, self.pressed))
+        self.setpoints.append(outcome.setpoint)
+        self._obey(outcome.setpoint)
+        self.t += 10 * MS
+        return outcome
+
+    def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
+        """Steps until the exam has ended (or `until`), at most `seconds` of simulated time."""
+        ended = until or (lambda: self.exam.status.end_tick >= 0)
+        while not ended():
+            if self.t > seconds * 1e9:
+                raise AssertionError(f"not there after {seconds} s: {self.exam.status}")
+            self.step()

@@ -1,0 +1,108 @@
+"""Depth regulation in closed loop with an impedance-controlled mass, with the bus's delay, on springs soft and stiff."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from palpate_planning.depth import FORCE_FRACTION, DepthRegulator, Regulation
+from palpate_planning.setpoint import NORMAL_STIFFNESS
+
+LIMIT_N = 15.0
+DASHPOT_S = 0.05
+
+
+def hertz(newton: float) -> Callable[[float], float]:
+    return lambda depth: newton * (max(depth, 0.0) / 0.01) ** 1.45
+
+
+def indent(force: Callable[[float, float], float], seconds: float = 4.0, seed: int = 0) -> np.ndarray:
+    """Rows of time, reference, depth, force, limited of an indentation at 20 mm/s from 10 mm above to 10 mm depth.
+
+    The arm: 4 kg, K_z, damping ratio 0.8, 1 N of friction; `force` by depth and time; sensor noise; the command comes
+    into force 10 ms late and is extrapolated by its rate.
+    """
+    rng = np.random.default_rng(seed)
+    mass, damping, dt = 4.0, 2 * 0.8 * np.sqrt(NORMAL_STIFFNESS * 4.0), 1e-3
+    regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
+    regulator.reset(-0.01)
+    x, v, target = -0.01, 0.0, -0.01
+    latest: tuple[Regulation, float] | None = None
+    pending: tuple[Regulation, float] | None = None
+    depths, forces, rows = [], [], []
+    for k in range(round(seconds / dt)):
+        t = k * dt
+        F = force(x + DASHPOT_S * v if x > 0 else x, t)
+        depths.append(x)
+        forces.append(F)
+        if k % 10 == 0 and k:
+            latest = pending
+            depth, measured = float(np.mean(depths[-10:])), float(np.mean(forces[-10:])) + rng.normal(0, 0.016)
+            room = 1.0 if latest is None else np.clip((1 - latest[0].expected_force / regulator.force_max) / 0.3, 0.01, 1)
+            target = min(target + 0.0002 * room, 0.010)
+            pending = (regulator.update(target, depth, measured, measured > 0.15), t)
+            rows.append((t, pending[0].reference, depth, float(np.mean(forces[-10:])), pending[0].limited))
+        goal, rate, feed = -0.01, 0.0, 0.0
+        if latest is not None:
+            regulation, since = latest
+            goal, rate, feed = regulation.depth + regulation.rate * min(t - since, 0.03), regulation.rate, regulation.force
+        pull = NORMAL_STIFFNESS * (goal - x) + damping * (rate - v) + feed - F - np.tanh(v / 0.002)
+        v += pull / mass * dt
+        x += v * dt
+    return np.array(rows, dtype=float)
+
+
+@pytest.mark.parametrize("newton", [0.3, 1.0, 2.4, 5.0, 9.6])
+def test_depth_converges_on_soft_and_stiff_tissue(newton: float) -> None:
+    rows = indent(lambda depth, t: hertz(newton)(depth))
+    settled = rows[rows[:, 0] > 2.0]
+    assert settled[:, 2] == pytest.approx(0.010, abs=1e-4)
+    assert not settled[:, 4].any()
+
+
+@pytest.mark.parametrize("contrast", [4.0, 10.0])
+def test_sliding_into_a_lesion_keeps_depth_or_yields_below_the_limit(contrast: float) -> None:
+    def force(depth: float, t: float) -> float:
+        return hertz(2.4)(depth) * (1 + (contrast - 1) * float(np.clip((t - 2) / 0.6, 0, 1)))
+
+    rows = indent(force)
+    error = (rows[:, 1] - rows[:, 2])[rows[:, 0] > 1.8]
+    assert np.sqrt(np.mean(error**2)) < 2e-4
+    assert rows[:, 3].max() < LIMIT_N
+    end = rows[-1]
+    if contrast == 10.0:
+        assert end[4]
+        assert end[3] == pytest.approx(FORCE_FRACTION * LIMIT_N, abs=0.3)
+        assert end[2] < 0.008
+    else:
+        assert end[2] == pytest.approx(0.010, abs=1e-4)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 2.0])
+def test_a_wrong_exponent_still_ends_at_the_limit(exponent: float) -> None:
+    rows = indent(lambda depth, t: 24.0 * (max(depth, 0.0) / 0.01) ** exponent)
+    assert rows[-1, 3] <= LIMIT_N
+    assert rows[-1, 3] > 0.6 * LIMIT_N
+
+
+def test_a_hard_surface_is_not_pressed_with_more_than_the_limit_for_long() -> None:
+    rows = indent(lambda depth, t: 1e5 * max(depth, 0.0))
+    assert rows[:, 3].max() < 25.0
+    assert rows[-1, 3] < LIMIT_N
+
+
+def test_depth_is_never_commanded_beyond_its_limit() -> None:
+    regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
+    regulator.reset(0.0)
+    commands = [regulator.update(0.05, 0.0, 1.0, True).depth for _ in range(200)]
+    assert max(commands) <= 0.02
+
+
+def test_in_free_air_nothing_winds_up() -> None:
+    regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
+    regulator.reset(-0.02)
+    for _ in range(500):
+        regulation = regulator.update(-0.02, -0.018, 0.01, False)
+    assert regulation.depth == pytest.approx(-0.02)
+    assert regulation.force < 0.02

@@ -1,0 +1,218 @@
+"""The examination from home to done, in closed loop with a spring tissue and an ideal robot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from palpate_models.scenario import Mode, Pattern, Robot
+from palpate_planning.exam import Phase, Unseen
+from palpate_planning.setpoint import ControlMode
+from palpate_planning.timing import PERIOD_S
+from planning_fakes import World, hertz, known
+
+
+@pytest.fixture(scope="module")
+def snake() -> World:
+    world = World(known())
+    world.run()
+    return world
+
+
+def phases(world: World) -> list[Phase]:
+    order = [row[0] for row in world.rows]
+    return [order[0]] + [b for a, b in pairwise(order) if a is not b]
+
+
+def test_snake_goes_through_all_phases_in_order(snake: World) -> None:
+    assert phases(snake) == [
+        Phase.HOME,
+        Phase.LOOK,
+        Phase.PLAN,
+        Phase.APPROACH,
+        Phase.INDENT,
+        Phase.SCAN,
+        Phase.RETRACT,
+        Phase.RETURN,
+        Phase.ASSESS,
+        Phase.DONE,
+    ]
+    assert snake.exam.status.end_tick == snake.t - 10_000_000 + 1_000_000_000
+    assert snake.exam.status.targets_skipped == 0
+    assert snake.exam.status.target_index == snake.exam.status.target_count - 1 or snake.exam.status.target_count == 20
+
+
+def test_depth_is_true_while_samples_count(snake: World) -> None:
+    steady = np.array([(row[3], row[4]) for row in snake.rows if row[1]])
+    assert len(steady) > 500
+    assert np.sqrt(np.mean((steady[:, 1] - 0.010) ** 2)) < 3e-4
+    assert np.abs(steady[:, 1] - steady[:, 0]).max() < 1e-3
+
+
+def test_contact_is_kept_through_the_scan(snake: World) -> None:
+    assert min(row[5] for row in snake.rows if row[0] is Phase.SCAN) > 1.0
+
+
+def test_setpoints_agree_with_their_feed_forward(snake: World) -> None:
+    for a, b in pairwise(snake.setpoints):
+        if a.mode is not b.mode:
+            continue
+        if a.mode is ControlMode.JOINT:
+            assert np.abs(a.q + a.qd * PERIOD_S - b.q).max() < 2e-3
+        else:
+            step = b.X_WI[:3, 3] - a.X_WI[:3, 3] - a.V_WI[:3] * PERIOD_S
+            assert np.linalg.norm(step) < 2e-4
+
+
+def test_the_path_covers_the_targets(snake: World) -> None:
+    centres = np.array([s.X_WI[:3, 3] for s, row in zip(snake.setpoints, snake.rows, strict=True) if row[0] is Phase.SCAN])
+    for target in snake.dome.positions:
+        assert np.linalg.norm(centres - target, axis=1).min() < 0.008  # radius less depth is 5 mm
+
+
+def test_two_runs_are_the_same_to_the_bit(snake: World) -> None:
+    again = World(known())
+    again.run()
+    assert len(again.setpoints) == len(snake.setpoints)
+    for a, b in zip(snake.setpoints, again.setpoints, strict=True):
+        assert a.mode is b.mode
+        assert np.array_equal(a.X_WI, b.X_WI)
+        assert np.array_equal(a.q, b.q)
+        assert np.array_equal(a.F_W, b.F_W)
+
+
+@pytest.mark.parametrize(("pattern", "mode", "strokes"), [(Pattern.RASTER, Mode.CONTINUOUS, 4), (Pattern.SNAKE, Mode.POINT, 20)])
+def test_raster_and_points_lift_between_strokes(pattern: Pattern, mode: Mode, strokes: int) -> None:
+    world = World(known(pattern=pattern, mode=mode))
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    order = phases(world)
+    assert order.count(Phase.INDENT) == strokes
+    assert order.count(Phase.SCAN) == strokes
+
+
+def test_force_limit_makes_depth_yield() -> None:
+    world = World(known(), hertz(30.0))
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    steady = [row for row in world.rows if row[1]]
+    assert steady
+    assert all(row[2] for row in steady), "every sample is flagged"
+    assert max(row[5] for row in world.rows) < 15.0
+    assert np.median([row[5] for row in steady]) > 11.0
+    assert np.median([row[4] for row in steady]) < 0.007
+
+
+def test_hard_surface_is_pressed_with_no_more_than_the_working_limit() -> None:
+    world = World(known(region_m=(0.025, 0.0125)), lambda depth: 1e4 * max(depth, 0.0))  # ISO/TS 15066: 10 N/mm
+    world.run()
+    assert max(row[5] for row in world.rows) < 15.0
+    assert world.exam.status.phase is Phase.DONE
+
+
+def test_soft_stop_passes_over_targets_then_gives_up() -> None:
+    world = World(known())
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    world.force = lambda depth: 40.0 if depth > 0.001 else 0.0
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+    assert "soft stop" in world.exam.status.message
+    assert world.exam.status.targets_skipped >= 3
+
+
+def test_targets_out_of_reach_are_skipped_counted_and_named() -> None:
+    world = World(known(Robot(base_xy_m=(-0.25, 0.0)), region_m=(0.15, 0.0125), centre_m=(0.0, 0.0)))
+    world.run()
+    status = world.exam.status
+    assert status.phase is Phase.DONE
+    assert 0 < status.targets_skipped < status.target_count
+    assert len(world.exam.skipped) == status.targets_skipped
+    assert "reach" in next(iter(world.exam.skipped.values()))
+    assert f"{status.targets_skipped} of {status.target_count} targets skipped" in status.message
+
+
+def test_no_target_in_reach_aborts() -> None:
+    world = World(known(Robot(base_xy_m=(-0.9, 0.0))))
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+    assert "no target is left" in world.exam.status.message
+
+
+def test_blocked_view_moves_on_and_says_so() -> None:
+    world = World(known())
+    world.answers = [Unseen("view blocked by the arm"), world.dome]
+    told = []
+    while world.exam.status.phase is not Phase.PLAN:
+        world.step()
+        told.append((world.exam.status.view_blocked, world.exam.status.message))
+        assert world.t < 30e9
+    assert (True, "view blocked by the arm") in told
+    assert not world.exam.status.view_blocked
+    assert not np.allclose(world.q, world.exam._looks[0], atol=0.1)
+
+
+def test_three_blocked_views_abort() -> None:
+    world = World(known())
+    world.answers = [Unseen("view blocked by the arm")]
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+    assert "gave up after 3 looks" in world.exam.status.message
+
+
+def test_silent_perception_is_tried_again_and_given_up() -> None:
+    world = World(known())
+    world.run(lambda: world.exam.status.phase is Phase.LOOK)
+    while world.exam.status.end_tick < 0:
+        world._answer_at = None
+        world.step()
+        assert world.t < 60e9
+    assert "no answer from perception" in world.exam.status.message
+
+
+def test_safe_hold_aborts_and_holds_still() -> None:
+    world = World(known())
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    world.stop = "the driver holds safely: torque limit at lbr_A2"
+    outcome = world.step()
+    status = world.exam.status
+    assert status.phase is Phase.ABORTED
+    assert "torque limit at lbr_A2" in status.message
+    assert "SCAN" in status.message
+    assert status.end_tick == world.t - 10_000_000 + 1_000_000_000
+    assert outcome.setpoint.mode is ControlMode.JOINT
+    assert not outcome.setpoint.qd.any()
+
+
+def test_lost_assessment_in_contact_lifts_off() -> None:
+    world = World(known())
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    world.lost = ("assessment",)
+    for _ in range(100):
+        world.step()
+    assert world.pressed == 0.0
+    assert "lost assessment" in world.exam.status.message
+
+
+def test_robot_away_from_home_is_brought_there() -> None:
+    world = World(known())
+    world.q = world.q + np.array([0.4, 0.1, 0.0, 0.2, 0.0, -0.1, 0.5])
+    world.run(lambda: world.exam.status.phase is Phase.PLAN)
+    assert np.abs(world.q - world.exam._looks[0]).max() < 0.02
+
+
+def test_speed_of_the_tool_in_contact_is_the_one_asked_for(snake: World) -> None:
+    speeds = [np.linalg.norm(s.V_WI[:3]) for s, row in zip(snake.setpoints, snake.rows, strict=True) if row[0] is Phase.SCAN]
+    assert np.median(speeds) == pytest.approx(0.03, rel=0.05)
+    assert max(speeds) < 0.036
+
+
+def test_before_the_robot_is_heard_nothing_is_asked_of_it() -> None:
+    world = World(known())
+    from palpate_planning.exam import Observation
+
+    outcome = world.exam.step(Observation(0, None))
+    assert outcome.contact is None
+    assert not outcome.setpoint.joint_stiffness.any()
+    assert replace(outcome.setpoint, limp=False).joint_stiffness.all()

@@ -1,0 +1,166 @@
+"""Kinematics, collision scene, free motion and its timing."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from palpate_models import lbr
+from palpate_models.scenario import Limits, Robot
+from palpate_planning.kinematics import Kinematics
+from palpate_planning.look import look_postures
+from palpate_planning.motion import NoPathError, plan
+from palpate_planning.poses import centre, least_twist, pose
+from palpate_planning.prepare import Planner
+from palpate_planning.scene import Scene, with_skirt
+from palpate_planning.timing import JOINT_ACCELERATION, PERIOD_S, Axis, SpeedLimit, joint_trajectory, rounded
+from planning_fakes import BASE, known, seen_dome
+
+LIMITS = Limits()
+KINEMATICS = Kinematics(BASE, LIMITS)
+SEEN = seen_dome(known(region_m=(0.2, 0.2)))
+SCENE = Scene(KINEMATICS, BASE, (SEEN.vertices, SEEN.triangles))
+
+
+def above(x: float, y: float, gap: float) -> np.ndarray:
+    """A posture with the indenter's deepest point `gap` above the surface over (x, y) of A."""
+    p, n = (a[0] for a in SEEN.surface.at(np.array([[x, y]])))
+    R = least_twist(-n, KINEMATICS.pose(lbr.HOME)[:3, :3])
+    solution = KINEMATICS.solve(pose(R, centre(p, n, BASE.indenter_radius_m, -gap)), np.array(lbr.HOME))
+    assert solution.ok
+    return solution.q
+
+
+AROUND = (np.array([1.3, 0.9, 0.0, -1.2, 0.0, 1.0, 0.0]), np.array([-1.3, 0.9, 0.0, -1.2, 0.0, 1.0, 0.0]))
+"""From one side of the abdomen to the other, low: the straight motion sweeps through it."""
+
+
+def test_inverse_kinematics_meets_position_and_axis() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        q = rng.uniform(-0.7, 0.7, 7) * KINEMATICS.upper
+        X = KINEMATICS.pose(q)
+        solution = KINEMATICS.solve(X, q + rng.normal(0, 0.2, 7))
+        assert solution.ok
+        found = KINEMATICS.pose(solution.q)
+        assert found[:3, 3] == pytest.approx(X[:3, 3], abs=1e-4)
+        assert found[:3, 2] == pytest.approx(X[:3, 2], abs=1e-3)
+        assert KINEMATICS.within_limits(solution.q)
+
+
+def test_out_of_reach_is_said_not_hidden() -> None:
+    X = KINEMATICS.pose(np.array(lbr.HOME))
+    X[:3, 3] = (3.0, 0.0, 1.0)
+    solution = KINEMATICS.solve(X, np.array(lbr.HOME))
+    assert not solution.ok
+    assert solution.error_m > 1.0
+
+
+def test_jacobian_is_the_derivative_of_the_pose() -> None:
+    q, dq = above(0.0, 0.0, 0.02), np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.2, 0.1])
+    h = 1e-6
+    numeric = (KINEMATICS.pose(q + h * dq)[:3, 3] - KINEMATICS.pose(q - h * dq)[:3, 3]) / (2 * h)
+    assert (KINEMATICS.jacobian(q) @ dq)[:3] == pytest.approx(numeric, abs=1e-7)
+
+
+def test_home_is_free_and_the_table_is_not() -> None:
+    assert SCENE.free(np.array(lbr.HOME))
+    deep = np.array([0.0, 1.9, 0.0, -0.3, 0.0, 0.5, 0.0])
+    assert not SCENE.free(deep)
+    assert any("table" in pair or "abdomen" in pair for pair in SCENE.collisions(deep))
+
+
+def test_only_the_tool_may_touch_and_only_in_the_contact_phase() -> None:
+    pressed = above(0.0, 0.0, -0.010)
+    contact = Scene(KINEMATICS, BASE, (SEEN.vertices, SEEN.triangles), tool_may_touch=True)
+    assert not SCENE.free(pressed)
+    assert contact.free(pressed)
+    buried = above(0.0, 0.0, -0.10)
+    assert not contact.free(buried), "the F/T sensor's body must not touch"
+
+
+def test_skirt_closes_the_surface_down_to_the_table() -> None:
+    vertices, triangles = with_skirt(SEEN.vertices, SEEN.triangles, 0.73)
+    edges = np.sort(np.concatenate([triangles[:, (0, 1)], triangles[:, (1, 2)], triangles[:, (2, 0)]]), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    low = np.isclose(vertices[:, 2], 0.73)
+    single = np.unique(edges, axis=0)[counts == 1]
+    assert low[single].all(), "open only along the foot of the skirt"
+
+
+def test_a_free_straight_motion_is_taken_as_it_is() -> None:
+    q = above(0.03, 0.02, 0.03)
+    path = plan(SCENE, np.array(lbr.HOME), q, KINEMATICS.upper, 1)
+    assert path.shape == (2, 7)
+
+
+def test_round_an_obstacle_the_path_is_free_all_along() -> None:
+    a, b = AROUND
+    assert SCENE.free(a)
+    assert SCENE.free(b)
+    assert not SCENE.motion_free(a, b)
+    path = plan(SCENE, a, b, KINEMATICS.upper, 1)
+    assert len(path) > 2
+    assert np.array_equal(path[[0, -1]], AROUND)
+    fine = np.concatenate([np.linspace(p, q, 400) for p, q in pairwise(path)])
+    assert all(SCENE.free(q) for q in fine)
+
+
+def test_the_same_seed_gives_the_same_path_to_the_bit_and_another_another() -> None:
+    a, b = AROUND
+    paths = [plan(SCENE, a, b, KINEMATICS.upper, seed) for seed in (4, 9, 4)]
+    assert np.array_equal(paths[0], paths[2])
+    assert not np.array_equal(paths[0], paths[1])
+
+
+def test_ends_in_collision_are_named() -> None:
+    with pytest.raises(NoPathError, match=r"goal posture .* collides: .* and abdomen"):
+        plan(SCENE, np.array(lbr.HOME), above(0.0, 0.0, -0.02), KINEMATICS.upper, 0)
+
+
+@pytest.mark.parametrize("points", [(np.array(lbr.HOME), above(0.05, 0.05, 0.03)), AROUND])
+def test_timing_keeps_all_limits(points: tuple[np.ndarray, np.ndarray]) -> None:
+    path = plan(SCENE, *points, KINEMATICS.upper, 1)
+    trajectory = joint_trajectory(KINEMATICS, rounded(path), LIMITS)
+    assert trajectory.q[0] == pytest.approx(points[0], abs=1e-3)
+    assert trajectory.q[-1] == pytest.approx(points[1], abs=1e-9)
+    speed = np.abs(np.diff(trajectory.q, axis=0)) / PERIOD_S
+    assert (speed <= LIMITS.joint_velocity_scale * lbr.VELOCITY_LIMIT * 1.02).all()
+    assert (np.abs(np.diff(trajectory.qd, axis=0)) / PERIOD_S <= JOINT_ACCELERATION * 1.1).all()
+    tool = np.array([KINEMATICS.pose(q)[:3, 3] for q in trajectory.q])
+    assert np.linalg.norm(np.diff(tool, axis=0), axis=1).max() / PERIOD_S <= LIMITS.speed_mps * 1.02
+    assert trajectory.qd[-1] == pytest.approx(np.zeros(7), abs=1e-9)
+    predicted = trajectory.q[:-1] + 0.5 * PERIOD_S * (trajectory.qd[:-1] + trajectory.qd[1:])
+    assert predicted == pytest.approx(trajectory.q[1:], abs=3e-4)
+
+
+def test_rounded_and_timed_motion_of_the_planner_is_free() -> None:
+    planner = Planner(known(region_m=(0.2, 0.2)))
+    trajectory = planner.motion(*AROUND, SEEN)
+    assert all(SCENE.free(q) for q in trajectory.q)
+
+
+def test_speed_limit_brakes_ahead_of_a_slow_place() -> None:
+    s = np.linspace(0.0, 1.0, 1001)
+    limit = SpeedLimit(s, np.where(np.abs(s - 0.5) < 0.01, 0.01, 0.2), 0.1)
+    assert limit.at(0.5) == pytest.approx(0.01)
+    assert limit.at(0.1) == pytest.approx(0.2)
+    assert limit.at(0.4) == pytest.approx(np.sqrt(0.01**2 + 2 * 0.1 * 0.09), rel=0.01)
+
+
+def test_axis_moves_to_its_target_at_rest() -> None:
+    axis = Axis(0.0, 0.5, 5.0)
+    speeds = []
+    while not axis.step(0.1, 0.05):
+        speeds.append(axis.velocity)
+        assert len(speeds) < 1000
+    assert axis.position == pytest.approx(0.1)
+    assert max(speeds) <= 0.05 + 1e-9
+
+
+def test_look_postures_leave_the_view_free_and_differ() -> None:
+    postures = look_postures(known(Robot()))
+    assert len(postures) >= 3
+    assert np.array_equal(postures[0], lbr.HOME)
+    assert all(np.abs(a - b).max() > 0.5 for i, a in enumerate(postures) for b in postures[:i])
