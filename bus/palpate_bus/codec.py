@@ -14,6 +14,8 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from palpate_bus import cdr
+
 Message = Any
 """A message instance. Message classes are generated at run time from .msg files, so they have no static type."""
 
@@ -69,31 +71,73 @@ def type_hash(name: str) -> str:
     return str(store.hash_rihs01(name))
 
 
+@cache
+def _fast(name: str) -> cdr.Codec:
+    """The generated codec of a type. Raises KeyError if it has a field that only rosbags knows how to encode."""
+    return cdr.generate(store, name, _fast)
+
+
 def encode(message: Message, name: str) -> bytes:
     """A message as little-endian CDR. Raises CodecError if a field does not fit its type."""
-    try:
-        return bytes(store.serialize_cdr(message, name))
-    except Exception as error:
-        raise CodecError(f"{name}: cannot encode: {error}") from error
+    return encoder(name)(message)
 
 
 def decode(payload: bytes | memoryview, name: str) -> Message:
     """The message in CDR bytes. Arrays may be read-only views of `payload`. Raises CodecError on anything malformed."""
-    try:
-        return store.deserialize_cdr(payload, name)
-    except Exception as error:
-        raise CodecError(f"{name}: cannot decode {len(payload)} bytes: {error!r}") from error
+    return decoder(name)(payload)
 
 
 @cache
 def encoder(name: str) -> Callable[[Message], bytes]:
     """`encode` for one type, for hot paths."""
     message_type(name)
-    return lambda message: encode(message, name)
+    try:
+        fast = _fast(name).encode
+    except KeyError:
+        return lambda message: _rosbags_encode(message, name)
+
+    def encode_one(message: Message) -> bytes:
+        try:
+            return fast(message, 0, cdr.HEADER)
+        except Exception as error:
+            raise CodecError(f"{name}: cannot encode: {error}") from error
+
+    return encode_one
 
 
 @cache
-def decoder(name: str) -> Callable[[bytes], Message]:
+def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
     """`decode` for one type, for hot paths."""
     message_type(name)
-    return lambda payload: decode(payload, name)
+    try:
+        fast = _fast(name).decode
+    except KeyError:
+        return lambda payload: _rosbags_decode(payload, name)
+
+    def decode_one(payload: bytes | memoryview) -> Message:
+        data = payload if payload.__class__ is bytes else bytes(payload)
+        if data[:2] != b"\x00\x01":
+            return _rosbags_decode(data, name)  # big-endian, or no CDR at all
+        try:
+            message, end = fast(data, 4)
+        except Exception as error:
+            raise CodecError(f"{name}: cannot decode {len(data)} bytes: {error}") from error
+        if not 0 <= len(data) - end < 4:  # some encoders pad the end to a multiple of four
+            raise CodecError(f"{name}: {len(data)} bytes, but the message ends at {end}")
+        return message
+
+    return decode_one
+
+
+def _rosbags_encode(message: Message, name: str) -> bytes:
+    try:
+        return bytes(store.serialize_cdr(message, name))
+    except Exception as error:
+        raise CodecError(f"{name}: cannot encode: {error}") from error
+
+
+def _rosbags_decode(payload: bytes | memoryview, name: str) -> Message:
+    try:
+        return store.deserialize_cdr(payload, name)
+    except Exception as error:
+        raise CodecError(f"{name}: cannot decode {len(payload)} bytes: {error!r}") from error

@@ -1,0 +1,150 @@
+"""The codec: the bytes are those of rosbags, every message survives the round trip, and no bytes do worse than a CodecError."""
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from palpate_bus import codec
+from palpate_bus.contract import contract
+from palpate_bus.messages import Advance, JointTorqueCommand
+from palpate_bus.stamps import duration_message, header
+from palpate_bus.strategies import messages
+
+TYPES = sorted(
+    {row.type for row in contract().topics.values()}
+    | {row.type for row in contract().internal.values()}
+    | set(codec.palpation_definitions())
+    # Shapes that our rows do not have: arrays of messages and of strings, bytes, eight-byte numbers behind one-byte ones.
+    | {"visualization_msgs/msg/Marker", "std_msgs/msg/ByteMultiArray", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Char"}
+    | {"shape_msgs/msg/SolidPrimitive", "trajectory_msgs/msg/JointTrajectory", "geometry_msgs/msg/PolygonStamped"}
+    | {"std_msgs/msg/Empty", "std_msgs/msg/Int64MultiArray", "rcl_interfaces/msg/ParameterValue"}
+)
+FAST = settings(max_examples=30, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_every_type_has_generated_code(name: str) -> None:
+    assert codec._fast(name).least_size >= 1
+
+
+@pytest.mark.parametrize("name", TYPES)
+@FAST
+@given(data=st.data())
+def test_bytes_are_those_of_rosbags_and_decode_to_the_same_message(name: str, data: st.DataObject) -> None:
+    message = data.draw(messages(name))
+    expected = bytes(codec.store.serialize_cdr(message, name))
+    encoded = codec.encode(message, name)
+    assert encoded == expected
+    decoded = codec.decode(encoded, name)
+    assert type(decoded) is codec.message_type(name)
+    assert bytes(codec.store.serialize_cdr(decoded, name)) == expected
+    assert codec.encode(decoded, name) == expected
+    # Others may send big-endian.
+    big = bytes(codec.store.serialize_cdr(message, name, little_endian=False))
+    assert codec.encode(codec.decode(big, name), name) == expected
+
+
+@pytest.mark.parametrize("name", TYPES)
+@FAST
+@given(data=st.data())
+def test_broken_messages_raise_codec_error_at_most(name: str, data: st.DataObject) -> None:
+    payload = bytearray(codec.encode(data.draw(messages(name)), name))
+    payload = payload[: data.draw(st.integers(0, len(payload)))]
+    for _ in range(data.draw(st.integers(0, 4))):
+        if payload:
+            payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    broken = bytes(payload) + data.draw(st.binary(max_size=9))
+    try:
+        message = codec.decode(broken, name)
+    except codec.CodecError:
+        return
+    assert codec.decode(codec.encode(message, name), name) is not None
+
+
+@pytest.mark.parametrize("name", TYPES)
+@FAST
+@given(payload=st.binary(max_size=200))
+@example(payload=b"")
+@example(payload=b"\x00\x01\x00\x00")
+@example(payload=b"\x00\x01\x00\x00" + b"\xff" * 64)
+@example(payload=b"\x00\x00\x00\x00" + b"\xff" * 64)
+@example(payload=b"\x00\x01\x00\x00" + b"\x00" * 400)
+def test_garbage_raises_codec_error_at_most(name: str, payload: bytes) -> None:
+    for data in (payload, b"\x00\x01\x00\x00" + payload, memoryview(payload)):
+        try:
+            codec.decode(data, name)
+        except codec.CodecError as error:
+            assert name in str(error)
+
+
+@pytest.mark.parametrize("length", [2**31, 2**32 - 1])
+@pytest.mark.parametrize(
+    "name", ["palpation_msgs/msg/SurfaceMesh", "tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticStatus"]
+)
+def test_a_length_bomb_allocates_nothing(name: str, length: int) -> None:
+    import tracemalloc
+
+    bomb = b"\x00\x01\x00\x00" + length.to_bytes(4, "little") * 400
+    tracemalloc.start()
+    with pytest.raises(codec.CodecError):
+        codec.decode(bomb, name)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1_000_000
+
+
+def test_trailing_padding_is_accepted_and_trailing_data_is_not() -> None:
+    payload = codec.encode(Advance(5, np.zeros(1, np.uint32)), "palpation_msgs/msg/Advance")
+    assert codec.decode(payload + b"\0\0\0", "palpation_msgs/msg/Advance").tick == 5
+    with pytest.raises(codec.CodecError, match="ends at"):
+        codec.decode(payload + bytes(4), "palpation_msgs/msg/Advance")
+
+
+@pytest.mark.parametrize(
+    ("torque", "reason"),
+    [
+        (np.zeros(6), "torque: has shape"),
+        (np.array(["a"] * 7), "torque: has"),
+        (np.zeros(7, complex), "torque: has complex128"),
+        (None, "torque: has object"),
+    ],
+)
+def test_a_field_that_does_not_fit_is_named(torque: object, reason: str) -> None:
+    message = JointTorqueCommand(header(0), torque, duration_message(0))
+    with pytest.raises(codec.CodecError, match=f"palpation_msgs/msg/JointTorqueCommand.*{reason}"):
+        codec.encode(message, "palpation_msgs/msg/JointTorqueCommand")
+
+
+@pytest.mark.parametrize(
+    "torque", [list(range(7)), np.arange(7), np.arange(7, dtype=np.float32), np.arange(14.0)[::2] / 2, np.arange(7, dtype=">f8")]
+)
+def test_numbers_of_another_kind_or_layout_are_converted(torque: object) -> None:
+    name = "palpation_msgs/msg/JointTorqueCommand"
+    decoded = codec.decode(codec.encode(JointTorqueCommand(header(0), torque, duration_message(0)), name), name)
+    np.testing.assert_array_equal(decoded.torque, np.arange(7.0))
+
+
+def test_large_strided_arrays_are_encoded_in_order() -> None:
+    from palpate_bus.messages import SurfaceMesh
+
+    vertices = np.arange(6000, dtype=np.float32)
+    mesh = SurfaceMesh(header(0), vertices[::2], vertices[:0], np.arange(3, dtype=np.uint32))
+    name = "palpation_msgs/msg/SurfaceMesh"
+    np.testing.assert_array_equal(codec.decode(codec.encode(mesh, name), name).vertices, vertices[::2])
+
+
+def test_decoded_names_are_not_shared_between_messages() -> None:
+    from palpate_bus.messages import JointState
+
+    empty = np.zeros(0)
+    name = "sensor_msgs/msg/JointState"
+    payload = codec.encode(JointState(header(0), ["a", "bc"], empty, empty, empty), name)
+    first = codec.decode(payload, name)
+    first.name.append("changed")
+    assert codec.decode(payload, name).name == ["a", "bc"]
+
+
+def test_unknown_type_is_named() -> None:
+    for call in (lambda: codec.encoder("no/msg/Such"), lambda: codec.decode(b"", "no/msg/Such"), lambda: codec.type_hash("x")):
+        with pytest.raises(codec.CodecError, match="no such message type"):
+            call()
