@@ -1,0 +1,230 @@
+"""Scans without a robot: a sphere slid over the real tissue along a snake, with the errors that measuring has.
+
+`python bench_assessment_scans.py [SEEDS]` prints what the assessment makes of many phantoms: the figures of the README.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_assessment.service import AssessmentService
+from palpate_bus.codec import message_type
+from palpate_bus.messages import ExamState, SurfaceMesh
+from palpate_bus.stamps import header
+from palpate_conductor.evidence import centroids_of, map_of
+from palpate_conductor.scoring import Scores, Truth, score
+from palpate_models.frames import apply, matrix
+from palpate_models.load import exam_input
+from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.phantom.field import gaussian_field
+from palpate_models.scenario import Lesion, Phantom, Scenario
+from palpate_tissue.tissue import Tissue
+from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.signal import lfilter
+
+Array = NDArray[np.float64]
+
+_Point: Any = message_type("geometry_msgs/msg/Point")
+_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
+
+SURFACE_SD, SURFACE_LENGTH = 0.0004, 0.012
+"""Error of the perceived surface [m] and its correlation length: perception's own figures."""
+CONTROL_SD, CONTROL_S = 0.0003, 0.2
+"""Depth error of the regulation [m] and its correlation time [s]."""
+FORCE_SD = 0.03
+"""Noise of the force at 100 Hz [N]."""
+
+
+class FakeInbox:
+    """What a step receives, by topic."""
+
+    def __init__(self, messages: dict[str, list[Any]]) -> None:
+        self._messages = messages
+
+    def new(self, topic: str) -> list[Any]:
+        return self._messages.get(topic, [])
+
+    def latest(self, topic: str) -> Any | None:
+        return (self._messages.get(topic) or [None])[-1]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Measured states of one examination, and the truth."""
+
+    scenario: Scenario
+    surface: Any
+    """`perception/surface`."""
+    states: list[Any]
+    """`exam/state` each 10 ms, the last in phase ASSESS."""
+    truth: Truth
+
+
+def phantom_truth(model: PhantomModel, X_WA: Array) -> Truth:
+    return Truth(model.vertices, model.triangles, model.stiffness, model.background, model.lesion, X_WA)
+
+
+def snake(region: tuple[float, float], spacing: float, speed: float, dt: float) -> Iterator[tuple[Array, Array]]:
+    """Strokes of a snake over a region about the umbilicus: times [s] and xy [m] of each, forth and back."""
+    width, height = region
+    lines = round(height / spacing) + 1
+    t = 0.0
+    for i, y in enumerate(np.linspace(-0.5 * height, 0.5 * height, lines)):
+        n = round(width / speed / dt)
+        x = np.linspace(-0.5 * width, 0.5 * width, n) * (1 if i % 2 == 0 else -1)
+        yield t + dt * np.arange(n), np.column_stack((x, np.full(n, y)))
+        t += n * dt + 0.6
+
+
+def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | None = None) -> Scan:
+    """Slides the indenter over a scenario's phantom at the examination's depth; `errors` scales all that is wrong."""
+    exam, robot = scenario.exam, scenario.robot
+    X_WA = matrix(scenario.phantom.pose.true)
+    model = build_phantom(scenario.phantom, scenario.seed)
+    tissue = Tissue(model, scenario.phantom.stiffness)
+    rng = np.random.Generator(np.random.PCG64(scenario.seed + 1000))
+    near = (np.abs(model.vertices[:, :2]) < 0.15).all(axis=1) & (model.normals[:, 2] > 0.2)
+    height = CloughTocher2DInterpolator(model.vertices[near, :2], model.vertices[near, 2])
+
+    def shape(xy: Array) -> tuple[Array, Array]:
+        h = 0.002
+        zx = (height(xy + (h, 0)) - height(xy - (h, 0))) / (2 * h)
+        zy = (height(xy + (0, h)) - height(xy - (0, h))) / (2 * h)
+        n = np.column_stack((-zx, -zy, np.ones(len(xy))))
+        return np.column_stack((xy, height(xy))), n / np.linalg.norm(n, axis=1, keepdims=True)
+
+    def wrong(p: Array) -> Array:
+        flat = np.column_stack((p[:, :2], np.zeros(len(p))))
+        return errors * SURFACE_SD * gaussian_field(flat, SURFACE_LENGTH, scenario.seed + 777)
+
+    grid = np.arange(-0.125, 0.1251, 0.005)
+    xy = np.column_stack([a.ravel() for a in np.meshgrid(grid, grid)])
+    p, n = shape(xy)
+    perceived = p + n * wrong(p)[:, None]
+    surface = SurfaceMesh(header(0, "world"), apply(X_WA, perceived).astype(np.float32).ravel(), np.empty(0, np.float32), np.empty(0, np.uint32))
+    states: list[Any] = []
+    zero = np.zeros(3)
+    for times, path in snake(region or exam.region_m, exam.spacing_m, exam.speed_mps, tissue.dt):
+        p, n = shape(path)
+        off = wrong(p)
+        decay = np.exp(-tissue.dt / CONTROL_S)
+        drive = rng.standard_normal(len(times)) * CONTROL_SD * errors * np.sqrt(1 - decay**2)
+        wanted = exam.depth_m * np.minimum(1.0, (times - times[0]) / 0.3)
+        measured = wanted + lfilter([1.0], [1.0, -decay], drive)
+        # depth yields to the working force limit, as planning does it
+        centre = p + n * (robot.indenter_radius_m - (measured - off))[:, None]
+        velocity = np.gradient(centre, tissue.dt, axis=0)
+        force = np.zeros(len(times))
+        for k, t in enumerate(times):
+            F, _ = tissue.step(float(t), centre[k], velocity[k], robot.indenter_radius_m)
+            force[k] = F @ n[k]
+        for k in range(9, len(times), 10):
+            F = float(force[k - 9 : k + 1].mean()) + errors * FORCE_SD * float(rng.standard_normal())
+            steady = bool(times[k] - times[0] > 0.4)
+            states.append(_state(times[k], p[k], n[k], float(measured[k]), F, steady, X_WA))
+        for k in range(600):
+            tissue.step(float(times[-1] + tissue.dt * k), p[-1] + n[-1] * 0.1, zero, robot.indenter_radius_m)
+        states.append(_state(times[-1] + 0.05, p[-1], n[-1], -0.08, 0.0, False, X_WA))
+    states.append(_state(times[-1] + 1.0, p[-1], n[-1], -0.08, 0.0, False, X_WA, phase=ExamState.PHASE_ASSESS))
+    return Scan(scenario, surface, states, phantom_truth(model, X_WA))
+
+
+def _state(t: float, p: Array, n: Array, depth: float, force: float, steady: bool, X_WA: Array, phase: int = ExamState.PHASE_SCAN) -> Any:
+    p_W = apply(X_WA, p[None])[0]
+    n_W = X_WA[:3, :3] @ n
+    return ExamState(
+        header=header(round(t * 1e9), "world"),
+        phase=phase,
+        message="",
+        target_index=0,
+        target_count=0,
+        targets_skipped=0,
+        in_contact=force > 0.2,
+        steady=steady,
+        force_limited=False,
+        view_blocked=False,
+        depth_setpoint=0.01,
+        depth=depth,
+        normal_force=force,
+        surface_point=_Point(*map(float, p_W)),
+        surface_normal=_Vector3(*map(float, n_W)),
+        end_tick=-1,
+    )
+
+
+def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
+    """Drives the service with a scan: its last map, its findings, and all samples."""
+    service = AssessmentService(exam_input(data.scenario))
+    stiffness_map = findings = None
+    samples: list[Any] = []
+    surface = [data.surface]
+    for state in data.states:
+        t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
+        outbox = service.step(t, FakeInbox({"exam/state": [state], "perception/surface": surface}))
+        surface = []
+        samples += outbox.get("assessment/samples", [])
+        stiffness_map = outbox.get("assessment/map", stiffness_map)
+        findings = outbox.get("assessment/findings", findings)
+    return stiffness_map, findings, samples
+
+
+def scored(data: Scan) -> Scores:
+    """The scores of what the service makes of a scan."""
+    stiffness_map, findings, _ = examine(data)
+    return score(centroids_of(findings), None if stiffness_map is None else map_of(stiffness_map), data.truth)
+
+
+def scenario_with(lesions: tuple[Lesion, ...], seed: int) -> Scenario:
+    """A scenario of the default abdomen with given lesions."""
+    return Scenario(seed=seed, phantom=Phantom(lesions=lesions))
+
+
+def random_lesion(seed: int) -> Lesion:
+    """A lesion anywhere in the examined region, of 20 to 40 mm radius and contrast 2.5 to 5."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    radii = rng.uniform(0.02, 0.04, 2)
+    x, y = rng.uniform(-0.1 + radii.max(), 0.1 - radii.max(), 2)
+    return Lesion(
+        centre_m=(float(x), float(y)), radii_m=(float(radii[0]), float(radii[1])), contrast=float(rng.uniform(2.5, 5))
+    )
+
+
+def main(seeds: int) -> None:
+    """Prints a row a scan, and the means of each kind."""
+    rlq = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.035, 0.030), contrast=4.0)
+    right = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.03, 0.03), contrast=4.0)
+    left = Lesion(centre_m=(0.055, 0.055), radii_m=(0.025, 0.025), contrast=3.5)
+    kinds = {
+        "healthy": lambda seed: (),
+        "rlq": lambda seed: (rlq,),
+        "two": lambda seed: (right, left),
+        "anywhere": lambda seed: (random_lesion(seed),),
+    }
+    for kind, lesions in kinds.items():
+        rows = []
+        for seed in range(seeds):
+            begin = time.process_time()
+            s = scored(scan(scenario_with(lesions(seed), seed)))
+            rows.append(s)
+            print(f"{kind:9} {seed:3}  {s}  {time.process_time() - begin:.1f} s", flush=True)
+        errors = [s.localisation_error_m for s in rows if s.localisation_error_m is not None]
+        dices = [s.dice for s in rows if s.dice is not None]
+        print(
+            f"== {kind}: {seeds} scans, missed {sum(s.missed for s in rows)}, "
+            f"false positives {sum(s.false_positives for s in rows)}, "
+            f"localisation {1e3 * np.mean(errors or [np.nan]):.1f} mm (worst {1e3 * np.max(errors or [np.nan]):.1f}), "
+            f"Dice {np.mean(dices or [np.nan]):.3f} (worst {np.min(dices or [np.nan]):.3f}), "
+            f"coverage {np.mean([s.coverage_90 for s in rows]):.3f} "
+            f"({np.min([s.coverage_90 for s in rows]):.2f} to {np.max([s.coverage_90 for s in rows]):.2f})",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5)
