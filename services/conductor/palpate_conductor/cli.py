@@ -13,10 +13,11 @@ from palpate_models.load import ScenarioError, load_scenario, scenario_names
 from rich.console import Console
 from rich.table import Table
 
-from palpate_conductor.processes import ProcessListError
-from palpate_conductor.progress import RunDisplay
 from palpate_conductor.bench import bench as run_bench
 from palpate_conductor.conductor import RunFailed
+from palpate_conductor.processes import ProcessListError
+from palpate_conductor.progress import RunDisplay
+from palpate_conductor.report import print_findings, write_results
 from palpate_conductor.run import OBSERVERS, run_composed, run_distributed
 
 EXIT_BAD_INPUT = 2
@@ -132,14 +133,6 @@ def bench(
 ) -> None:
     """Measure the bus, the parts of a tick and whole runs; print tables and write bench.json."""
     run_bench(scenario, out, Console())
-
-
-@app.command()
-def router(
-    listen: Annotated[str, typer.Option(help="Endpoint to listen on.")] = "tcp/127.0.0.1:7447",
-) -> None:
-    """Run a zenoh router for services in containers or on several machines."""
-    run_router([listen])
 
 
 def main() -> None:
