@@ -32,7 +32,7 @@ LOOKS_MAX = 3
 REST = 200 * MS
 """Time at rest before looking or taring [ns]: the arm's oscillations fade."""
 TARE = 300 * MS
-"""Time of taring [ns]: 300 readings of 0.05 N noise leave 3 mN."""
+"""Time of taring [ns]: 30 means over 10 ms of 0.05 N noise leave 3 mN."""
 LOOK_PATIENCE = 3 * SECOND
 """How long perception may take beyond the burst."""
 FRAME = 100 * MS

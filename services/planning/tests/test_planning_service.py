@@ -1,0 +1,218 @@
+"""The service: contract's messages in and out, encoded and decoded as on the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from palpate_bus import codec
+from palpate_bus.contract import contract
+from palpate_bus.messages import (
+    Findings,
+    OperatorRequest,
+    PalpationTargets,
+    RobotStatus,
+    SurfaceMesh,
+)
+from palpate_bus.stamps import header, nanoseconds
+from palpate_models import lbr
+from palpate_models.scenario import Exam, Scenario
+from palpate_planning.exam import Outcome, Phase
+from palpate_planning.messages import pose_message
+from palpate_planning.service import PlanningService, create
+from palpate_planning.setpoint import ControlMode, Setpoint
+from planning_fakes import BASE, World, known
+from scipy.spatial.transform import Rotation
+
+Vector3 = codec.message_type("geometry_msgs/msg/Vector3")
+Point = codec.message_type("geometry_msgs/msg/Point")
+Wrench = codec.message_type("geometry_msgs/msg/Wrench")
+OUTPUTS = {topic.name: topic for topic in contract().outputs("planning")}
+
+
+class FakeInbox:
+    """Messages by topic, as a step sees them."""
+
+    def __init__(self) -> None:
+        self.fresh: dict[str, list[Any]] = {}
+        self.last: dict[str, Any] = {}
+        self.gone: set[str] = set()
+
+    def put(self, topic: str, message: Any) -> None:
+        type_name = contract().topics[topic].type
+        message = codec.decode(codec.encode(message, type_name), type_name)
+        self.fresh.setdefault(topic, []).append(message)
+        self.last[topic] = message
+
+    def latest(self, topic: str) -> Any:
+        return self.last.get(topic)
+
+    def new(self, topic: str) -> Iterable[Any]:
+        return self.fresh.get(topic, [])
+
+    def stamp(self, topic: str) -> int | None:
+        message = self.last.get(topic)
+        return None if message is None else nanoseconds(message.header.stamp)
+
+    def lost(self, role: str) -> bool:
+        return role in self.gone
+
+
+def status(t: int, q: np.ndarray, w: np.ndarray, mode: int = RobotStatus.MODE_ACTIVE, reason: str = "") -> Any:
+    """The robot's status with mean joint positions and F/T reading."""
+    force, torque = (Vector3(*map(float, part)) for part in (w[:3], w[3:]))
+    zero = np.zeros(7)
+    return RobotStatus(header(t), mode, 0, reason, np.array(q), zero, Wrench(force, torque), zero, 0)
+
+
+def sent(outbox: Any) -> dict[str, Any]:
+    """The outbox after its way over the bus; fails where a message does not fit its type or its ranges."""
+    out = {}
+    for name, message in outbox.items():
+        topic = OUTPUTS[name]
+        out[name] = codec.decode(codec.encode(message, topic.type), topic.type)
+        assert not topic.frame or message.header.frame_id == topic.frame
+    assert {name for name, topic in OUTPUTS.items() if topic.periodic} <= out.keys()
+    return out
+
+
+def within_ranges(message: Any, topic: str) -> None:
+    for field, (low, high) in contract().topics[topic].ranges.items():
+        value = message
+        for part in field.split("."):
+            value = getattr(value, part, None)
+        if hasattr(value, "x"):
+            value = (value.x, value.y, value.z)
+        if value is not None and not isinstance(value, list):
+            assert (np.asarray(value) >= low).all(), (topic, field, value)
+            assert (np.asarray(value) <= high).all(), (topic, field, value)
+
+
+class BusWorld(World):
+    """The closed loop with messages between world and service."""
+
+    def __init__(self) -> None:
+        settings = known(region_m=(0.025, 0.0125))
+        super().__init__(settings)
+        self.service = PlanningService(settings)
+        self.exam = self.service._exam
+        self.inbox = FakeInbox()
+        self.states: list[Any] = []
+        self.events: list[str] = []
+
+    def step(self) -> Outcome:
+        inbox, t = self.inbox, self.t
+        inbox.fresh = {}
+        X_WI, R_WS = self.kinematics.poses(self.q)
+        contact = R_WS.T @ self._touch(X_WI)
+        w = np.concatenate((contact, np.zeros(3))) + self.weight.wrench(R_WS) + self.bias
+        inbox.put("robot/status", status(t, self.q, w))
+        if self._answer_at is not None and t >= self._answer_at:
+            self._answer_at = None
+            mesh, found = self.dome, self.dome.positions
+            flat = np.ascontiguousarray(mesh.vertices, dtype=np.float32).ravel()
+            triangles = np.ascontiguousarray(mesh.triangles, dtype=np.uint32).ravel()
+            inbox.put("perception/surface", SurfaceMesh(header(t, "world"), flat, np.zeros(0, dtype=np.float32), triangles))
+            normals = [Vector3(0.0, 0.0, 1.0)] * len(found)
+            points = [Point(*map(float, p)) for p in found]
+            lines = np.asarray(mesh.lines, dtype=np.uint32)
+            inbox.put("perception/targets", PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, ""))
+        if self.exam.status.phase is Phase.ASSESS:
+            inbox.put("assessment/findings", Findings(header(t, "abdomen"), [], True))
+        out = sent(self.service.step(t, inbox))
+        self.states.append(out["exam/state"])
+        self.events += [name for name in out if not OUTPUTS[name].periodic]
+        for name in ("planning/setpoint", "exam/state"):
+            assert nanoseconds(out[name].header.stamp) == t
+            within_ranges(out[name], name)
+        if "planning/camera_trigger" in out:
+            assert out["planning/camera_trigger"].frames == self.settings.camera.frames
+            self._answer_at = t + 300_000_000
+        self._obey(setpoint(out["planning/setpoint"]))
+        self.t += 10_000_000
+        return None  # type: ignore[return-value]
+
+
+def setpoint(m: Any) -> Setpoint:
+    """A set-point message as arrays."""
+    o, p, v, w, f = m.pose.orientation, m.pose.position, m.twist.linear, m.twist.angular, m.wrench.force
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_quat((o.x, o.y, o.z, o.w)).as_matrix()
+    X[:3, 3] = p.x, p.y, p.z
+    return Setpoint(
+        ControlMode(m.mode),
+        X,
+        np.array(m.joint_position),
+        np.array((v.x, v.y, v.z, w.x, w.y, w.z)),
+        np.array((f.x, f.y, f.z)),
+        np.array(m.joint_velocity),
+        limp=m.mode == 1 and not np.any(m.joint_stiffness),
+    )
+
+
+def test_an_examination_over_messages() -> None:
+    world = BusWorld()
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert world.events == ["planning/camera_trigger", "planning/path"]
+    assert [s.phase for s in world.states if s.end_tick >= 0] == [Phase.DONE]
+    steady = [s for s in world.states if s.steady]
+    assert steady
+    assert all(s.in_contact and s.phase == Phase.SCAN for s in steady)
+    assert [s.depth for s in steady] == pytest.approx([0.010] * len(steady), abs=1e-3)
+    assert [s.normal_force for s in steady] == pytest.approx([2.4] * len(steady), rel=0.1)
+    facts = world.service.finish()
+    assert facts["phase"] == "DONE"
+    assert facts["skipped_targets"] == {}
+    assert facts["peak_force_N"] < 4.0
+
+
+def test_the_first_step_asks_the_arm_for_nothing() -> None:
+    service = create(Scenario(robot=BASE, exam=Exam()))
+    out = sent(service.step(0, FakeInbox()))
+    assert out["planning/setpoint"].mode == ControlMode.JOINT
+    assert not np.any(out["planning/setpoint"].joint_stiffness)
+    assert nanoseconds(out["planning/setpoint"].valid_for) == 250_000_000
+    assert out["exam/state"].phase == Phase.HOME
+    assert out["exam/state"].end_tick == -1
+
+
+def test_the_arm_is_held_where_it_was_found() -> None:
+    service = create(Scenario(robot=BASE))
+    inbox = FakeInbox()
+    q = np.array(lbr.HOME) + 0.2
+    inbox.put("robot/status", status(0, q, np.zeros(6)))
+    out = sent(service.step(0, inbox))
+    assert np.array(out["planning/setpoint"].joint_position) == pytest.approx(q, abs=1e-12)
+    assert np.all(out["planning/setpoint"].joint_stiffness > 0)
+
+
+@pytest.mark.parametrize("cause", ["hold", "operator", "robot"])
+def test_holds_stops_and_losses_abort(cause: str) -> None:
+    service = create(Scenario(robot=BASE))
+    inbox = FakeInbox()
+    q = np.array(lbr.HOME)
+    inbox.put("robot/status", status(0, q, np.zeros(6)))
+    service.step(10_000_000, inbox)
+    inbox.fresh = {}
+    if cause == "hold":
+        hold = status(10_000_000, q, np.zeros(6), RobotStatus.MODE_SAFE_HOLD, "force 41 N, limit 40 N")
+        inbox.put("robot/status", hold)
+    elif cause == "operator":
+        inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
+    else:
+        inbox.gone.add("robot")
+    state = sent(service.step(20_000_000, inbox))["exam/state"]
+    assert state.phase == Phase.ABORTED
+    assert {"hold": "force 41 N", "operator": "enough", "robot": "lost robot"}[cause] in state.message
+    assert state.end_tick == 1_020_000_000
+
+
+def test_pose_message_round_trip() -> None:
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_rotvec((0.1, -2.0, 0.7)).as_matrix()
+    message = pose_message(X)
+    o = message.orientation
+    assert Rotation.from_quat((o.x, o.y, o.z, o.w)).as_matrix() == pytest.approx(X[:3, :3], abs=1e-12)
