@@ -1,0 +1,162 @@
+"""How processes find each other: options, meshes, routers, and sessions that end in order."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from queue import Empty, SimpleQueue
+
+import pytest
+import zenoh
+from palpate_bus.zenoh_config import BusConfigError, BusOptions, close_session, mesh, open_session, session, zenoh_config
+
+
+def heard(publisher: zenoh.Session, subscriber: zenoh.Session, payload: bytes = b"x", key: str = "test/key") -> bytes | None:
+    """What the subscriber gets within ten seconds of sending, sent again and again."""
+    queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    declared = subscriber.declare_subscriber(key, zenoh.handlers.Callback(queue.put, indirect=False))
+    end = time.monotonic() + 10
+    try:
+        while time.monotonic() < end:
+            publisher.put(key, payload)
+            try:
+                return queue.get(timeout=0.05).payload.to_bytes()
+            except Empty:
+                continue
+        return None
+    finally:
+        declared.undeclare()
+
+
+def test_options_survive_the_environment() -> None:
+    options = BusOptions(("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"), ("tcp/h:3",), "tcp/r:7447", lowlatency=True, shared_memory=False)
+    assert BusOptions.from_env(options.to_env()) == options
+    assert BusOptions.from_env({}) == BusOptions()
+
+
+def test_wall_clock_neither_waits_long_nor_uses_the_low_latency_transport() -> None:
+    options = BusOptions.from_env({"PALPATE_LOWLATENCY": "1", "PALPATE_RUNTIME": "wallclock"})
+    assert not options.lowlatency
+    assert options.drop_wait_us < BusOptions().drop_wait_us
+    assert BusOptions.from_env({"PALPATE_LOWLATENCY": "1", "PALPATE_RUNTIME": "lockstep"}).lowlatency
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ({"PALPATE_MODE": "boss"}, "PALPATE_MODE is 'boss'; allowed are peer, client and router"),
+        ({"PALPATE_MODE": "client"}, "neither PALPATE_ROUTER nor PALPATE_CONNECT"),
+        ({"PALPATE_LISTEN": "7447"}, "endpoint '7447' is not <protocol>/<address>"),
+        ({"PALPATE_LOWLATENCY": "maybe"}, "PALPATE_LOWLATENCY is 'maybe'; allowed are 0 and 1"),
+        ({"PALPATE_CONNECT": "unixsock-stream/" + "x" * 120}, "at most 107 bytes; choose a shorter folder"),
+    ],
+)
+def test_what_cannot_work_is_refused_by_name(environment: dict[str, str], message: str) -> None:
+    with pytest.raises(BusConfigError, match=message):
+        BusOptions.from_env(environment)
+
+
+def test_a_broken_configuration_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "bus.json5"
+    file.write_text("{ mode: 'pee' }")
+    with pytest.raises(BusConfigError, match=r"PALPATE_ZENOH_CONFIG is .*bus\.json5"):
+        zenoh_config(BusOptions(file=file))
+
+
+def test_a_configuration_file_is_used(tmp_path: Path) -> None:
+    file = tmp_path / "bus.json5"
+    file.write_text(f"{{ mode: 'peer', listen: {{ endpoints: ['unixsock-stream/{tmp_path}/f.sock'] }} }}")
+    with session(BusOptions(file=file)) as ours, session(BusOptions(connect=(f"unixsock-stream/{tmp_path}/f.sock",))) as theirs:
+        assert heard(ours, theirs) == b"x"
+
+
+def test_an_endpoint_in_use_is_an_error(tmp_path: Path) -> None:
+    options = BusOptions(listen=(f"unixsock-stream/{tmp_path}/a.sock",))
+    with session(options), pytest.raises(BusConfigError, match=r"cannot open a zenoh session.*a\.sock"):
+        open_session(options)
+
+
+@pytest.mark.parametrize("lowlatency", [(), ("a", "b"), ("a",)], ids=["usual", "low-latency", "one-sided"])
+@pytest.mark.parametrize("size", [1, 300, 60_000, 200_000, 1_300_000])
+def test_a_mesh_carries_messages_of_every_size(tmp_path: Path, lowlatency: tuple[str, ...], size: int) -> None:
+    options = mesh(["a", "b"], tmp_path, lowlatency=lowlatency)
+    payload = bytes(range(256)) * (size // 256) + bytes(size % 256)
+    with session(options["b"]) as b, session(options["a"]) as a:  # the later one of the mesh first: it tries again
+        assert heard(a, b, payload) == payload
+        assert heard(b, a, payload) == payload
+
+
+def test_every_pair_of_a_mesh_has_one_link() -> None:
+    roles = ["a", "b", "c", "d"]
+    options = mesh(roles, Path("/run"))
+    assert sum(len(option.connect) for option in options.values()) == len(roles) * (len(roles) - 1) // 2
+
+
+def test_peers_meet_through_a_router_and_outlive_it(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path}/router.sock"
+    router = open_session(BusOptions(mode="router", listen=(endpoint,)))
+    with session(BusOptions(router=endpoint)) as a, session(BusOptions(router=endpoint)) as b:
+        assert heard(a, b) == b"x"
+        with session(BusOptions(router=endpoint, mode="client")) as client:
+            assert heard(a, client) == b"x"
+            assert heard(client, b) == b"x"
+        end = time.monotonic() + 10
+        while b.zid() not in a.info.peers_zid() and time.monotonic() < end:
+            time.sleep(0.01)
+        assert b.zid() in a.info.peers_zid()
+        assert close_session(router)
+        assert heard(a, b, key="test/after") == b"x"
+
+
+def test_router_command_routes_until_it_is_told_to_end(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path}/router.sock"
+    router = subprocess.Popen([sys.executable, "-m", "palpate_bus.router", endpoint], stdout=subprocess.PIPE, text=True)
+    try:
+        assert router.stdout is not None
+        assert endpoint in router.stdout.readline()
+        with session(BusOptions(mode="client", router=endpoint)) as a, session(BusOptions(mode="client", router=endpoint)) as b:
+            assert heard(a, b) == b"x"
+        router.send_signal(signal.SIGTERM)
+        assert router.wait(timeout=30) == 0
+    finally:
+        router.kill()
+        router.wait()
+
+
+def test_router_command_refuses_what_it_cannot_listen_on() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "palpate_bus.router", "7447"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert "7447" in done.stderr
+
+
+def test_a_process_that_merely_ends_closes_its_session(tmp_path: Path) -> None:
+    """Left to itself, zenoh hangs for ten seconds at interpreter exit and then prints a panic."""
+    options = mesh(["a", "b"], tmp_path)
+    program = (
+        "import zenoh; from queue import SimpleQueue; from palpate_bus.zenoh_config import open_session\n"
+        "s = open_session(); q = SimpleQueue()\n"
+        "sub = s.declare_subscriber('k/**', zenoh.handlers.Callback(q.put, indirect=False)); pub = s.declare_publisher('k/b')\n"
+        "token = s.liveliness().declare_token('alive/b')\n"
+        "print(q.get().payload.to_string(), flush=True)\n"
+    )
+    with session(options["a"]) as a:
+        child = subprocess.Popen(
+            [sys.executable, "-c", program], env={**__import__("os").environ, **options["b"].to_env()}, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        end = time.monotonic() + 60
+        while child.poll() is None and time.monotonic() < end:
+            a.put("k/a", "hello")
+            time.sleep(0.01)
+        out, error = child.communicate(timeout=60)
+    assert (child.returncode, out.strip()) == (0, "hello")
+    assert "panic" not in error
+
+
+def test_closing_twice_is_harmless() -> None:
+    opened = open_session(BusOptions())
+    assert close_session(opened)
+    assert close_session(opened)
