@@ -1,0 +1,229 @@
+"""Every row of the contract: what it says holds together, and its messages survive the wire."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from palpate_bus import codec
+from palpate_bus.conformance import leaves, numbers, violations
+from palpate_bus.contract import Contract, Edge, Role, Topic, Visibility, contract, parse
+from palpate_bus.stamps import header
+from palpate_bus.strategies import messages
+
+RULES = contract()
+TOPICS = pytest.mark.parametrize("topic", RULES.topics.values(), ids=lambda topic: topic.name)
+PINNED = Path(__file__).with_name("type_hashes.yaml")
+FRAMES = {"world", "abdomen", "ft_sensor", "camera_depth_optical_frame"}
+
+
+def all_types() -> list[str]:
+    rows = [*RULES.topics.values(), *RULES.internal.values()]
+    return sorted({row.type for row in rows} | set(codec.palpation_definitions()))
+
+
+@TOPICS
+@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@given(data=st.data())
+def test_a_message_survives_the_round_trip(topic: Topic, data: st.DataObject) -> None:
+    message = data.draw(messages(topic.type))
+    payload = codec.encode(message, topic.type)
+    assert codec.encode(codec.decode(payload, topic.type), topic.type) == payload
+    # The definition that rosbags has by itself reads the same.
+    assert bytes(codec.store.serialize_cdr(codec.store.deserialize_cdr(payload, topic.type), topic.type)) == payload
+
+
+@pytest.mark.parametrize("name", all_types())
+def test_type_hash_is_the_pinned_one(name: str) -> None:
+    """A changed message is a new type name. If you mean it: `python tests/contract/pin_type_hashes.py`."""
+    pinned = yaml.safe_load(PINNED.read_text(encoding="utf-8"))
+    assert codec.type_hash(name) == pinned.get(name), f"{name} changed, or is not pinned in {PINNED.name}"
+
+
+def test_nothing_is_pinned_that_is_gone() -> None:
+    assert sorted(yaml.safe_load(PINNED.read_text(encoding="utf-8"))) == all_types()
+
+
+@TOPICS
+def test_units_and_ranges_name_numbers_of_the_type(topic: Topic) -> None:
+    for path in {*topic.units, *topic.ranges}:
+        found = leaves(topic.type, path)
+        assert found
+        assert all(base != "string" for _, base in found), f"{path} holds text"
+    for path, (least, most) in topic.ranges.items():
+        assert least < most
+        integral = all("int" in base for _, base in leaves(topic.type, path))
+        assert integral or path in topic.units, f"{path} has a range but no unit"
+
+
+@TOPICS
+def test_every_physical_quantity_of_our_own_types_has_a_unit(topic: Topic) -> None:
+    if not topic.type.startswith("palpation_msgs/"):
+        return
+    told = [*topic.units]
+    for path, base in leaves(topic.type):
+        if base.startswith("float") and not any(path == known or path.startswith(known + ".") for known in told):
+            comment = _comment(topic.type, path)
+            assert "[" in comment or "unit" in comment or "orientation" in path, (
+                f"{path}: neither the row nor the .msg has a unit"
+            )
+
+
+def _comment(type_name: str, path: str) -> str:
+    """The comment at a field's line in its .msg, or at the outer field that holds it."""
+    definitions = codec.palpation_definitions()
+    found = ""
+    description = type_name
+    for name in path.split("."):
+        if description not in definitions:
+            break
+        line = next((line for line in definitions[description].splitlines() if re.match(rf"\S+\s+{name}\b", line)), "")
+        found += line.partition("#")[2]
+        base = line.split()[0].partition("[")[0] if line else ""
+        description = base if "/" not in base and base else base.replace("/", "/msg/", 1)
+        description = f"palpation_msgs/msg/{description}" if f"palpation_msgs/msg/{description}" in definitions else description
+    return found
+
+
+@TOPICS
+def test_frame_is_a_known_one_and_only_where_a_header_is(topic: Topic) -> None:
+    paths = [path for path, _ in leaves(topic.type)]
+    has_header = any(path.endswith("header.frame_id") for path in paths)
+    assert topic.frame is None or (has_header and topic.frame in FRAMES)
+
+
+@TOPICS
+def test_key_space_tells_who_may_know(topic: Topic) -> None:
+    prefix = {Visibility.SIM: "sim/", Visibility.TRUTH: "truth/"}.get(topic.visibility)
+    if prefix is None:
+        assert not topic.name.startswith(("sim/", "truth/"))
+    else:
+        assert topic.name.startswith(prefix)
+
+
+WHO_MAY_KNOW = {
+    Visibility.SIM: {"robot", "tissue", "camera", "dashboard", "recorder"},
+    Visibility.TRUTH: {"conductor", "dashboard", "recorder"},
+}
+"""Stated here anew, so that a change of the contract's own table is noticed. Architecture: «Who may know what»."""
+
+
+@TOPICS
+def test_secrets_reach_only_those_who_may_know(topic: Topic) -> None:
+    if topic.visibility in WHO_MAY_KNOW:
+        assert set(topic.readers) <= WHO_MAY_KNOW[topic.visibility]
+        assert topic.producer in {"robot", "tissue"}
+
+
+def test_the_examination_sees_no_secret() -> None:
+    for role in ("planning", "control", "perception", "assessment"):
+        assert all(topic.visibility is Visibility.PUBLIC for topic, _ in RULES.inputs(role))
+        assert all(topic.visibility is Visibility.PUBLIC for topic in RULES.outputs(role))
+
+
+@pytest.mark.parametrize("secret", ["sim/contact_wrench", "truth/phantom", "truth/indentation", "sim/tool_state"])
+@pytest.mark.parametrize("reader", ["planning", "control", "perception", "assessment"])
+def test_a_row_that_leaks_a_secret_is_refused(secret: str, reader: str) -> None:
+    rows = RULES.model_dump(mode="python")
+    rows["topics"][secret]["readers"][reader] = Edge.PREVIOUS
+    with pytest.raises(ValueError, match=rf"{secret} is (sim|truth) and must not be read by \['{reader}'\]"):
+        Contract.model_validate(rows)
+
+
+@TOPICS
+def test_period_is_a_multiple_of_the_producers(topic: Topic) -> None:
+    if not topic.latched:
+        assert topic.period % RULES.roles[topic.producer].period == 0
+
+
+@TOPICS
+def test_edges_fit_the_kind_of_topic(topic: Topic) -> None:
+    assert topic.producer not in topic.readers
+    for role, edge in topic.readers.items():
+        assert (edge is Edge.LATCHED) <= topic.latched, f"{role} waits for {topic.name} as latched"
+        if RULES.roles[role].observer:
+            assert edge is Edge.OBSERVE, f"{role} is an observer and must not hold up {topic.producer}"
+    assert (RULES.qos[topic.qos].transient_local) == topic.latched
+
+
+def test_every_topic_is_read_and_recorded() -> None:
+    assert all("recorder" in topic.readers for topic in RULES.topics.values())
+
+
+def test_no_cycle_of_same_tick_edges() -> None:
+    order = RULES.step_order(tuple(RULES.roles))
+    for topic in RULES.topics.values():
+        for role, edge in topic.readers.items():
+            if edge is Edge.SAME_TICK:
+                assert order.index(topic.producer) < order.index(role)
+
+
+def test_a_cycle_of_same_tick_edges_is_named() -> None:
+    rows = RULES.model_dump(mode="python")
+    rows["topics"]["control/joint_torque"]["readers"]["robot"] = Edge.SAME_TICK
+    with pytest.raises(ValueError, match=r"cycle of same_tick edges among \[.*'control'.*'robot'.*\]"):
+        Contract.model_validate(rows)
+
+
+def test_everything_that_the_physics_and_the_examination_send_is_hashed() -> None:
+    for topic in RULES.topics.values():
+        observer = RULES.roles[topic.producer].observer
+        assert topic.hashed == (not observer and not topic.latched), topic.name
+
+
+def test_commands_expire() -> None:
+    for name in ("control/joint_torque", "planning/setpoint"):
+        topic = RULES.topics[name]
+        assert topic.expiry_ms is not None
+        assert topic.expiry_ms >= 2 * topic.period_ms
+
+
+@pytest.mark.parametrize("role", RULES.roles.values(), ids=lambda role: role.name)
+def test_inputs_and_outputs_of_a_role_are_those_of_the_rows(role: Role) -> None:
+    assert [topic.name for topic in RULES.outputs(role.name)] == [
+        t.name for t in RULES.topics.values() if t.producer == role.name
+    ]
+    assert [t.name for t, _ in RULES.inputs(role.name)] == [t.name for t in RULES.topics.values() if role.name in t.readers]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("producer: robot", "no role 'robott'"),
+        ("qos: control", "no QoS class 'controll'"),
+        ("type: sensor_msgs/msg/JointState", "no such message type"),
+        ("period_ms: 1\n    readers: {control: same_tick", "Extra inputs are not permitted"),
+    ],
+)
+def test_a_broken_row_is_refused(change: str, message: str) -> None:
+    text = (Path(codec.__file__).parent / "contract.yaml").read_text(encoding="utf-8")
+    broken = (
+        text.replace(change, change[:-1] + change[-1] * 2, 1)
+        if "\n" not in change
+        else text.replace(change, "colour: red\n    " + change, 1)
+    )
+    assert broken != text
+    with pytest.raises(ValueError, match=message):
+        parse(broken)
+
+
+def test_a_message_that_breaks_its_row_is_told_how() -> None:
+    topic = RULES.topics["ft/wrench"]
+    vector, wrench, stamped = (
+        codec.message_type(f"geometry_msgs/msg/{name}") for name in ("Vector3", "Wrench", "WrenchStamped")
+    )  # fmt: skip
+    good = stamped(header(5, "ft_sensor"), wrench(vector(0.0, 0.0, 3.0), vector(0.0, 0.0, 0.0)))
+    assert violations(topic, good, 5) == []
+    assert numbers(good, "wrench.force").tolist() == [0, 0, 3]
+    bad = stamped(header(6, "world"), wrench(vector(0.0, float("nan"), 0.0), vector(41.0, 0.0, 0.0)))
+    assert violations(topic, bad, 5) == [
+        "ft/wrench: frame_id is 'world', wants 'ft_sensor'",
+        "ft/wrench: stamp is 6 ns, wants 5 ns",
+        "ft/wrench: wrench.force is nan, allowed are -200..200 [N]",
+        "ft/wrench: wrench.torque is 41, allowed are -40..40 [N m]",
+    ]
+    assert violations(topic, vector(0.0, 0.0, 0.0)) == [
+        "ft/wrench: is a geometry_msgs__msg__Vector3, wants geometry_msgs/msg/WrenchStamped"
+    ]
