@@ -97,7 +97,11 @@ class Composed:
 
     def run_hash(self) -> str:
         """The run hash."""
+        return run_hash(self.digests())
+
+    def digests(self) -> dict[str, str]:
+        """Digest of each hashed topic."""
         digests: dict[str, str] = {}
         for stepper in self.steppers.values():
             digests.update(stepper.digests())
-        return run_hash(digests)
+        return digests

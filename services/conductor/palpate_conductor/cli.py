@@ -9,7 +9,9 @@ from typing import Annotated, NoReturn
 
 import typer
 from palpate_bus.contract import contract
+from palpate_bus.zenoh_config import BusConfigError, close_session, open_session
 from palpate_models.load import ScenarioError, load_scenario, scenario_names
+from palpate_models.scenario import Scenario
 from rich.console import Console
 from rich.table import Table
 
@@ -18,10 +20,13 @@ from palpate_conductor.conductor import RunFailed
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
 from palpate_conductor.report import print_findings, write_results
-from palpate_conductor.run import OBSERVERS, run_composed, run_distributed
+from palpate_conductor.run import OBSERVERS, WORKERS, RunResult, run_composed, run_distributed, write_scenario_files
+from palpate_conductor.run import conduct as run_conduct
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
+
+Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")]
 
 app = typer.Typer(
     name="palpate",
@@ -90,10 +95,54 @@ def run(
         _fail(console, EXIT_BAD_INPUT, str(error))
     except RunFailed as error:
         _fail(console, EXIT_FAILED, str(error))
-    report = write_results(folder, chosen, result)
-    print_findings(Console(), report)
+    _conclude(console, folder, chosen, result)
+
+
+def _conclude(console: Console, folder: Path, scenario: Scenario, result: RunResult) -> None:
+    """Writes the results, prints the findings, and leaves with status 3 when the run failed."""
+    print_findings(Console(), write_results(folder, scenario, result))
     if result.failure:
         _fail(console, EXIT_FAILED, f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+
+
+@app.command()
+def prepare(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a YAML file.")] = "rlq_guarding",
+    out: Annotated[Path, typer.Option(help="Folder for the scenario files.")] = Path("out"),
+    seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
+    ] = None,
+) -> None:
+    """Write scenario.yaml (for tissue and scoring) and exam.yaml (for everybody else): the first step of a run in containers."""
+    console = Console(stderr=True)
+    try:
+        chosen = load_scenario(scenario, settings or (), seed)
+    except ScenarioError as error:
+        _fail(console, EXIT_BAD_INPUT, str(error))
+    write_scenario_files(chosen, out)
+
+
+@app.command()
+def conduct(
+    out: Annotated[Path, typer.Option(help="Folder with scenario.yaml, for the results.")] = Path("out"),
+    observers: Annotated[str, typer.Option(help="Observers of this run, comma-separated.")] = ",".join(OBSERVERS),
+    realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
+    wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
+) -> None:
+    """Conduct services that are started by others (containers, other machines) and write the report."""
+    console = Console(stderr=True)
+    try:
+        chosen = load_scenario(str(out / "scenario.yaml"))
+        session = open_session()
+    except (ScenarioError, BusConfigError) as error:
+        _fail(console, EXIT_BAD_INPUT, str(error))
+    roles = (*WORKERS, *(name for name in observers.split(",") if name))
+    with RunDisplay(console, quiet) as display:
+        result = run_conduct(session, roles, display.tell, realtime=1.0 if realtime else None, wallclock=wallclock)
+    close_session(session)
+    _conclude(console, out, chosen, result)
 
 
 @app.command()

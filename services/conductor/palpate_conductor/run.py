@@ -10,6 +10,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import zenoh
 from palpate_bus.composed import Composed, ServiceFailed
 from palpate_bus.contract import contract
 from palpate_bus.recording import RawRecorder
@@ -37,6 +38,8 @@ class RunResult:
     runtime: str
     collected: Collected
     run_hash: str | None
+    digests: dict[str, str]
+    """SHA-256 over the messages of each hashed topic: where two runs differ, this says in which topic."""
     sim_time_s: float
     wall_time_s: float
     start_time_s: float
@@ -61,7 +64,7 @@ class Progress:
 Tell = Callable[[Progress], None]
 
 
-def prepare(scenario: Scenario, out: Path) -> dict[str, Path]:
+def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
     """Makes the results folder and the scenario files; returns the file that each role may see."""
     (out / "logs").mkdir(parents=True, exist_ok=True)
     full, exam = out / "scenario.yaml", out / "exam.yaml"
@@ -79,49 +82,73 @@ def run_distributed(
     wallclock: bool = False,
     patience: Patience | None = None,
 ) -> RunResult:
-    """Starts the local processes of the compose file and conducts them to the end."""
+    """Starts the local processes of the compose file and conducts them to the end.
+
+    Raises ProcessListError when the compose file cannot be used; later failures are in the result.
+    """
     begin = perf_counter()
     roles = (*WORKERS, *observers)
-    files = prepare(scenario, out)
+    files = write_scenario_files(scenario, out)
     processes = read_processes(compose_file(), roles)
     extra = {
         "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         "PALPATE_RECORD": str(int("recorder" in observers)),
     }
     local = LocalProcesses(roles, out, files, extra)
-    collector = Collector()
     try:
         session = open_session(local.bus["conductor"])
-        domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
-        conductor = Conductor(session, contract(), domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock=wallclock)
         for role in roles:
             local.start(processes[role])
 
         def died() -> Mapping[str, str]:
             return {role: _how(code) for role, code in local.ended().items()}
 
-        def report(c: Conductor) -> None:
-            wall = max(c.elapsed_s, 1e-9)
-            t = max(collector.collected.exam_time, 0)
-            tell(Progress(t, t / NS / wall, collector.collected))
-
         try:
-            outcome = conductor.run(died, report)
-            failure = outcome.failure
-        except RunFailed as error:
-            outcome = conductor.outcome
-            failure = str(error)
-        start_time = conductor.started_at_perf - begin if conductor.started_at_perf else perf_counter() - begin
-        close_session(session)
+            return conduct(session, roles, tell, died, realtime, wallclock, patience, begin)
+        finally:
+            close_session(session)
     finally:
         local.stop()
+
+
+def conduct(
+    session: zenoh.Session,
+    roles: tuple[str, ...],
+    tell: Tell,
+    died: Callable[[], Mapping[str, str]] = dict,
+    realtime: float | None = None,
+    wallclock: bool = False,
+    patience: Patience | None = None,
+    begin: float | None = None,
+) -> RunResult:
+    """Conducts services that somebody else has started on the bus of `session`, to the end.
+
+    `died` gives the roles whose process is known to be gone, with how; `begin` [s] is when the command came, by `perf_counter`.
+    """
+    begin = perf_counter() if begin is None else begin
+    collector = Collector()
+    domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
+    conductor = Conductor(session, contract(), domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock=wallclock)
+
+    def report(c: Conductor) -> None:
+        wall = max(c.elapsed_s, 1e-9)
+        t = max(collector.collected.exam_time, 0)
+        tell(Progress(t, t / NS / wall, collector.collected))
+
+    try:
+        outcome = conductor.run(died, report)
+        failure = outcome.failure
+    except RunFailed as error:
+        outcome = conductor.outcome
+        failure = str(error)
     return RunResult(
         runtime="wallclock" if wallclock else "distributed",
         collected=collector.collected,
         run_hash=None if wallclock else outcome.run_hash,
+        digests=outcome.digests,
         sim_time_s=max(outcome.last_tick, 0) / NS,
         wall_time_s=outcome.wall_time_s,
-        start_time_s=start_time,
+        start_time_s=(conductor.started_at_perf or perf_counter()) - begin,
         blame={role: detail.get("blame") for role, detail in outcome.reports.items()},
         counters={
             role: {key: value for key, value in detail.items() if key not in ("blame", "digests")}
@@ -155,7 +182,7 @@ def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
 def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
     """Runs all services in this process."""
     begin = perf_counter()
-    prepare(scenario, out)
+    write_scenario_files(scenario, out)
     os.environ["PALPATE_OUT"] = str(out)
     collector = Collector()
     observing = load_services(scenario, observers)
@@ -191,6 +218,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         runtime="composed",
         collected=collector.collected,
         run_hash=None if failure else run.run_hash(),
+        digests=run.digests(),
         sim_time_s=last / NS,
         wall_time_s=wall,
         start_time_s=start - begin,
