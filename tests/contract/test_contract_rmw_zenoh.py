@@ -1,0 +1,107 @@
+"""Keys and hashes are rmw_zenoh's of ROS 2 Jazzy, and a program with nothing of ours reads the bus."""
+
+import ast
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from palpate_bus import codec
+from palpate_bus.contract import contract
+from palpate_bus.liveliness import NodeTokens
+from palpate_bus.messages import Image, JointState, Vector3, Wrench, WrenchStamped
+from palpate_bus.stamps import header
+from palpate_bus.transport import Publisher
+from palpate_bus.wire import topic_key
+from palpate_bus.zenoh_config import mesh, session
+
+RULES = contract()
+LISTENER = Path(__file__).with_name("foreign_listener.py")
+
+# As ROS 2 itself shows them, copied from public records: what `ros2 topic info -v` printed (Image, PointCloud2, Clock), what
+# rosbag2 of Jazzy wrote into metadata.yaml (String, TFMessage), rmw_zenoh's design.md (String), the generated code of Jazzy and
+# the tables of other implementations of this wire format that were checked against it (the others).
+JAZZY = {
+    "builtin_interfaces/msg/Time": "b106235e25a4c5ed35098aa0a61a3ee9c9b18d197f398b0e4206cea9acf9c197",
+    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    "geometry_msgs/msg/WrenchStamped": "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
+    "nav_msgs/msg/Path": "1957a5bb3cee5da65c4e52e52b65a93df227efce4c20f8458b36e73066ca334b",
+    "rosgraph_msgs/msg/Clock": "692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564",
+    "sensor_msgs/msg/CameraInfo": "b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275",
+    "sensor_msgs/msg/Image": "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
+    "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    "sensor_msgs/msg/PointCloud2": "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+    "std_msgs/msg/Header": "f49fb3ae2cf070f793645ff749683ac6b06203e41c891e17701b1cb597ce6a01",
+    "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+}
+
+
+@pytest.mark.parametrize("name", sorted(JAZZY))
+def test_hash_is_jazzys(name: str) -> None:
+    assert codec.type_hash(name) == "RIHS01_" + JAZZY[name]
+
+
+def test_every_standard_type_of_the_contract_is_compared() -> None:
+    standard = {topic.type for topic in RULES.topics.values() if not topic.type.startswith("palpation_msgs/")}
+    assert standard <= JAZZY.keys()
+
+
+def test_key_of_joint_states() -> None:
+    expected = "0/joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_" + JAZZY["sensor_msgs/msg/JointState"]
+    assert topic_key(RULES.topics["joint_states"], 0) == expected
+
+
+def test_the_listener_imports_nothing_of_ours() -> None:
+    imported = set()
+    for node in ast.walk(ast.parse(LISTENER.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(str(node.module))
+    assert not [name for name in imported if name.startswith("palpat")]
+
+
+def test_a_stranger_reads_joint_states_wrench_and_depth_image(tmp_path: Path) -> None:
+    options = mesh(["robot"], tmp_path)["robot"]
+    depth = np.full((48, 64), np.nan, np.float32)
+    depth[10:20, 10:20] = np.linspace(0.8, 1.2, 100).reshape(10, 10)
+    samples = {
+        "joint_states": lambda t: JointState(
+            header(t), [f"lbr_A{i}" for i in range(1, 8)], np.arange(7.0), np.zeros(7), np.ones(7)
+        ),
+        "ft/wrench": lambda t: WrenchStamped(header(t, "ft_sensor"), Wrench(Vector3(1.0, -2.0, 3.5), Vector3(0.0, 0.0, 0.0))),
+        "camera/depth/image_raw": lambda t: Image(
+            header(t, "camera_depth_optical_frame"), 48, 64, "32FC1", 0, 256, depth.reshape(-1).view(np.uint8)
+        ),
+    }
+    with session(options) as bus:
+        tokens = NodeTokens(bus, "robot", domain=9)
+        publishers = {}
+        for name in samples:
+            topic = RULES.topics[name]
+            qos = RULES.qos[topic.qos]
+            publishers[name] = Publisher(bus, topic_key(topic, 9), qos, tokens.publisher(topic, qos))
+        command = [sys.executable, str(LISTENER), options.listen[0], "--domain", "9", "--count", "2", "--seconds", "60"]
+        listener = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        end = time.monotonic() + 60
+        sequence = 0
+        while listener.poll() is None and time.monotonic() < end:
+            sequence += 1
+            for name, make in samples.items():
+                message = make(sequence * 1_000_000)
+                publishers[name].put(codec.encode(message, RULES.topics[name].type), sequence)
+            time.sleep(0.02)
+        out, error = listener.communicate(timeout=30)
+    assert listener.returncode == 0, error
+    heard = {line["topic"]: line for line in map(json.loads, out.splitlines()[1:])}
+    assert heard["joint_states"]["names"][-1] == "lbr_A7"
+    assert heard["joint_states"]["position"] == list(range(7))
+    assert heard["ft/wrench"]["force"] == [1.0, -2.0, 3.5]
+    assert heard["ft/wrench"]["frame"] == "ft_sensor"
+    image = heard["camera/depth/image_raw"]
+    assert (image["shape"], image["encoding"], image["valid"]) == ([48, 64], "32FC1", 100)
+    assert (image["least"], image["most"]) == pytest.approx((0.8, 1.2))
