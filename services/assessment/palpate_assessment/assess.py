@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from palpate_assessment.contact import REACH, ReferenceContact
 from palpate_assessment.findings import CANDIDATE_RATIO, StiffArea, candidates, find
 from palpate_assessment.grid import MapGrid
-from palpate_assessment.inversion import POWER, Z90, Noise, Observations, invert, observe
+from palpate_assessment.inversion import POWER, Z90, Noise, Observations, estimate_noise, invert, observe
 from palpate_assessment.prior import HEALTHY, LESION, Field
 from palpate_assessment.sampling import Sample
 
@@ -44,6 +44,8 @@ class Assessment:
     background: float
     """Robust level of the unremarkable wall [N/m^3]."""
     findings: list[StiffArea]
+    noise: Noise
+    """What the samples get wrong, as estimated from themselves."""
     samples: int
 
 
@@ -74,6 +76,7 @@ def assess(
     for _ in range(2 if refine else 0):
         envelope = lesion_envelope(posterior.mean - background, grid, scanned)
         lesion = Field(grid, LESION, envelope)
+        observations = replace(observations, noise=estimate_noise(observations, posterior, healthy + lesion))
         posterior = invert(observations, healthy + lesion, mean, posterior.mean, iterations=4)
         background = mean + healthy.times((posterior.weights @ posterior.jacobian)[None])[0]
     if refine:
@@ -91,6 +94,7 @@ def assess(
         scanned=scanned,
         background=float(np.exp(np.median(posterior.mean[rest]))),
         findings=found,
+        noise=observations.noise,
         samples=len(good),
     )
 

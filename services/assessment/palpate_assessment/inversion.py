@@ -11,11 +11,12 @@ The posterior's mode follows by Gauss-Newton; its covariance is the Gaussian one
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 
 from palpate_assessment.contact import REACH, ReferenceContact
@@ -34,18 +35,30 @@ Z90 = 1.6449
 
 @dataclass(frozen=True)
 class Noise:
-    """What the samples get wrong."""
+    """What the samples get wrong. How large the depth's errors are is estimated from the scan itself (`estimate_noise`)."""
 
-    depth_white: float = 0.00025
-    """Depth error of a sample by itself [m]: control, sensor, mesh ripple."""
-    depth_smooth: float = 0.0006
+    depth_white: float = 0.0002
+    """Depth error of a sample by itself [m]: mesh ripple, control, sensor."""
+    depth_smooth: float = 0.0004
     """Error of the perceived surface [m], correlated over `depth_length`."""
     depth_length: float = 0.015
     """[m]"""
-    depth_common: float = 0.0003
-    """Error of the perceived surface that is common to all samples [m]."""
-    model: float = 0.03
-    """Relative error of the contact model [1]."""
+    depth_common: float = 0.0002
+    """Error of the perceived surface that is common to all samples [m]. A scan cannot tell it from a stiffer patient."""
+    model_common: float = 0.03
+    """Relative error of the contact model that is common to all samples [1]: the wall's discretisation and constants."""
+    model_white: float = 0.01
+    """That of a sample by itself [1]."""
+
+    def covariance(self, steep: Array, squared_distance: Array, relative: Array) -> Array:
+        """Covariance of log(F / F_ref), shape (m, m).
+
+        `steep`: d log F / d depth [1/m]; `squared_distance` of the samples [m^2], shape (m, m); `relative` force noise [1].
+        """
+        smooth = self.depth_smooth**2 * np.exp(-0.5 * squared_distance / self.depth_length**2) + self.depth_common**2
+        covariance = np.outer(steep, steep) * smooth + self.model_common**2
+        covariance[np.diag_indices(len(steep))] += (steep * self.depth_white) ** 2 + relative**2 + self.model_white**2
+        return np.asarray(covariance)
 
 
 @dataclass(frozen=True)
@@ -54,10 +67,20 @@ class Observations:
 
     value: Array
     """log(F / F_ref), log of an effective k_w in N/m^3, shape (m,)."""
-    covariance: Array
-    """Of their noise, shape (m, m)."""
+    noise: Noise
+    steep: Array
+    """d log F / d depth [1/m], shape (m,)."""
+    squared_distance: Array
+    """Of the samples from each other [m^2], shape (m, m)."""
+    relative: Array
+    """Noise of the force over the force [1], shape (m,)."""
     footprint: Array
     """Weight of each node in each sample, rows sum to 1, shape (m, n)."""
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of the noise, shape (m, m)."""
+        return self.noise.covariance(self.steep, self.squared_distance, self.relative)
 
 
 @dataclass(frozen=True)
@@ -94,13 +117,14 @@ def observe(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact,
     depth = np.array([s.depth for s in samples])
     force = np.array([s.force for s in samples])
     value = np.log(force / reference_force(samples, contact, grid.curvature(position)))
-    steep = contact.exponent(depth) / depth
-    apart = cdist(position, position, "sqeuclidean")
-    smooth = noise.depth_smooth**2 * np.exp(-0.5 * apart / noise.depth_length**2) + noise.depth_common**2
-    covariance = np.outer(steep, steep) * smooth
-    relative = np.array([s.force_noise for s in samples]) / force
-    covariance[np.diag_indices(len(samples))] += (steep * noise.depth_white) ** 2 + relative**2 + noise.model**2
-    return Observations(value, covariance, footprints(samples, grid, contact))
+    return Observations(
+        value=value,
+        noise=noise,
+        steep=contact.exponent(depth) / depth,
+        squared_distance=cdist(position, position, "sqeuclidean"),
+        relative=np.array([s.force_noise for s in samples]) / force,
+        footprint=footprints(samples, grid, contact),
+    )
 
 
 def footprints(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact) -> Array:
@@ -140,3 +164,30 @@ def invert(observations: Observations, prior: Field, mean: float, start: Array |
     half = solve_triangular(factor[0], spread, lower=True)
     variance = np.maximum(prior.variance - np.einsum("ij,ij->j", half, half), 1e-8)
     return Posterior(z, np.sqrt(variance), jacobian, residual, weights)
+
+
+_SCALES = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
+"""Standard deviations of depth errors that are tried [mm]."""
+
+
+def estimate_noise(observations: Observations, posterior: Posterior, prior: Field) -> Noise:
+    """The noise under which the data are most likely, given the prior field: evidence of the problem linearised at the mode.
+
+    Depth errors are told from stiffness by being rougher than the footprint lets a change of stiffness appear.
+    What all samples share cannot be seen; half the perceived surface's own error is assumed, but not less than the default.
+    """
+    J = posterior.jacobian
+    signal = prior.times(J) @ J.T
+    noise = chosen = observations.noise
+    best = -np.inf
+    for smooth in _SCALES:
+        for white in _SCALES[:-1]:
+            common = max(Noise.depth_common, 0.5e-3 * smooth)
+            tried = replace(noise, depth_smooth=1e-3 * smooth, depth_white=1e-3 * white, depth_common=common)
+            covariance = tried.covariance(observations.steep, observations.squared_distance, observations.relative)
+            half = cholesky(signal + covariance, lower=True)
+            scaled = solve_triangular(half, posterior.residual, lower=True)
+            evidence = -0.5 * float(scaled @ scaled) - float(np.log(np.diag(half)).sum())
+            if evidence > best:
+                best, chosen = evidence, tried
+    return chosen

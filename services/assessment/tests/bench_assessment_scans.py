@@ -94,8 +94,9 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
 
     def shape(xy: Array) -> tuple[Array, Array]:
         h = 0.002
-        zx = (height(xy + (h, 0)) - height(xy - (h, 0))) / (2 * h)
-        zy = (height(xy + (0, h)) - height(xy - (0, h))) / (2 * h)
+        right, up = np.array((h, 0.0)), np.array((0.0, h))
+        zx = (height(xy + right) - height(xy - right)) / (2 * h)
+        zy = (height(xy + up) - height(xy - up)) / (2 * h)
         n = np.column_stack((-zx, -zy, np.ones(len(xy))))
         return np.column_stack((xy, height(xy))), n / np.linalg.norm(n, axis=1, keepdims=True)
 
@@ -107,7 +108,9 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
     xy = np.column_stack([a.ravel() for a in np.meshgrid(grid, grid)])
     p, n = shape(xy)
     perceived = p + n * wrong(p)[:, None]
-    surface = SurfaceMesh(header(0, "world"), apply(X_WA, perceived).astype(np.float32).ravel(), np.empty(0, np.float32), np.empty(0, np.uint32))
+    surface = SurfaceMesh(
+        header(0, "world"), apply(X_WA, perceived).astype(np.float32).ravel(), np.empty(0, np.float32), np.empty(0, np.uint32)
+    )
     states: list[Any] = []
     zero = np.zeros(3)
     for times, path in snake(region or exam.region_m, exam.spacing_m, exam.speed_mps, tissue.dt):
@@ -135,7 +138,9 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
     return Scan(scenario, surface, states, phantom_truth(model, X_WA))
 
 
-def _state(t: float, p: Array, n: Array, depth: float, force: float, steady: bool, X_WA: Array, phase: int = ExamState.PHASE_SCAN) -> Any:
+def _state(
+    t: float, p: Array, n: Array, depth: float, force: float, steady: bool, X_WA: Array, phase: int = ExamState.PHASE_SCAN
+) -> Any:
     p_W = apply(X_WA, p[None])[0]
     n_W = X_WA[:3, :3] @ n
     return ExamState(
@@ -190,9 +195,7 @@ def random_lesion(seed: int) -> Lesion:
     rng = np.random.Generator(np.random.PCG64(seed))
     radii = rng.uniform(0.02, 0.04, 2)
     x, y = rng.uniform(-0.1 + radii.max(), 0.1 - radii.max(), 2)
-    return Lesion(
-        centre_m=(float(x), float(y)), radii_m=(float(radii[0]), float(radii[1])), contrast=float(rng.uniform(2.5, 5))
-    )
+    return Lesion(centre_m=(float(x), float(y)), radii_m=(float(radii[0]), float(radii[1])), contrast=float(rng.uniform(2.5, 5)))
 
 
 def main(seeds: int) -> None:

@@ -15,7 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
@@ -29,6 +29,7 @@ _QUIET = "#6b7a83"
 _FORCE, _STIFFNESS, _UNCERTAINTY = "viridis", "inferno", "cividis"
 _FINDING, _TRUE = "#18e0d0", "#ffffff"
 _SMALL = 8.5
+_LOG_TICKS = [m * 10.0**e for e in range(4) for m in (1, 1.5, 2, 3, 4, 5, 7)]
 
 
 class _Drawing:
@@ -84,18 +85,29 @@ class _Drawing:
         axes.tick_params(labelsize=_SMALL, colors=_INK)
         return image
 
+    def rounded(self, member: Array) -> Array:
+        """Membership averaged over neighbours, so that its half level is an outline and not a staircase."""
+        edges = np.concatenate((self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]))
+        for _ in range(3):
+            total, count = 2.0 * member, np.full(len(member), 2.0)
+            for a, b in (edges.T, edges.T[::-1]):
+                np.add.at(total, a, member[b])
+                np.add.at(count, a, 1.0)
+            member = total / count
+        return member
+
     def outlines(self, axes: Axes, truth: bool, labels: bool = False) -> None:
         """Findings, and the truth's half-contrast outline when asked for and known."""
         for i, f in enumerate(self.findings):
             member = (self.map.finding == i).astype(float)
             if not member.any():
                 continue
-            contour = axes.tricontour(self.tri, member, levels=[0.5], colors=[_FINDING], linewidths=2.0)
+            contour = axes.tricontour(self.tri, self.rounded(member), levels=[0.5], colors=[_FINDING], linewidths=2.0)
             contour.set_path_effects([withStroke(linewidth=3.6, foreground=_INK)])
             x, y = f.centroid.x * 1e3, f.centroid.y * 1e3
             axes.plot(x, y, "+", color=_FINDING, ms=9, mew=2, path_effects=[withStroke(linewidth=3.6, foreground=_INK)])
             if labels:
-                words = f"{f.stiffness_ratio:.1f}x\n{f.area * 1e4:.0f} cm²"
+                words = f"{f.stiffness_ratio:.1f} ×\n{f.area * 1e4:.0f} cm²"
                 axes.annotate(
                     words,
                     (x, y),
@@ -108,7 +120,9 @@ class _Drawing:
                     path_effects=[withStroke(linewidth=2.5, foreground=_INK)],
                 )
         if truth and self.lesion is not None and self.lesion.max() > 0.5:
-            contour = axes.tricontour(self.tri, self.lesion, levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--")
+            contour = axes.tricontour(
+                self.tri, self.rounded(self.lesion), levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--"
+            )
             contour.set_path_effects([withStroke(linewidth=2.8, foreground=_INK)])
 
     def space(self, axes: Any, height: Array, values: Array, cmap: str, norm: Normalize, label: str) -> None:
@@ -120,7 +134,8 @@ class _Drawing:
         surface.set_array(values[self.triangles].mean(axis=1))
         surface.set_edgecolor("none")
         surface.set_antialiased(False)
-        axes.view_init(elev=32, azim=-62)
+        axes.view_init(elev=30, azim=-62)
+        axes.zaxis.set_major_locator(MaxNLocator(4))
         axes.set_xlabel("x [mm]", fontsize=_SMALL, labelpad=-2)
         axes.set_ylabel("y [mm]", fontsize=_SMALL, labelpad=-2)
         axes.set_zlabel(label, fontsize=_SMALL, labelpad=0)
@@ -136,9 +151,9 @@ def draw_map(path: Path, message: Any, findings: Any | None, samples: Samples, t
     drawing = _Drawing(message, findings, truth)
     if not len(drawing.triangles):
         return
-    figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white", layout="constrained")
+    figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
     FigureCanvasAgg(figure)
-    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)  # type: ignore[union-attr]
+    figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)
     grid = figure.add_gridspec(2, 3)
     _draw_force(figure, grid, drawing, samples)
     _draw_stiffness(figure, grid, drawing)
@@ -157,6 +172,7 @@ def _draw_force(figure: Figure, grid: Any, drawing: _Drawing, samples: Samples) 
     _bar(figure, image, flat, "force [N]")
     solid = figure.add_subplot(grid[0, 1], projection="3d")
     drawing.space(solid, drawing.force, drawing.force, _FORCE, norm, "force [N]")
+    solid.set_box_aspect((1, 1, 0.72), zoom=1.14)
     _title(solid, "b", "Normal force in 3-D", "height and colour are force")
     spread = figure.add_subplot(grid[0, 2])
     half = 100 * (np.sqrt(drawing.map.upper / drawing.map.lower) - 1)
@@ -177,7 +193,7 @@ def _draw_stiffness(figure: Figure, grid: Any, drawing: _Drawing) -> None:
     _bar(figure, image, flat, "$k_w$ [kN/m³]")
     solid = figure.add_subplot(grid[1, 1], projection="3d")
     drawing.space(solid, drawing.xyz[:, 2], estimate, _STIFFNESS, norm, "z [mm]")
-    solid.set_box_aspect((1, 1, 0.45))
+    solid.set_box_aspect((1, 1, 0.45), zoom=1.14)
     _title(solid, "e", "Estimated stiffness on the abdomen", "perceived surface")
     true = figure.add_subplot(grid[1, 2])
     if drawing.true is None:
@@ -200,11 +216,14 @@ def _bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
     bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02)
     bar.set_label(label, fontsize=_SMALL, color=_INK)
     if isinstance(image.norm, LogNorm):
-        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        low, high = image.get_clim()
+        ticks = [t for t in _LOG_TICKS if (low or 0.0) <= t <= (high or 0.0)]
+        bar.ax.yaxis.set_major_locator(FixedLocator(ticks))
         bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        bar.ax.yaxis.set_minor_locator(NullLocator())
         bar.ax.yaxis.set_minor_formatter(NullFormatter())
     bar.ax.tick_params(labelsize=_SMALL, colors=_INK)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
 
 
 def _summary(drawing: _Drawing) -> str:

@@ -222,7 +222,7 @@ def _coverage(found: Map, truth: Truth, surface: TrueSurface) -> float | None:
 def _nearest(found: Map, points: Array, flag: Mask) -> Mask:
     """A flag of the map's vertices at points, by the nearest vertex; false farther off than the map's own pitch."""
     tree = cKDTree(found.vertices[:, :2])
-    pitch = float(np.median(tree.query(found.vertices[:, :2], k=2)[0][:, 1]))
+    pitch = float(np.median(np.asarray(tree.query(found.vertices[:, :2], k=2)[0])[:, 1]))
     distance, index = tree.query(points)
     return np.asarray(flag[index] & (distance <= pitch))
 
