@@ -63,6 +63,8 @@ class Outcome:
     first_tick_wall: float = 0.0
     wall_time_s: float = 0.0
     last_tick: int = NEVER
+    trouble: list[str] = field(default_factory=list)
+    """A sentence for each loss."""
     lost: dict[str, int] = field(default_factory=dict)
     """Tick [ns] at which each lost service fell silent."""
     failure: str | None = None
@@ -290,6 +292,7 @@ class Conductor:
         row = self._rules.roles[role]
         self.outcome.lost[role] = tick
         sentence = f"{role} lost at tick {tick / 1e9:.3f} s: {how}"
+        self.outcome.trouble.append(sentence)
         if row.observer:
             log.warning("%s; the run goes on", sentence)
             return

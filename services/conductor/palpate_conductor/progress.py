@@ -26,6 +26,7 @@ class RunDisplay:
         self._console = console
         self._quiet = quiet
         self._phase = -1
+        self._troubles = 0
         self._bar = Progress(
             SpinnerColumn(),
             TextColumn("[bold]{task.fields[phase]:<8}"),
@@ -47,6 +48,9 @@ class RunDisplay:
 
     def tell(self, progress: RunProgress) -> None:
         """Shows where the run stands."""
+        for sentence in progress.trouble[self._troubles :]:
+            self._console.print(f"[bold red]{sentence}[/]", highlight=False, soft_wrap=True)
+        self._troubles = len(progress.trouble)
         exam = progress.collected.exam
         if exam is None:
             return

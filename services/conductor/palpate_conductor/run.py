@@ -59,6 +59,8 @@ class Progress:
     """Simulated time [ns]."""
     real_time_factor: float
     collected: Collected
+    trouble: tuple[str, ...] = ()
+    """What went wrong so far: who was lost, when and how."""
 
 
 Tell = Callable[[Progress], None]
@@ -133,7 +135,7 @@ def conduct(
     def report(c: Conductor) -> None:
         wall = max(c.elapsed_s, 1e-9)
         t = max(collector.collected.exam_time, 0)
-        tell(Progress(t, t / NS / wall, collector.collected))
+        tell(Progress(t, t / NS / wall, collector.collected, tuple(c.outcome.trouble)))
 
     try:
         outcome = conductor.run(died, report)
