@@ -1,0 +1,99 @@
+"""The architecture's walls: who imports whom, who may know the phantom, what a step may not touch. By reading the source."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from palpate_bus.contract import contract
+
+ROOT = Path(__file__).resolve().parents[2]
+STEPPED = [name for name, role in contract().roles.items() if not role.observer]
+"""Roles that step in simulated time."""
+MAY_KNOW_THE_PHANTOM = {"tissue"}
+MAY_SPEAK_TO_THE_BUS = {"service.py", "__main__.py", "messages.py", "bench.py"}
+NOT_IN_A_STEP = {
+    "zenoh",
+    "socket",
+    "threading",
+    "asyncio",
+    "multiprocessing",
+    "subprocess",
+    "time",
+    "datetime",
+    "random",
+    "secrets",
+    "uuid",
+}
+
+
+def modules(role: str) -> list[tuple[Path, ast.Module]]:
+    folder = ROOT / "services" / role / f"palpate_{role}"
+    found = sorted(folder.rglob("*.py"))
+    assert found, f"no modules in {folder}"
+    return [(path, ast.parse(path.read_text(encoding="utf-8"))) for path in found]
+
+
+def imports(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """(module, name) of every import, wherever it stands."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, "") for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from ((node.module or "", alias.name) for alias in node.names)
+
+
+def test_layers_are_kept() -> None:
+    command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_import_linter_knows_every_package() -> None:
+    text = (ROOT / ".importlinter").read_text(encoding="utf-8")
+    packages = {path.parent.name for path in ROOT.glob("*/palpate_*/__init__.py")}
+    packages |= {path.parent.name for path in ROOT.glob("services/*/palpate_*/__init__.py")}
+    for package in packages:
+        assert text.count(f"    {package}\n") >= 3, f"{package} is missing from .importlinter"
+
+
+@pytest.mark.parametrize("role", STEPPED)
+def test_the_algorithm_never_imports_the_bus(role: str) -> None:
+    for path, tree in modules(role):
+        if path.name not in MAY_SPEAK_TO_THE_BUS:
+            named = [module for module, _ in imports(tree) if module.startswith("palpate_bus")]
+            assert not named, f"{path.relative_to(ROOT)} imports {named}; only {sorted(MAY_SPEAK_TO_THE_BUS)} may"
+
+
+@pytest.mark.parametrize("role", [role for role in STEPPED if role not in MAY_KNOW_THE_PHANTOM])
+def test_the_examination_does_not_look_at_the_phantom(role: str) -> None:
+    for path, tree in modules(role):
+        where = path.relative_to(ROOT)
+        looked = [node.lineno for node in ast.walk(tree) if isinstance(node, ast.Attribute) and node.attr == "phantom"]
+        assert not looked, f"{where}, lines {looked}: reads .phantom"
+        for module, name in imports(tree):
+            allowed = not module.startswith("palpate_models.phantom") or name == "quadrant"  # a name for a place, no secret
+            assert allowed, f"{where} imports {name} of {module}"
+
+
+@pytest.mark.parametrize("role", STEPPED)
+def test_a_step_touches_no_socket_thread_clock_or_global_generator(role: str) -> None:
+    for path, tree in modules(role):
+        if path.name == "bench.py":
+            continue
+        named = {module.partition(".")[0] for module, _ in imports(tree)} & NOT_IN_A_STEP
+        assert not named, f"{path.relative_to(ROOT)} imports {sorted(named)}"
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random":
+                used = f"{path.relative_to(ROOT)}:{node.lineno}"
+                assert node.attr in {"Generator", "PCG64", "SeedSequence", "BitGenerator"}, (
+                    f"{used}: numpy.random.{node.attr} is not seeded by us"
+                )
+
+
+def test_plant_and_controller_share_no_dynamics() -> None:
+    for role, others in (("robot", {"pinocchio", "coal"}), ("control", {"dartpy"})):
+        for path, tree in modules(role):
+            assert not {module.partition(".")[0] for module, _ in imports(tree)} & others, path
