@@ -1,0 +1,108 @@
+"""Cross-compiling a folder of C into the shared libraries of an FMU, by zig's C compiler from PyPI."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wno-strict-prototypes")
+"""The one exception is for the standard's own headers."""
+OPTIMISE = ("-O3", "-ffp-contract=off", "-fno-sanitize=all", "-g0")
+"""No contraction into fused operations, so that platforms agree to the last bits of libm."""
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A target by its folder names in FMI."""
+
+    tuple_3: str
+    """Folder in FMI 3.0."""
+    folder_2: str | None
+    """Folder in FMI 2.0, which has no name for 64-bit ARM."""
+    triple: str
+    """The target by zig's name."""
+    suffix: str
+
+
+PLATFORMS: tuple[Platform, ...] = (
+    Platform("x86_64-linux", "linux64", "x86_64-linux-gnu.2.17", ".so"),
+    Platform("aarch64-linux", None, "aarch64-linux-gnu.2.17", ".so"),
+    Platform("x86_64-windows", "win64", "x86_64-windows-gnu", ".dll"),
+    Platform("aarch64-windows", None, "aarch64-windows-gnu", ".dll"),
+    Platform("x86_64-darwin", "darwin64", "x86_64-macos.11.0", ".dylib"),
+    Platform("aarch64-darwin", None, "aarch64-macos.11.0", ".dylib"),
+)
+
+
+class CompileError(RuntimeError):
+    """The C compiler refused; holds what it said."""
+
+
+def platforms(version: int, names: Sequence[str] | None = None) -> tuple[Platform, ...]:
+    """The platforms that an FMI version has a folder for; those of `names` (of FMI 3.0), if given.
+
+    Raises ValueError naming one that is not known.
+    """
+    known = {platform.tuple_3: platform for platform in PLATFORMS if version >= 3 or platform.folder_2}
+    if names is None:
+        return tuple(known.values())
+    for name in names:
+        if name not in known:
+            raise ValueError(f"FMI {version} has no platform {name!r}; platforms are {', '.join(known)}")
+    return tuple(known[name] for name in names)
+
+
+def native() -> str:
+    """This machine's platform, by its name in FMI 3.0."""
+    machine = {"arm64": "aarch64", "amd64": "x86_64"}.get(os.uname().machine if hasattr(os, "uname") else "x86_64")
+    machine = machine or os.uname().machine
+    system = {"darwin": "darwin", "win32": "windows"}.get(sys.platform, "linux")
+    return f"{machine}-{system}"
+
+
+def fmi_headers() -> Path:
+    """The folder of the standard's C headers, which the FMPy package brings."""
+    import fmpy  # noqa: PLC0415  (slow to import)
+
+    return Path(fmpy.__file__).parent / "c-code"
+
+
+def compile_library(folder: Path, sources: Sequence[str], platform: Platform, includes: Sequence[Path] = ()) -> bytes:
+    """The shared library of `sources` in `folder` for a platform; remembered in a cache by their content.
+
+    Raises CompileError.
+    """
+    flags = [*WARNINGS, *OPTIMISE, *(f"-I{path}" for path in includes)]
+    key = hashlib.sha256(f"{metadata.version('ziglang')} {platform} {WARNINGS} {OPTIMISE} {list(sources)}".encode())
+    for path in sorted([*folder.glob("*.[ch]"), *(header for include in includes for header in include.glob("*.h"))]):
+        key.update(path.name.encode() + b"\0" + path.read_bytes())
+    cached = _cache() / f"{key.hexdigest()}{platform.suffix}"
+    if cached.is_file():
+        return cached.read_bytes()
+    with tempfile.TemporaryDirectory() as work:
+        out = Path(work) / f"library{platform.suffix}"
+        link = ["-shared", "-fvisibility=hidden", "-s", "-o", str(out), *sources]
+        if "windows" not in platform.triple:
+            link += ["-fPIC", "-lm"]
+        command = [sys.executable, "-m", "ziglang", "cc", "-target", platform.triple, *flags, *link]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode or not out.is_file():
+            raise CompileError(f"cannot compile for {platform.tuple_3}:\n{done.stderr}")
+        library = out.read_bytes()
+    cached.parent.mkdir(parents=True, exist_ok=True)
+    partial = cached.with_suffix(f".{os.getpid()}")
+    partial.write_bytes(library)
+    partial.replace(cached)
+    return library
+
+
+def _cache() -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or (Path.home() / ".cache")
+    return Path(root) / "palpate" / "fmu"

@@ -1,0 +1,199 @@
+"""modelDescription.xml for FMI 2.0 and 3.0, from the table of variables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import product
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_fmu.variables import Kind, Role, Sizes, Variable, variables
+
+Array = NDArray[np.float64]
+
+MODEL = "abdomen"
+"""The model identifier: name of binaries and prefix of functions."""
+STEP_S = 1e-3
+"""The step size a master should take."""
+SOURCES = ("component.c", "matrices.c", "phantom.c", "surface.c", "tissue.c")
+
+UNITS: dict[str, dict[str, str]] = {
+    "1": {},
+    "s": {"s": "1"},
+    "m": {"m": "1"},
+    "m/s": {"m": "1", "s": "-1"},
+    "rad": {"rad": "1"},
+    "rad/s": {"rad": "1", "s": "-1"},
+    "1/min": {"s": "-1", "factor": repr(1 / 60)},
+    "N": {"kg": "1", "m": "1", "s": "-2"},
+    "N.m": {"kg": "1", "m": "2", "s": "-2"},
+    "N/m3": {"kg": "1", "m": "-2", "s": "-2"},
+    "J": {"kg": "1", "m": "2", "s": "-2"},
+}
+
+
+def _causality(variable: Variable) -> dict[str, str]:
+    """Causality, variability and initial, where they are not FMI's defaults."""
+    if variable.role is Role.INDEPENDENT and variable.kind is Kind.READ:
+        return {"causality": "independent", "variability": "continuous"}
+    if variable.kind is Kind.INPUT:
+        return {"causality": "input", "variability": "continuous"}
+    if variable.parameter:
+        return {
+            "causality": "parameter",
+            "variability": "fixed" if variable.kind is Kind.FIXED else "tunable",
+            "initial": "exact",
+        }
+    if variable.role is Role.CALCULATED:
+        return {"causality": "calculatedParameter", "variability": "fixed", "initial": "calculated"}
+    continuous = "discrete" if variable.integer else "continuous"
+    return {"causality": str(variable.role), "variability": continuous, "initial": "calculated"}
+
+
+def _number(value: float, integer: bool) -> str:
+    return str(int(value)) if integer else repr(float(value))
+
+
+def _type_attributes(variable: Variable) -> dict[str, str]:
+    attributes = {} if variable.unit is None else {"unit": variable.unit}
+    for name, bound in (("min", variable.low), ("max", variable.high)):
+        if bound is not None:
+            attributes[name] = _number(bound, variable.integer)
+    return attributes
+
+
+def _start(variable: Variable, starts: Mapping[str, Array]) -> Array | None:
+    if variable.name in starts:
+        return starts[variable.name]
+    return np.atleast_1d(np.asarray(variable.start, dtype=np.float64)) if variable.kind is Kind.INPUT else None
+
+
+def _units(root: ET.Element) -> None:
+    definitions = ET.SubElement(root, "UnitDefinitions")
+    for name, base in UNITS.items():
+        ET.SubElement(ET.SubElement(definitions, "Unit", name=name), "BaseUnit", base)
+
+
+def _common(root: ET.Element) -> None:
+    _units(root)
+    categories = ET.SubElement(root, "LogCategories")
+    ET.SubElement(categories, "Category", name="logStatusError", description="Why a call failed")
+    ET.SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="1.0", stepSize=repr(STEP_S))
+
+
+def _text(root: ET.Element) -> bytes:
+    ET.indent(root)
+    return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
+
+
+def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes) -> bytes:
+    """modelDescription.xml of FMI 3.0, where a variable is an array."""
+    root = ET.Element(
+        "fmiModelDescription",
+        fmiVersion="3.0",
+        modelName=MODEL,
+        instantiationToken=token,
+        description=about,
+        generationTool="Palpate",
+        license="Apache-2.0",
+        variableNamingConvention="structured",
+    )
+    ET.SubElement(
+        root,
+        "CoSimulation",
+        modelIdentifier=MODEL,
+        canHandleVariableCommunicationStepSize="true",
+        canGetAndSetFMUState="true",
+        canSerializeFMUState="true",
+        recommendedIntermediateInputSmoothness="0",
+    )
+    _common(root)
+    table = variables(3)
+    parent = ET.SubElement(root, "ModelVariables")
+    for variable in table:
+        attributes = {"name": variable.name, "valueReference": str(variable.vr), "description": variable.doc}
+        attributes |= _causality(variable) | _type_attributes(variable)
+        start = _start(variable, starts)
+        if start is not None:
+            attributes["start"] = " ".join(_number(value, variable.integer) for value in start)
+        element = ET.SubElement(parent, "Int32" if variable.integer else "Float64", attributes)
+        for extent in variable.extents(sizes):
+            ET.SubElement(element, "Dimension", start=str(extent))
+    structure = ET.SubElement(root, "ModelStructure")
+    outputs = [v for v in table if _causality(v)["causality"] == "output"]
+    calculated = [v for v in table if _causality(v)["causality"] == "calculatedParameter"]
+    for name, members in (("Output", outputs), ("InitialUnknown", [*outputs, *calculated])):
+        for variable in members:
+            ET.SubElement(structure, name, valueReference=str(variable.vr))
+    return _text(root)
+
+
+def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes) -> bytes:
+    """modelDescription.xml of FMI 2.0, where each element of an array is a scalar."""
+    root = ET.Element(
+        "fmiModelDescription",
+        fmiVersion="2.0",
+        modelName=MODEL,
+        guid=token,
+        description=about,
+        generationTool="Palpate",
+        license="Apache-2.0",
+        variableNamingConvention="structured",
+    )
+    support = ET.SubElement(
+        root,
+        "CoSimulation",
+        modelIdentifier=MODEL,
+        canHandleVariableCommunicationStepSize="true",
+        canGetAndSetFMUstate="true",
+        canSerializeFMUstate="true",
+        canNotUseMemoryManagementFunctions="true",
+    )
+    files = ET.SubElement(support, "SourceFiles")
+    for name in ("fmi2.c", *SOURCES):
+        ET.SubElement(files, "File", name=name)
+    _common(root)
+    parent = ET.SubElement(root, "ModelVariables")
+    outputs, unknowns = [], []
+    for variable in variables(2):
+        start = _start(variable, starts)
+        causality = _causality(variable)
+        for k, index in enumerate(product(*(range(1, extent + 1) for extent in variable.extents(sizes)))):
+            suffix = f"[{','.join(map(str, index))}]" if index else ""
+            scalar = ET.SubElement(
+                parent,
+                "ScalarVariable",
+                {
+                    "name": variable.name + suffix,
+                    "valueReference": str(variable.vr + k),
+                    "description": variable.doc,
+                    **causality,
+                },
+            )
+            attributes = _type_attributes(variable)
+            if start is not None:
+                attributes["start"] = _number(start[k], variable.integer)
+            ET.SubElement(scalar, "Integer" if variable.integer else "Real", attributes)
+            if causality["causality"] == "output":
+                outputs.append(len(parent))
+            if causality["causality"] in ("output", "calculatedParameter"):
+                unknowns.append(len(parent))
+    structure = ET.SubElement(root, "ModelStructure")
+    for name, members in (("Outputs", outputs), ("InitialUnknowns", unknowns)):
+        group = ET.SubElement(structure, name)
+        for member in members:
+            ET.SubElement(group, "Unknown", index=str(member))
+    return _text(root)
+
+
+def build_description() -> bytes:
+    """sources/buildDescription.xml of FMI 3.0: how to compile the FMU."""
+    root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
+    configuration = ET.SubElement(root, "BuildConfiguration", modelIdentifier=MODEL)
+    files = ET.SubElement(configuration, "SourceFileSet", language="C99")
+    for name in ("fmi3.c", *SOURCES):
+        ET.SubElement(files, "SourceFile", name=name)
+    ET.SubElement(configuration, "Library", name="m", external="true")
+    return _text(root)

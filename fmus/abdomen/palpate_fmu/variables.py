@@ -1,0 +1,206 @@
+"""The FMU's variables: one table, from which modelDescription.xml, the C code's table and the README's come.
+
+A value reference stands for a whole array in FMI 3.0. FMI 2.0 has scalars only: there, element k of a variable has its
+value reference plus k, and is named `name[1]` or `name[1,2]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from math import prod
+
+LESIONS = 8
+"""Most lesions that an FMU can have."""
+BRANCHES = 4
+"""Most Prony branches."""
+
+
+class Kind(StrEnum):
+    """What a variable is for, by the C code's names."""
+
+    INPUT = "INPUT"
+    FIXED = "FIXED"
+    TUNABLE = "TUNABLE"
+    READ = "READ"
+
+
+class Role(StrEnum):
+    """How FMI classifies what can only be read."""
+
+    OUTPUT = "output"
+    LOCAL = "local"
+    CALCULATED = "calculatedParameter"
+    INDEPENDENT = "independent"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """The sizes of a phantom's mesh."""
+
+    vertices: int
+    triangles: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A row of the table."""
+
+    vr: int
+    name: str
+    member: str
+    """Where the C code keeps it."""
+    doc: str
+    unit: str | None = None
+    shape: tuple[int | str, ...] = ()
+    """Extents; `vertices`, `triangles` or `samples` stand for the phantom's."""
+    kind: Kind = Kind.READ
+    role: Role = Role.OUTPUT
+    group: str = "NONE"
+    """What the C code refreshes before it is read."""
+    integer: bool = False
+    low: float | None = None
+    high: float | None = None
+    start: float | tuple[float, ...] | None = None
+    """The start value; for a parameter only where the phantom's scenario has none."""
+    versions: tuple[int, ...] = (2, 3)
+
+    @property
+    def parameter(self) -> bool:
+        """Whether it is set before or, if tunable, during the simulation and held."""
+        return self.kind in (Kind.FIXED, Kind.TUNABLE)
+
+    def extents(self, sizes: Sizes) -> tuple[int, ...]:
+        """Its shape for a phantom."""
+        return tuple(getattr(sizes, extent) if isinstance(extent, str) else extent for extent in self.shape)
+
+    def count(self, sizes: Sizes) -> int:
+        """How many values it has."""
+        return prod(self.extents(sizes))
+
+
+def _input(vr: int, name: str, member: str, unit: str, bound: float, start: tuple[float, ...], doc: str) -> Variable:
+    return Variable(vr, name, member, doc, unit, (3,), Kind.INPUT, low=-bound, high=bound, start=start)
+
+
+def _parameter(
+    vr: int,
+    name: str,
+    unit: str | None,
+    low: float,
+    high: float,
+    doc: str,
+    start: float | tuple[float, ...] | None = None,
+    shape: tuple[int, ...] = (),
+    kind: Kind = Kind.FIXED,
+    member: str | None = None,
+    integer: bool = False,
+) -> Variable:
+    member = f"parameters.{member or name}"
+    return Variable(vr, name, member, doc, unit, shape, kind, integer=integer, low=low, high=high, start=start)
+
+
+TABLE: tuple[Variable, ...] = (
+    Variable(0, "time", "outputs.time", "Simulated time", "s", role=Role.INDEPENDENT, group="STATE"),
+    _input(1, "indenter_position", "inputs.position", "m", 10, (0.0, 0.0, 1.0), "Centre of the sphere at the end of the step"),
+    _input(4, "indenter_velocity", "inputs.velocity", "m/s", 10, (0.0, 0.0, 0.0), "Velocity of the centre, for friction"),
+    _input(7, "indenter_angular_velocity", "inputs.spin", "rad/s", 100, (0.0, 0.0, 0.0), "Angular velocity, for friction"),
+    Variable(10, "contact_force", "outputs.force", "Force of the tissue on the sphere, mean over the step", "N", (3,), group="STATE"),
+    Variable(13, "contact_torque", "outputs.torque", "Its torque about the sphere's centre", "N.m", (3,), group="STATE"),
+    Variable(16, "indentation_depth", "outputs.depth", "Of the sphere's lowest point below the rest surface", "m", group="UNDER"),
+    Variable(17, "surface_point", "outputs.point", "Point of the rest surface nearest to the centre", "m", (3,), group="UNDER"),
+    Variable(20, "surface_normal", "outputs.normal", "Outward normal there", "1", (3,), group="UNDER", low=-1.001, high=1.001),
+    Variable(23, "local_stiffness", "outputs.k_w", "Foundation modulus k_w there", "N/m3", group="UNDER", low=0),
+    Variable(24, "normal_force", "outputs.normal_force", "Share of the force along that normal", "N", group="UNDER", low=0),
+    Variable(25, "tangential_force", "outputs.tangential_force", "Share across it", "N", group="UNDER", low=0),
+    Variable(26, "contacts", "outputs.contacts", "Vertices in contact", group="STATE", integer=True, low=0),
+    Variable(27, "breathing_excursion", "outputs.excursion", "Outward, where the profile is 1", "m", group="STATE"),
+    Variable(28, "elastic_energy", "outputs.energy", "Stored in springs, Maxwell branches and skin", "J", group="ENERGY", low=0),
+    _parameter(30, "indenter_radius", "m", 0.001, 0.1, "Radius of the sphere", 0.015, kind=Kind.TUNABLE, member="radius"),
+    _parameter(31, "stiffness_scale", "1", 0.01, 100, "Factor on the foundation modulus everywhere", 1.0, member="scale"),
+    _parameter(32, "pasternak_length", "m", 0.002, 0.1, "l = sqrt(G / k_w)", member="length"),
+    _parameter(33, "dashpot", "s", 1e-4, 1, "Dashpot over foundation modulus"),
+    _parameter(34, "friction", "1", 0, 2, "Coulomb friction between indenter and skin"),
+    _parameter(35, "breathing_amplitude", "m", 0, 0.02, "Half of the peak-to-peak excursion", member="amplitude"),
+    _parameter(36, "breathing_rate", "1/min", 0, 60, "Breaths a minute", member="rate"),
+    _parameter(37, "breathing_phase", "rad", -6.2831854, 6.2831854, "Phase of breathing at time 0", 0.0, member="phase"),
+    _parameter(38, "lesion_count", None, 0, LESIONS, "How many entries of the lesion list count", integer=True),
+    _parameter(40, "prony_g", "1", 0, 1, "Relaxing fractions of the stiffness, sum below 1", shape=(BRANCHES,)),
+    _parameter(44, "prony_tau", "s", 1e-4, 1e6, "Their time constants", shape=(BRANCHES,)),
+    _parameter(48, "lesion_centre", "m", -10, 10, "Centre in the xy plane", shape=(LESIONS, 2)),
+    _parameter(64, "lesion_radii", "m", 1e-4, 10, "Half axes of the half-contrast outline", shape=(LESIONS, 2)),
+    _parameter(80, "lesion_contrast", "1", 0.001, 20, "Stiffness at the centre over that without", shape=(LESIONS,)),
+    _parameter(88, "lesion_edge", "m", 1e-4, 10, "Width of the smooth edge", shape=(LESIONS,)),
+    Variable(
+        1000, "sample_displacement", "arrays.sample_inward", "Inward displacement of sample vertices", "m", ("samples",),
+        group="INWARD", versions=(2,),
+    ),
+    Variable(
+        1500, "sample_position", "arrays.sample_position", "Rest position of sample vertices", "m", ("samples", 3),
+        role=Role.CALCULATED, versions=(2,),
+    ),
+    Variable(
+        5000, "surface_displacement", "arrays.inward", "Inward displacement of every vertex", "m", ("vertices",),
+        group="INWARD", versions=(3,),
+    ),
+    Variable(
+        5001, "deformed_position", "arrays.position", "Vertices of the deformed surface", "m", ("vertices", 3),
+        role=Role.LOCAL, group="SHAPE", versions=(3,),
+    ),
+    Variable(
+        5002, "deformed_normal", "arrays.normal", "Its outward normals", "1", ("vertices", 3),
+        role=Role.LOCAL, group="SHAPE", versions=(3,),
+    ),
+    Variable(
+        5003, "rest_position", "arrays.rest_position", "Vertices at rest", "m", ("vertices", 3),
+        role=Role.CALCULATED, versions=(3,),
+    ),
+    Variable(
+        5004, "rest_normal", "arrays.rest_normal", "Outward normals at rest", "1", ("vertices", 3),
+        role=Role.CALCULATED, versions=(3,),
+    ),
+    Variable(
+        5005, "stiffness", "arrays.stiffness", "k_w with lesions", "N/m3", ("vertices",),
+        role=Role.CALCULATED, group="MATRICES", versions=(3,),
+    ),
+    Variable(
+        5006, "background", "arrays.background", "k_w without lesions", "N/m3", ("vertices",),
+        role=Role.CALCULATED, group="MATRICES", versions=(3,),
+    ),
+    Variable(
+        5007, "lesion", "arrays.lesion", "Lesion in which a vertex lies, from 0; -1: none", None, ("vertices",),
+        role=Role.CALCULATED, group="MATRICES", integer=True, versions=(3,),
+    ),
+    Variable(
+        5008, "triangles", "arrays.triangles", "Vertex indices from 0, counter-clockwise seen from outside", None,
+        ("triangles", 3), role=Role.CALCULATED, integer=True, versions=(3,),
+    ),
+)  # fmt: skip
+
+
+def variables(version: int) -> tuple[Variable, ...]:
+    """The variables of an FMI version (2 or 3)."""
+    return tuple(variable for variable in TABLE if version in variable.versions)
+
+
+def parameters() -> Iterator[Variable]:
+    """The variables that have a start value in the phantom file, in its order."""
+    return (variable for variable in TABLE if variable.parameter)
+
+
+def c_table() -> str:
+    """The table as C code, to be included where ROW is defined."""
+    lines = ["/* Written by the exporter from its table of variables. */"]
+    for variable in TABLE:
+        of, count = "PLAIN", variable.shape
+        if variable.shape and isinstance(variable.shape[0], str):
+            of, count = variable.shape[0].upper(), variable.shape[1:]
+        each = prod(extent for extent in count if isinstance(extent, int))
+        low, high = (bound if variable.kind is not Kind.READ else 0.0 for bound in (variable.low, variable.high))
+        lines.append(
+            f"ROW({variable.vr}, {'INTEGER' if variable.integer else 'REAL'}, {variable.kind}, {of}, {each}, {float(low or 0)!r}, "
+            f'{float(high or 0)!r}, {variable.group}, {variable.member}, "{variable.name}")'
+        )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,424 @@
+#include "component.h"
+
+#include <math.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define LONGEST_STEP_S 60.0
+#define PERIOD_S 1e-3    /* a longer step is cut, so that contact and friction are followed */
+#define MOST_SUBSTEPS 64 /* of a period */
+#define STEP_TOLERANCE 1e-6
+
+static const Row ROWS[] = {
+#define ROW(vr, type, access, of, count, low, high, group, member, name) \
+    {vr, TYPE_##type, ACCESS_##access, COUNT_##of, count, low, high, GROUP_##group, offsetof(Component, member), name},
+#include "variables.h"
+#undef ROW
+};
+#define ROW_COUNT (sizeof ROWS / sizeof ROWS[0])
+
+void component_say(const Component *c, const char *format, ...) {
+    char message[512];
+    va_list arguments;
+    if (!c->log) return;
+    va_start(arguments, format);
+    vsnprintf(message, sizeof message, format, arguments);
+    va_end(arguments);
+    c->log(c->environment, message);
+}
+
+static size_t row_count(const Component *c, const Row *row) {
+    const size_t each = (size_t)row->count;
+    switch (row->of) {
+        case COUNT_VERTICES: return each * (size_t)c->phantom->n;
+        case COUNT_TRIANGLES: return each * (size_t)c->phantom->m;
+        case COUNT_SAMPLES: return each * (size_t)c->phantom->samples;
+        default: return each;
+    }
+}
+
+static char *row_data(Component *c, const Row *row) {
+    char *place = (char *)c + row->offset;
+    if (row->of != COUNT_PLAIN) {
+        void *array;
+        memcpy(&array, place, sizeof array);
+        return array;
+    }
+    return place;
+}
+
+static void start_values(Component *c) {
+    int k = 0;
+    memset(&c->inputs, 0, sizeof c->inputs);
+    c->inputs.position[2] = 1; /* out of reach of the abdomen */
+    for (size_t r = 0; r < ROW_COUNT; r++) {
+        const Row *row = &ROWS[r];
+        char *data = row_data(c, row);
+        if (row->access != ACCESS_FIXED && row->access != ACCESS_TUNABLE) continue;
+        for (int i = 0; i < row->count; i++, k++) {
+            if (row->type == TYPE_REAL) {
+                memcpy(data + (size_t)i * sizeof(double), &c->phantom->start[k], sizeof(double));
+            } else {
+                const int32_t value = (int32_t)c->phantom->start[k];
+                memcpy(data + (size_t)i * sizeof value, &value, sizeof value);
+            }
+        }
+    }
+}
+
+/* Whether the file has as many start values as there are, each within its bounds. */
+static int start_values_fit(const Component *c) {
+    int k = 0;
+    for (size_t r = 0; r < ROW_COUNT; r++) {
+        if (ROWS[r].access != ACCESS_FIXED && ROWS[r].access != ACCESS_TUNABLE) continue;
+        for (int i = 0; i < ROWS[r].count; i++, k++) {
+            if (k >= c->phantom->values) return 0;
+            if (!(c->phantom->start[k] >= ROWS[r].low && c->phantom->start[k] <= ROWS[r].high)) return 0;
+        }
+    }
+    return k == c->phantom->values;
+}
+
+static int allocate(Component *c) {
+    const size_t n = (size_t)c->phantom->n, samples = (size_t)c->phantom->samples + 1;
+    Arrays *a = &c->arrays;
+    c->matrices = matrices_new(c->phantom);
+    c->surface = surface_new(c->phantom);
+    if (!c->matrices || !c->surface) return 0;
+    c->tissue = tissue_new(c->phantom, c->matrices);
+    a->inward = calloc(n, sizeof(double));
+    a->position = calloc(3 * n, sizeof(double));
+    a->normal = calloc(3 * n, sizeof(double));
+    a->sample_inward = calloc(samples, sizeof(double));
+    a->sample_position = calloc(3 * samples, sizeof(double));
+    a->rest_position = c->phantom->vertices;
+    a->rest_normal = c->phantom->normals;
+    a->stiffness = c->matrices->k_w;
+    a->background = c->matrices->plain;
+    a->lesion = c->matrices->lesion;
+    a->triangles = c->phantom->triangles;
+    return c->tissue && a->inward && a->position && a->normal && a->sample_inward && a->sample_position;
+}
+
+Component *component_new(const char *resources, const char *token, Log log, void *environment) {
+    Component *c = calloc(1, sizeof *c);
+    char error[400], *path;
+    size_t length;
+    if (!c) return NULL;
+    c->log = log;
+    c->environment = environment;
+    length = resources ? strlen(resources) : 0;
+    path = malloc(length + 16);
+    if (!length || !path) {
+        component_say(c, length ? "out of memory" : "no path to the FMU's resources was given");
+        free(path);
+        component_free(c);
+        return NULL;
+    }
+    memcpy(path, resources, length);
+    if (path[length - 1] != '/' && path[length - 1] != '\\') path[length++] = '/';
+    memcpy(path + length, "phantom.bin", 12);
+    c->phantom = phantom_read(path, error, sizeof error);
+    free(path);
+    if (!c->phantom) {
+        component_say(c, "%s", error);
+    } else if (!token || strcmp(token, c->phantom->token) != 0) {
+        component_say(c, "the token %s is not that of this FMU, %s", token ? token : "(none)", c->phantom->token);
+    } else if (!start_values_fit(c)) {
+        component_say(c, "the start values in the phantom file do not fit this FMU's parameters");
+    } else if (!allocate(c)) {
+        component_say(c, "out of memory for %ld vertices", (long)c->phantom->n);
+    } else {
+        for (int32_t i = 0; i < c->phantom->samples; i++) {
+            memcpy(c->arrays.sample_position + 3 * i, c->phantom->vertices + 3 * c->phantom->sample[i], 3 * sizeof(double));
+        }
+        component_reset(c);
+        return c;
+    }
+    component_free(c);
+    return NULL;
+}
+
+void component_free(Component *c) {
+    if (!c) return;
+    free(c->arrays.inward);
+    free(c->arrays.position);
+    free(c->arrays.normal);
+    free(c->arrays.sample_inward);
+    free(c->arrays.sample_position);
+    tissue_free(c->tissue);
+    surface_free(c->surface);
+    matrices_free(c->matrices);
+    phantom_free(c->phantom);
+    free(c);
+}
+
+int component_expects(Component *c, int phase_is_right, const char *function) {
+    static const char *const NAMES[] = {"instantiated", "initialization mode", "step mode", "terminated"};
+    if (!phase_is_right) component_say(c, "%s is not allowed in the state: %s", function, NAMES[c->phase]);
+    return phase_is_right;
+}
+
+int component_reset(Component *c) {
+    start_values(c);
+    c->phase = PHASE_INSTANTIATED;
+    c->has_stop = 0;
+    c->stale_matrices = 1;
+    c->fresh = 0;
+    c->tissue->parameters = c->parameters;
+    tissue_reset(c->tissue, 0);
+    return 1;
+}
+
+int component_find(Component *c, uint32_t vr, Type type, int flat, Slot *slot) {
+    for (size_t r = 0; r < ROW_COUNT; r++) {
+        const Row *row = &ROWS[r];
+        const size_t count = row_count(c, row);
+        if (row->vr > vr || (flat ? vr - row->vr >= count : vr != row->vr)) continue;
+        if (row->type != type) {
+            component_say(c, "%s (value reference %lu) is of another type", row->name, (unsigned long)vr);
+            return 0;
+        }
+        slot->row = row;
+        slot->first = flat ? vr - row->vr : 0;
+        slot->count = flat ? 1 : count;
+        return 1;
+    }
+    component_say(c, "there is no variable with value reference %lu", (unsigned long)vr);
+    return 0;
+}
+
+static void assemble(Component *c) {
+    if (!c->stale_matrices) return;
+    matrices_assemble(c->matrices, c->phantom, &c->parameters);
+    c->stale_matrices = 0;
+}
+
+/* The wrench's share along the surface normal and across it; the indentation at the rest point beneath. */
+static void look_under(Component *c) {
+    const State *s = &c->tissue->state;
+    const double *p = s->moved ? s->at : c->inputs.position;
+    Outputs *o = &c->outputs;
+    RestPoint under;
+    double across = 0, along = 0;
+    assemble(c);
+    under = surface_nearest(c->surface, p, s->excursion, c->matrices->k_w);
+    for (int k = 0; k < 3; k++) {
+        o->point[k] = under.position[k];
+        o->normal[k] = under.normal[k];
+        along += s->force[k] * under.normal[k];
+    }
+    for (int k = 0; k < 3; k++) {
+        const double part = s->force[k] - along * under.normal[k];
+        across += part * part;
+    }
+    o->depth = c->parameters.radius - under.height;
+    o->k_w = under.k_w;
+    o->normal_force = along > 0 ? along : 0;
+    o->tangential_force = sqrt(across);
+}
+
+static void displace(Component *c) {
+    for (int32_t i = 0; i < c->phantom->n; i++) c->arrays.inward[i] = tissue_inward(c->tissue, i);
+    for (int32_t i = 0; i < c->phantom->samples; i++) c->arrays.sample_inward[i] = c->arrays.inward[c->phantom->sample[i]];
+}
+
+static void deform(Component *c) {
+    const Phantom *p = c->phantom;
+    displace(c);
+    for (int32_t i = 0; i < p->n; i++) {
+        for (int k = 0; k < 3; k++) {
+            c->arrays.position[3 * i + k] = p->vertices[3 * i + k] - c->arrays.inward[i] * p->normals[3 * i + k];
+        }
+    }
+    surface_normals(c->surface, c->arrays.inward, c->arrays.normal);
+}
+
+static void refresh(Component *c, Group group) {
+    const State *s = &c->tissue->state;
+    if (group == GROUP_NONE || c->fresh & 1u << group) return;
+    switch (group) {
+        case GROUP_MATRICES: assemble(c); break;
+        case GROUP_STATE:
+            memcpy(c->outputs.force, s->force, sizeof s->force);
+            memcpy(c->outputs.torque, s->torque, sizeof s->torque);
+            c->outputs.contacts = s->contacts;
+            c->outputs.excursion = s->excursion;
+            c->outputs.time = s->time;
+            break;
+        case GROUP_UNDER: look_under(c); break;
+        case GROUP_ENERGY:
+            assemble(c);
+            c->outputs.energy = tissue_energy(c->tissue);
+            break;
+        case GROUP_INWARD: displace(c); break;
+        case GROUP_SHAPE: deform(c); break;
+        default: break;
+    }
+    c->fresh |= 1u << group;
+}
+
+static size_t size_of(Type type) { return type == TYPE_REAL ? sizeof(double) : sizeof(int32_t); }
+
+int component_read(Component *c, const Slot *slot, void *values) {
+    const size_t size = size_of(slot->row->type);
+    refresh(c, slot->row->group);
+    memcpy(values, row_data(c, slot->row) + slot->first * size, slot->count * size);
+    return 1;
+}
+
+int component_check(Component *c, const Slot *slot, const void *values) {
+    const Row *row = slot->row;
+    const int before = c->phase == PHASE_INSTANTIATED || c->phase == PHASE_INITIALIZATION;
+    if (row->access == ACCESS_READ) {
+        component_say(c, "%s cannot be set: it is an output", row->name);
+        return 0;
+    }
+    if (c->phase == PHASE_TERMINATED || (row->access == ACCESS_FIXED && !before)) {
+        component_say(c, "%s cannot be set any more: it is fixed after initialization", row->name);
+        return 0;
+    }
+    for (size_t i = 0; i < slot->count; i++) {
+        double value;
+        if (row->type == TYPE_REAL) {
+            memcpy(&value, (const char *)values + i * sizeof value, sizeof value);
+        } else {
+            int32_t integer;
+            memcpy(&integer, (const char *)values + i * sizeof integer, sizeof integer);
+            value = integer;
+        }
+        if (!(value >= row->low && value <= row->high)) {
+            component_say(c, "%s[%lu] = %g is not allowed: want %g to %g", row->name,
+                          (unsigned long)(slot->first + i + 1), value, row->low, row->high);
+            return 0;
+        }
+    }
+    return 1;
+}
+
+void component_write(Component *c, const Slot *slot, const void *values) {
+    const size_t size = size_of(slot->row->type);
+    char *data = row_data(c, slot->row) + slot->first * size;
+    if (memcmp(data, values, slot->count * size) == 0) return;
+    memcpy(data, values, slot->count * size);
+    c->fresh &= ~(1u << GROUP_UNDER);
+    if (slot->row->access == ACCESS_FIXED) {
+        c->stale_matrices = 1;
+        c->fresh = 0;
+    }
+    if (slot->row->access != ACCESS_INPUT) c->tissue->parameters = c->parameters;
+}
+
+int component_enter_initialization(Component *c, double start, int has_stop, double stop) {
+    if (!component_expects(c, c->phase == PHASE_INSTANTIATED, "entering initialization mode")) return 0;
+    if (!isfinite(start) || (has_stop && !(stop >= start))) {
+        component_say(c, "start time %g and stop time %g do not fit", start, stop);
+        return 0;
+    }
+    c->has_stop = has_stop;
+    c->stop = stop;
+    tissue_reset(c->tissue, start);
+    c->phase = PHASE_INITIALIZATION;
+    c->fresh = 0;
+    return 1;
+}
+
+/* What no single bound can say. */
+static int parameters_agree(Component *c) {
+    double relaxing = 0, needed;
+    for (int k = 0; k < BRANCHES; k++) relaxing += c->parameters.prony_g[k];
+    if (relaxing >= 1) {
+        component_say(c, "prony_g must sum to less than 1, not %g", relaxing);
+        return 0;
+    }
+    assemble(c);
+    needed = matrices_substeps(c->matrices, PERIOD_S);
+    if (needed > MOST_SUBSTEPS) {
+        component_say(c,
+                      "%.0f sub-steps a millisecond would be needed, at most %d are allowed: use a shorter pasternak_length or "
+                      "a larger dashpot",
+                      needed, MOST_SUBSTEPS);
+        return 0;
+    }
+    return 1;
+}
+
+int component_exit_initialization(Component *c) {
+    if (!component_expects(c, c->phase == PHASE_INITIALIZATION, "leaving initialization mode")) return 0;
+    if (!parameters_agree(c)) return 0;
+    c->tissue->parameters = c->parameters;
+    tissue_reset(c->tissue, c->tissue->state.time);
+    c->phase = PHASE_STEP;
+    c->fresh &= 1u << GROUP_MATRICES;
+    return 1;
+}
+
+int component_step(Component *c, double time, double dt) {
+    const double now = c->tissue->state.time;
+    double count, periods;
+    if (!component_expects(c, c->phase == PHASE_STEP, "a step")) return 0;
+    if (!(dt > 0) || dt > LONGEST_STEP_S) {
+        component_say(c, "a step of %g s is not possible: want more than 0 and at most %g s", dt, LONGEST_STEP_S);
+        return 0;
+    }
+    if (!(fabs(time - now) <= STEP_TOLERANCE * dt + 1e-12 * fabs(now))) {
+        component_say(c, "a step from %.9g s is not possible: the time reached is %.9g s, and going back needs a saved FMU state",
+                      time, now);
+        return 0;
+    }
+    if (c->has_stop && time + dt > c->stop + STEP_TOLERANCE * dt + 1e-12 * fabs(c->stop)) {
+        component_say(c, "a step to %.9g s is not possible: the stop time is %.9g s", time + dt, c->stop);
+        return 0;
+    }
+    count = matrices_substeps(c->matrices, dt);
+    periods = ceil(dt / PERIOD_S * (1 - 1e-9));
+    c->tissue->state.time = time;
+    tissue_step(c->tissue, &c->inputs, dt, (long)(count > periods ? count : periods));
+    c->fresh &= 1u << GROUP_MATRICES;
+    return 1;
+}
+
+int component_terminate(Component *c) {
+    if (!component_expects(c, c->phase == PHASE_STEP, "termination")) return 0;
+    c->phase = PHASE_TERMINATED;
+    return 1;
+}
+
+static size_t field_size(const Component *c) { return (1 + BRANCHES) * (size_t)c->phantom->n * sizeof(double); }
+
+size_t component_snapshot_size(const Component *c) { return sizeof(Snapshot) + field_size(c); }
+
+void component_save(const Component *c, Snapshot *s) {
+    memset(s, 0, sizeof *s);
+    s->parameters = c->parameters;
+    s->inputs = c->inputs;
+    s->state = c->tissue->state;
+    s->stop = c->stop;
+    s->has_stop = c->has_stop;
+    s->phase = (int32_t)c->phase;
+    memcpy(s->field, c->tissue->field, field_size(c));
+}
+
+int component_load(Component *c, const Snapshot *s, size_t size) {
+    if (size != component_snapshot_size(c) || s->phase < PHASE_INSTANTIATED || s->phase > PHASE_TERMINATED ||
+        s->parameters.lesion_count < 0 || s->parameters.lesion_count > LESIONS) {
+        component_say(c, "this is not a state of this FMU");
+        return 0;
+    }
+    if (memcmp(&c->parameters, &s->parameters, sizeof c->parameters) != 0) c->stale_matrices = 1;
+    c->parameters = s->parameters;
+    c->inputs = s->inputs;
+    c->stop = s->stop;
+    c->has_stop = s->has_stop;
+    c->phase = (Phase)s->phase;
+    c->tissue->parameters = s->parameters;
+    c->tissue->state = s->state;
+    memcpy(c->tissue->field, s->field, field_size(c));
+    if (c->phase >= PHASE_STEP) assemble(c);
+    tissue_restore(c->tissue);
+    c->fresh = 0;
+    return 1;
+}

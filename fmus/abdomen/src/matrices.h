@@ -1,0 +1,32 @@
+/* The matrices of the tissue: `C u' + K u = f`, and the bound within which an explicit step is stable and passive. */
+#ifndef PALPATE_MATRICES_H
+#define PALPATE_MATRICES_H
+
+#include "parameters.h"
+#include "phantom.h"
+
+#define STEP_LIMIT 1.8 /* largest h * rate of a step: energy cannot grow below 2 */
+
+typedef struct {
+    double *k_w;      /* (n) foundation modulus with lesions [N/m^3] */
+    double *plain;    /* (n) the same without lesions */
+    int32_t *lesion;  /* (n) index of the lesion a vertex lies in, or -1 */
+    double *damping;  /* (n) diagonal of C [N s/m] */
+    int32_t *first;   /* (n + 1) rows of K; those of fixed vertices are empty */
+    int32_t *column;
+    double *value;    /* K [N/m] */
+    double *relative; /* C^-1 K [1/s] */
+    double rate;      /* largest eigenvalue of C^-1 K [1/s] */
+    double *work;     /* (4 n) */
+} Matrices;
+
+Matrices *matrices_new(const Phantom *phantom);
+void matrices_free(Matrices *matrices);
+
+/* Assembles for a set of parameters. */
+void matrices_assemble(Matrices *matrices, const Phantom *phantom, const Parameters *parameters);
+
+/* How many equal steps a time `dt` [s] must be cut into; as a real number, as it may be huge. */
+double matrices_substeps(const Matrices *matrices, double dt);
+
+#endif

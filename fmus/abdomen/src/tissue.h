@@ -1,0 +1,68 @@
+/* The tissue's step: an explicit field with contact solved exactly, vertex by vertex. See the README for the equations. */
+#ifndef PALPATE_TISSUE_H
+#define PALPATE_TISSUE_H
+
+#include "matrices.h"
+#include "parameters.h"
+#include "phantom.h"
+
+/* All that a step changes, but for the field. Plain data, so that it can be copied and serialised. */
+typedef struct {
+    double time;        /* [s] */
+    double at[3];       /* where the sphere was at the end of the last step [m] */
+    double excursion;   /* of breathing [m] */
+    double stretch[3];  /* of the skin by friction [m] */
+    double force[3];    /* on the sphere, mean of the last step [N] */
+    double torque[3];   /* on the sphere about its centre [N m] */
+    double origin[3];   /* where contact candidates were gathered [m] */
+    double ball;        /* within this distance of it [m] */
+    double reach;       /* how far the centre may go from there [m] */
+    double near_radius; /* for this sphere [m]; 0: none gathered yet */
+    int32_t moved;      /* whether `at` is known */
+    int32_t disturbed;  /* whether anything ever touched; until then the field is left at its exact rest */
+    int32_t touching;   /* whether the sphere holds a vertex */
+    int32_t contacts;   /* how many */
+} State;
+
+/* Contact candidates: gathered into contiguous memory, `count` of them. */
+typedef struct {
+    int32_t count;
+    int32_t *index;
+    double *normals;   /* (count, 3) */
+    double *positions; /* (count, 3) [m] */
+    double *breathing;
+    double *damping;   /* [N s/m] */
+} Candidates;
+
+typedef struct {
+    const Phantom *phantom;
+    const Matrices *matrices;
+    Parameters parameters;
+    State state;
+    double *field; /* u, then y_k: (1 + BRANCHES, n) [m] */
+    double *strain; /* (n) */
+    Candidates near;
+} Tissue;
+
+Tissue *tissue_new(const Phantom *phantom, const Matrices *matrices);
+void tissue_free(Tissue *tissue);
+
+/* Back to rest at `time` [s]. */
+void tissue_reset(Tissue *tissue, double time);
+
+/* Advances by `dt` [s] in `count` equal steps; the sphere moves straight from where it was to inputs->position. */
+void tissue_step(Tissue *tissue, const Inputs *inputs, double dt, long count);
+
+/* After state and field were replaced: gathers the contact candidates that belong to them. */
+void tissue_restore(Tissue *tissue);
+
+/* Breathing excursion [m] at a time [s]. */
+double tissue_excursion(const Parameters *parameters, double time);
+
+/* How far vertex i is from its place at rest [m] along its inward normal, breathing included. */
+double tissue_inward(const Tissue *tissue, int32_t i);
+
+/* Elastic energy [J] stored in springs, Maxwell branches and the sheared skin. */
+double tissue_energy(const Tissue *tissue);
+
+#endif
