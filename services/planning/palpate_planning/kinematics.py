@@ -62,37 +62,50 @@ class Kinematics:
         """Whether q keeps the joint margin."""
         return bool(np.all(np.abs(q) <= self.upper))
 
-    def solve(self, X_WI: Array, q_seed: Array, q_rest: Array | None = None, iterations: int = 60) -> Solution:
-        """Joint positions that put the sphere's centre and the tool axis on those of X_WI; the spin about the axis is free.
+    def solve(
+        self,
+        X_WI: Array,
+        q_seed: Array,
+        q_rest: Array | None = None,
+        *,
+        spin_free: bool = False,
+        iterations: int = 60,
+    ) -> Solution:
+        """Joint positions that put the indenter at X_WI; with `spin_free` the turn about the tool's axis does not matter.
 
-        Damped least squares on a five-dimensional task (Nakamura & Hanafusa 1986), with the null space drawn to `q_rest`
-        (mid-range where None) and joints clipped to the limits with margin. Deterministic; at most `iterations` steps.
+        Damped least squares (Nakamura & Hanafusa 1986) on six or five task coordinates, with the null space drawn to
+        `q_rest` (mid-range where None) and joints clipped to the limits with margin. Deterministic; at most `iterations`
+        steps.
         """
         rest = np.zeros(7) if q_rest is None else q_rest
         q = np.clip(np.asarray(q_seed, dtype=float), -self.upper, self.upper)
-        p, z = X_WI[:3, 3], X_WI[:3, 2]
         best = (np.inf, q, np.inf, np.inf)
+        rows = 5 if spin_free else 6
+        damping = 1e-6 * np.eye(rows)
         for _ in range(iterations):
             X = self.pose(q)
             J = self.jacobian(q)
-            axis = np.cross(X[:3, 2], z)
-            angle = float(np.arctan2(np.linalg.norm(axis), X[:3, 2] @ z))
-            turn = axis * (angle / max(float(np.linalg.norm(axis)), 1e-12))
-            gap = p - X[:3, 3]
-            error_m = float(np.linalg.norm(gap))
-            cost = error_m + 0.1 * angle
+            R_IW = X[:3, :3].T
+            gap = X_WI[:3, 3] - X[:3, 3]
+            turn = _turn_of_axis(R_IW @ X_WI[:3, 2]) if spin_free else pin.log3(R_IW @ X_WI[:3, :3])
+            error_m, error_rad = float(np.linalg.norm(gap)), float(np.linalg.norm(turn))
+            cost = error_m + 0.1 * error_rad
             if cost < best[0]:
-                best = (cost, q, error_m, angle)
-            if error_m < TOLERANCE_M / 10 and angle < TOLERANCE_RAD / 10:
+                best = (cost, q, error_m, error_rad)
+            if error_m < TOLERANCE_M / 10 and error_rad < TOLERANCE_RAD / 10:
                 break
-            across = X[:3, :2].T  # angular task in the plane across the tool axis: two rows
-            A = np.vstack((J[:3], across @ J[3:]))
-            b = np.concatenate((gap, across @ turn))
+            A = np.vstack((J[:3], R_IW @ J[3:]))[:rows]
+            b = np.concatenate((gap, turn))[:rows]
             scale = min(1.0, 0.3 / max(float(np.linalg.norm(b)), 1e-9))
-            AT = A.T
-            H = A @ AT + 1e-6 * np.eye(5)
             pull = 0.1 * (rest - q)
-            step = AT @ np.linalg.solve(H, scale * b - A @ pull) + pull
-            q = np.clip(q + step, -self.upper, self.upper)
-        _, q, error_m, angle = best
-        return Solution(q, error_m < TOLERANCE_M and angle < TOLERANCE_RAD, error_m, angle)
+            q = q + A.T @ np.linalg.solve(A @ A.T + damping, scale * b - A @ pull) + pull
+            q = np.clip(q, -self.upper, self.upper)
+        _, q, error_m, error_rad = best
+        return Solution(q, error_m < TOLERANCE_M and error_rad < TOLERANCE_RAD, error_m, error_rad)
+
+
+def _turn_of_axis(z_I: Array) -> Array:
+    """Rotation vector, in axes of I, that turns I's z axis onto unit z_I; its z component is zero. Shape (3,)."""
+    across = np.array((-z_I[1], z_I[0], 0.0))
+    size = float(np.linalg.norm(across))
+    return across * (float(np.arctan2(size, z_I[2])) / max(size, 1e-12))

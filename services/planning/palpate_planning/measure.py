@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.surface import Surface
+from palpate_planning.timing import PERIOD_S
 from palpate_planning.weight import ToolWeight
 
 Array = NDArray[np.float64]
@@ -26,6 +27,8 @@ class Reading:
     """Joint positions [rad], shape (7,)."""
     wrench_S: Array
     """Raw F/T reading, shape (6,)."""
+    qd: Array
+    """Joint velocities [rad/s], shape (7,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +56,15 @@ class ContactSense:
         self.weight = weight
         self._kinematics, self._radius = kinematics, radius
         self._touching = False
+        self._velocity: Array | None = None
 
     def sense(self, reading: Reading) -> Contact:
         """The contact at a reading."""
         X_WI, R_WS = self._kinematics.poses(reading.q)
         p_W, n_W, distance = self.surface.nearest(X_WI[:3, 3])
-        force = float(self.weight.contact(R_WS, reading.wrench_S) @ n_W)
+        velocity = (self._kinematics.jacobian(reading.q) @ reading.qd)[:3]
+        acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / PERIOD_S
+        self._velocity = velocity
+        force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ n_W)
         self._touching = force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
         return Contact(X_WI, R_WS, p_W, n_W, self._radius - distance, force, self._touching)

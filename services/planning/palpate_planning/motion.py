@@ -12,8 +12,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from ompl import base, geometric, util
+from palpate_models.scenario import Limits
 
+from palpate_planning.kinematics import Kinematics
 from palpate_planning.scene import STEP_RAD, Scene
+from palpate_planning.timing import JointTrajectory, joint_trajectory, rounded
 
 Array = NDArray[np.float64]
 
@@ -21,6 +24,9 @@ ITERATIONS = 6000
 """Iterations of RRT-Connect after which a motion counts as impossible."""
 RANGE_RAD = 0.4
 """Longest extension of the tree."""
+
+BLENDS_RAD = (0.25, 0.1, 0.03)
+"""Lengths by which corners are rounded, tried in turn until the rounded path is free."""
 
 
 class NoPathError(RuntimeError):
@@ -38,6 +44,16 @@ def plan(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
     if scene.motion_free(q0, q1):
         return np.array([q0, q1])
     return _shortcut(scene, _rrt_connect(scene, q0, q1, bound, seed))
+
+
+def timed_motion(scene: Scene, kinematics: Kinematics, limits: Limits, q0: Array, q1: Array, seed: int) -> JointTrajectory:
+    """A collision-free motion from q0 to q1, corners rounded, within all limits. Raises NoPathError."""
+    points = plan(scene, q0, q1, kinematics.upper, seed)
+    for blend in BLENDS_RAD:
+        smooth = rounded(points, blend)
+        if len(points) == 2 or scene.path_free(smooth):
+            return joint_trajectory(kinematics, smooth, limits)
+    raise NoPathError(f"corners of the motion to {np.round(q1, 3).tolist()} cannot be rounded without collision")
 
 
 def _rrt_connect(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:

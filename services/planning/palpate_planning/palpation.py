@@ -10,16 +10,14 @@ from numpy.typing import NDArray
 from palpate_models.scenario import Exam, Limits
 
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
+from palpate_planning.legs import HOVER_M, Leg
 from palpate_planning.measure import Contact
 from palpate_planning.poses import centre, pose
-from palpate_planning.prepare import HOVER_M, Leg
 from palpate_planning.setpoint import NORMAL_STIFFNESS, ControlMode, Setpoint
 from palpate_planning.timing import PERIOD_S, Axis
 
 Array = NDArray[np.float64]
 
-TRANSFER_M = 0.015
-"""Gap on the way between strokes."""
 SLOW_M = 0.006
 """Nearer to the surface than this the indenter descends slowly."""
 DESCEND_MPS = 0.08
@@ -99,6 +97,7 @@ class Palpation:
         leg = self._legs[self._k]
         speed = self._exam.speed_mps if leg.contact else TRANSFER_MPS
         self._limit = leg.path.speed_limit(speed, self._limits)
+        self._free_step = 0
         self._s = Axis(0.0, 0.2 if leg.contact else 0.8, 2.0 if leg.contact else 8.0)
         self._enter(Doing.DESCEND if leg.contact else Doing.TRANSFER)
 
@@ -181,9 +180,7 @@ class Palpation:
     def _lift(self) -> None:
         if self._s.velocity > 1e-4:
             self._s.step(self._s.position + self._s.velocity**2 / 0.3, max(self._s.velocity, 1e-3))
-        last = self._k == len(self._legs) - 1
-        height = HOVER_M if last or self.failed else TRANSFER_M
-        if not self._depth.step(-height, LIFT_MPS):
+        if not self._depth.step(-HOVER_M, LIFT_MPS):
             return
         if self.failed:
             self._enter(Doing.DONE)
@@ -193,6 +190,12 @@ class Palpation:
             self._next_leg()
 
     def _transfer(self) -> None:
+        free = self._legs[self._k].free
+        if free is not None:
+            self._free_step += 1
+            if self._free_step >= len(free) - 1:
+                self._next_leg()
+            return
         path = self._legs[self._k].path
         goal = path.length if self._resume is None else self._resume
         if not self._s.step(goal, max(self._limit.at(self._s.position), 1e-3)):
@@ -220,6 +223,11 @@ class Palpation:
     # --- set-points ---------------------------------------------------------------------------------------------------
 
     def _progress(self, contact: Contact) -> Progress:
+        leg = self._legs[self._k]
+        if leg.free is not None:
+            q, qd = leg.free.q[self._free_step], leg.free.qd[self._free_step]
+            setpoint = Setpoint(ControlMode.JOINT, contact.X_WI, q, qd=qd)
+            return Progress(setpoint, self.doing, -HOVER_M, False, False, int(leg.path.targets[-1]))
         place = self._legs[self._k].path.at(self._s.position)
         rate, regulation = self._s.velocity, self._regulation
         arm = self._radius - regulation.depth

@@ -10,7 +10,7 @@ from palpate_models import lbr
 from palpate_models.scenario import Limits
 from scipy.interpolate import CubicSpline
 
-from palpate_planning.poses import angular_velocity, orientations, orthonormal
+from palpate_planning.poses import angular_velocity, least_twist, orthonormal
 from palpate_planning.surface import Surface
 from palpate_planning.timing import SpeedLimit
 
@@ -96,8 +96,8 @@ def _frame(y: Array) -> Array:
     return orthonormal(np.column_stack((y[6:9], y[6:9], z)), z)
 
 
-def lay(surface: Surface, xy: Array, R_first: Array) -> tuple[Array, Array, Array, Array]:
-    """A curve in A's xy plane laid onto the surface: s (k,), p and n (k, 3) in world, R (k, 3, 3) without spin."""
+def lay(surface: Surface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:
+    """A curve in A's xy plane laid onto the surface: s (k,), p and n (k, 3) in world, R (k, 3, 3) by least twist."""
     p, n = surface.at(xy)
     s = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))
-    return s, p, n, orientations(n, R_first)
+    return s, p, n, least_twist(-n, R_ref)

@@ -89,7 +89,7 @@ class PlanningService(Service):
             return
         force, moment = status.wrench.force, status.wrench.torque
         wrench = np.array((force.x, force.y, force.z, moment.x, moment.y, moment.z))
-        self._reading = Reading(np.array(status.position), wrench)
+        self._reading = Reading(np.array(status.position), wrench, np.array(status.velocity))
 
     def _perceived(self, inbox: Inbox) -> Seen | Unseen | None:
         """Perception's newest answer, if one came."""

@@ -22,8 +22,6 @@ JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])
 """Joint acceleration of free motion [rad/s^2] [A]: about a third of what the arm's torques allow."""
 RISE_S = 0.15
 """Time in which acceleration builds up: jerk limit = acceleration / RISE_S."""
-BLEND_RAD = 0.25
-"""Joint-space length of path that is rounded off at each side of a way point, at most."""
 
 
 class Axis:
@@ -78,10 +76,11 @@ class JointTrajectory:
         return len(self.q)
 
 
-def rounded(points: Array, blend: float = BLEND_RAD) -> Array:
+def rounded(points: Array, blend: float) -> Array:
     """A polyline in joint space, shape (n, 7), with its corners replaced by parabolas sampled finely, shape (m, 7).
 
-    A parabola lies in the triangle of the corner and its two ends, at most blend / 4 from the corner.
+    At most `blend` [rad] is cut off each side of a corner, and never more than 45 % of an edge. A parabola lies in the
+    triangle of the corner and its two ends, at most blend / 4 from the corner.
     """
     if len(points) < 3:
         return points

@@ -17,6 +17,7 @@ from palpate_planning.measure import Reading
 from palpate_planning.prepare import Seen
 from palpate_planning.setpoint import CARTESIAN_STIFFNESS, ControlMode, Setpoint
 from palpate_planning.surface import Surface
+from palpate_planning.timing import PERIOD_S
 from palpate_planning.weight import ToolWeight
 
 Array = NDArray[np.float64]
@@ -89,6 +90,7 @@ class World:
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
         self.setpoints: list[Setpoint] = []
         self._answer_at: int | None = None
+        self._q_before, self._velocity = self.q, np.zeros(3)
         self._touch(self.kinematics.pose(self.q))
 
     def _touch(self, X_WI: Array) -> Array:
@@ -119,12 +121,16 @@ class World:
         X_WI, R_WS = self.kinematics.poses(self.q)
         contact = R_WS.T @ self._touch(X_WI)
         arm = np.array((0.0, 0.0, lbr.FT_TO_INDENTER_M))
-        wrench = np.concatenate((contact, np.cross(arm, contact))) + self.weight.wrench(R_WS) + self.bias
+        qd = (self.q - self._q_before) / PERIOD_S
+        velocity = (self.kinematics.jacobian(self.q) @ qd)[:3]
+        inertia = R_WS.T @ (self.weight.mass * (velocity - self._velocity) / PERIOD_S)
+        wrench = np.concatenate((contact - inertia, np.cross(arm, contact))) + self.weight.wrench(R_WS) + self.bias
+        self._q_before, self._velocity = self.q, velocity
         answer = None
         if self._answer_at is not None and self.t >= self._answer_at:
             answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
         final = self.exam.status.phase is Phase.ASSESS
-        reading = Reading(self.q.copy(), wrench)
+        reading = Reading(self.q.copy(), wrench, qd)
         outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.lost))
         if outcome.trigger:
             self._answer_at = self.t + 300 * MS

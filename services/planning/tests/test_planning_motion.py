@@ -27,7 +27,8 @@ def above(x: float, y: float, gap: float) -> np.ndarray:
     """A posture with the indenter's deepest point `gap` above the surface over (x, y) of A."""
     p, n = (a[0] for a in SEEN.surface.at(np.array([[x, y]])))
     R = least_twist(-n, KINEMATICS.pose(lbr.HOME)[:3, :3])
-    solution = KINEMATICS.solve(pose(R, centre(p, n, BASE.indenter_radius_m, -gap)), np.array(lbr.HOME))
+    goal = pose(R, centre(p, n, BASE.indenter_radius_m, -gap))
+    solution = KINEMATICS.solve(goal, np.array(lbr.HOME), spin_free=True)
     assert solution.ok
     return solution.q
 
@@ -46,7 +47,18 @@ def test_inverse_kinematics_meets_position_and_axis() -> None:
         found = KINEMATICS.pose(solution.q)
         assert found[:3, 3] == pytest.approx(X[:3, 3], abs=1e-4)
         assert found[:3, 2] == pytest.approx(X[:3, 2], abs=1e-3)
+        assert found[:3, 0] == pytest.approx(X[:3, 0], abs=1e-3)
         assert KINEMATICS.within_limits(solution.q)
+
+
+def test_free_spin_meets_the_axis_only() -> None:
+    X = KINEMATICS.pose(np.array(lbr.HOME))
+    turned = X.copy()
+    turned[:3, :3] = X[:3, :3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    free = KINEMATICS.solve(turned, np.array(lbr.HOME), np.array(lbr.HOME), spin_free=True)
+    assert free.ok
+    assert free.q == pytest.approx(lbr.HOME, abs=1e-3), "nothing to do: the axis is right already"
+    assert KINEMATICS.pose(KINEMATICS.solve(turned, np.array(lbr.HOME)).q)[:3, 0] == pytest.approx(turned[:3, 0], abs=1e-3)
 
 
 def test_out_of_reach_is_said_not_hidden() -> None:
@@ -122,7 +134,7 @@ def test_ends_in_collision_are_named() -> None:
 @pytest.mark.parametrize("points", [(np.array(lbr.HOME), above(0.05, 0.05, 0.03)), AROUND])
 def test_timing_keeps_all_limits(points: tuple[np.ndarray, np.ndarray]) -> None:
     path = plan(SCENE, *points, KINEMATICS.upper, 1)
-    trajectory = joint_trajectory(KINEMATICS, rounded(path), LIMITS)
+    trajectory = joint_trajectory(KINEMATICS, rounded(path, 0.1), LIMITS)
     assert trajectory.q[0] == pytest.approx(points[0], abs=1e-3)
     assert trajectory.q[-1] == pytest.approx(points[1], abs=1e-9)
     speed = np.abs(np.diff(trajectory.q, axis=0)) / PERIOD_S

@@ -35,6 +35,16 @@ def test_contact_force_is_found_at_any_orientation(seed: int) -> None:
     assert tool.contact(R, reading(R, force, bias, mass, com)) == pytest.approx(force, abs=1e-9)
 
 
+def test_acceleration_of_the_tool_is_no_contact() -> None:
+    tool = ToolWeight(0.4, np.array((0.0, 0.0, 0.06)))
+    R = Rotation.from_rotvec((0.3, -0.2, 0.1)).as_matrix()
+    a = np.array((0.1, -0.2, 0.5))
+    seen = tool.wrench(R)
+    seen[:3] -= R.T @ (0.4 * a)
+    assert tool.contact(R, seen, a) == pytest.approx(np.zeros(3), abs=1e-12)
+    assert np.linalg.norm(tool.contact(R, seen)) > 0.2
+
+
 def test_taring_averages_noise_out() -> None:
     rng = np.random.default_rng(1)
     tool = ToolWeight(0.35, np.array((0.0, 0.0, 0.07)))

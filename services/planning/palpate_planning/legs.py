@@ -1,0 +1,161 @@
+"""Strokes as motion of the arm: postures along them, what is out of reach or would collide, ways between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from palpate_planning.coverage import Stroke, transfer
+from palpate_planning.kinematics import Kinematics
+from palpate_planning.motion import NoPathError
+from palpate_planning.path import SurfacePath, lay
+from palpate_planning.poses import centre, least_twist, pose
+from palpate_planning.scene import Scene
+from palpate_planning.surface import Surface
+from palpate_planning.timing import JointTrajectory
+
+Array = NDArray[np.float64]
+
+HOVER_M = 0.02
+"""Height of the sphere's deepest point above the surface before, between and after strokes."""
+POSTURE_EVERY = 4
+"""A posture is solved at every so many samples of a stroke."""
+REACH = "out of the arm's reach"
+
+Troubles = list[tuple[int, str]]
+"""Samples of a path that the arm cannot take, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A part of the examination."""
+
+    path: SurfacePath
+    """On the surface; of a free motion only its ends count."""
+    contact: bool
+    """At depth; else above the surface, on the way to the next stroke."""
+    free: JointTrajectory | None = None
+    """A free motion, where the straight way above the surface cannot be taken."""
+
+
+@dataclass(slots=True)
+class Layout:
+    """All strokes and ways, and what stands in the way of it."""
+
+    legs: list[Leg] = field(default_factory=list)
+    breaks: set[int] = field(default_factory=set)
+    """Targets after which a stroke has to end: the way to the next is out of reach or collides."""
+    dropped: dict[int, str] = field(default_factory=dict)
+    """Targets to skip, and why."""
+
+    @property
+    def troubled(self) -> bool:
+        """Whether it cannot be carried out."""
+        return bool(self.breaks or self.dropped)
+
+
+class LegPlanner:
+    """Lays strokes over one surface with the postures of their targets, shape (n, 7)."""
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        scene: Scene,
+        surface: Surface,
+        postures: Array,
+        radius: float,
+        depth: float,
+        free_motion: Callable[[Array, Array], JointTrajectory],
+    ) -> None:
+        """`scene` lets the tool touch the abdomen; `free_motion(q0, q1)` plans without contact, or raises NoPathError."""
+        self._kinematics, self._scene, self._surface = kinematics, scene, surface
+        self._postures, self._radius, self._depth, self._free_motion = postures, radius, depth, free_motion
+        self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Troubles]] = {}
+        self._hovers: dict[int, Array | None] = {}
+        self._ways: dict[tuple[int, int], tuple[Leg | None, str]] = {}
+        self._R_ref = np.eye(3)
+
+    def lay(self, pieces: list[Stroke]) -> Layout:
+        """Paths for strokes and for the ways between them. Repeated calls reuse what has not changed."""
+        layout = Layout()
+        if pieces and not self._strokes:
+            self._R_ref = self._kinematics.pose(self._postures[pieces[0].targets[0]])[:3, :3]
+        for k, piece in enumerate(pieces):
+            path, troubles = self._stroke(piece)
+            for sample, why in troubles:
+                after = int(np.searchsorted(piece.visits, sample, side="right")) - 1
+                target = int(piece.targets[after])
+                if sample == piece.visits[after]:
+                    layout.dropped[target] = why
+                else:
+                    layout.breaks.add(target)
+            for end in (0, -1):
+                if self.hover(piece, end) is None:
+                    layout.dropped[int(piece.targets[end])] = f"the posture above it is {REACH}"
+            if k and not layout.troubled:
+                leg, why = self._way(pieces[k - 1], piece)
+                if leg is None:
+                    layout.dropped[int(piece.targets[0])] = f"no way to it: {why}"
+                else:
+                    layout.legs.append(leg)
+            layout.legs.append(Leg(path, contact=True))
+        return layout
+
+    def hover(self, piece: Stroke, end: int) -> Array | None:
+        """Posture above the stroke's first (0) or last (-1) target [rad], shape (7,); None out of reach or in collision."""
+        target = int(piece.targets[end])
+        if target not in self._hovers:
+            p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
+            goal = pose(least_twist(-n, self._R_ref), centre(p, n, self._radius, -HOVER_M))
+            near = self._postures[target]
+            solution = self._kinematics.solve(goal, near, near)
+            good = solution.ok and self._scene.free(solution.q)
+            self._hovers[target] = solution.q if good else None
+        return self._hovers[target]
+
+    def _stroke(self, piece: Stroke) -> tuple[SurfacePath, Troubles]:
+        key = tuple(int(i) for i in piece.targets)
+        if key not in self._strokes:
+            self._strokes[key] = self._path(piece, self._depth)
+        return self._strokes[key]
+
+    def _way(self, before: Stroke, after: Stroke) -> tuple[Leg | None, str]:
+        """From above the end of one stroke to above the start of the next: straight, else by a free motion."""
+        key = (int(before.targets[-1]), int(after.targets[0]))
+        if key not in self._ways:
+            xy = transfer(before.xy[-1], after.xy[0])
+            path, troubles = self._path(Stroke(xy, np.array(key), np.array([0, len(xy) - 1])), -HOVER_M)
+            start, goal = self.hover(before, -1), self.hover(after, 0)
+            if not troubles:
+                self._ways[key] = (Leg(path, contact=False), "")
+            elif start is None or goal is None:
+                self._ways[key] = (None, troubles[0][1])
+            else:
+                try:
+                    self._ways[key] = (Leg(path, contact=False, free=self._free_motion(start, goal)), "")
+                except NoPathError as error:
+                    self._ways[key] = (None, str(error))
+        return self._ways[key]
+
+    def _path(self, stroke: Stroke, depth: float) -> tuple[SurfacePath, Troubles]:
+        """A stroke with postures at `depth`, near those of its targets; and samples out of reach or in collision."""
+        s, p, n, R = lay(self._surface, stroke.xy, self._R_ref)
+        centres = centre(p, n, self._radius, depth)
+        known = self._postures[stroke.targets]
+        near = np.column_stack([np.interp(s, s[stroke.visits], known[:, j]) for j in range(7)])
+        solved = np.unique(np.concatenate((np.arange(0, len(s), POSTURE_EVERY), stroke.visits, [len(s) - 1])))
+        q = np.empty((len(solved), 7))
+        troubles: Troubles = []
+        for row, i in enumerate(solved):
+            solution = self._kinematics.solve(pose(R[i], centres[i]), near[i], near[i])
+            q[row] = solution.q
+            if not solution.ok:
+                troubles.append((int(i), REACH))
+            elif not self._scene.free(solution.q):
+                troubles.append((int(i), f"the arm would collide: {', '.join(self._scene.collisions(solution.q))}"))
+        between = np.asarray(CubicSpline(s[solved], q, bc_type="natural")(s)) if len(solved) > 1 else q
+        return SurfacePath(s, p, n, R, between, stroke.targets, stroke.visits), troubles
