@@ -81,6 +81,10 @@ class DepthRegulator:
         self._integral = self._guard = self._yield = 0.0
         self._command = depth
 
+    def shift(self, change: float) -> None:
+        """Counts depths from another zero from now on: every depth is `change` [m] more."""
+        self._command += change
+
     def update(self, target: float, depth: float, force: float, in_contact: bool) -> Regulation:
         """One step: target depth, measured depth [m], measured normal force [N], whether the tissue is touched."""
         dt = self._dt

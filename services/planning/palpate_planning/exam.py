@@ -166,6 +166,11 @@ class Exam:
         self._broken = ""
 
     @property
+    def surface_offset(self) -> float:
+        """Outward shift of the perceived surface that the onset of force called for [m]."""
+        return 0.0 if self._palpation is None else self._palpation.offset
+
+    @property
     def skipped(self) -> dict[int, str]:
         """Skipped targets with the reason."""
         return dict(self._skipped)
@@ -287,13 +292,14 @@ class Exam:
         return None
 
     def _approach(self, now: Observation) -> Setpoint | None:
-        assert now.reading is not None and self._plan_made is not None
+        assert now.reading is not None and self._plan_made is not None and self._seen is not None
         if not self._follower.arrived:
             self._since = now.t
             self._sense.weight.start_tare()
         elif now.t - self._since >= REST + TARE:
             exam, limits = self._known.exam, self._known.limits
-            self._palpation = Palpation(self._plan_made.legs, exam, limits, self._known.robot.indenter_radius_m)
+            radius, noise = self._known.robot.indenter_radius_m, self._seen.noise
+            self._palpation = Palpation(self._plan_made.legs, exam, limits, radius, noise)
             self._enter(Phase.INDENT, now.t, Doing.DESCEND.value)
             return self._palpate(now)
         elif now.t - self._since >= REST:
@@ -304,6 +310,7 @@ class Exam:
         assert now.reading is not None and self._palpation is not None
         progress = self._palpation.step(self._contact)
         self._report(progress, now.t)
+        self._sense.surface.offset = self._palpation.offset
         if progress.doing is Doing.DONE:
             self._broken = self._palpation.failed
             self._follower.hold(now.reading.q)

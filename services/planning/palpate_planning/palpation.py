@@ -12,6 +12,7 @@ from palpate_models.scenario import Exam, Limits
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
 from palpate_planning.legs import HOVER_M, Leg
 from palpate_planning.measure import Contact
+from palpate_planning.onset import OnsetEstimator
 from palpate_planning.poses import centre, pose
 from palpate_planning.setpoint import NORMAL_STIFFNESS, ControlMode, Setpoint
 from palpate_planning.timing import PERIOD_S, Axis
@@ -22,6 +23,9 @@ SLOW_M = 0.006
 """Nearer to the surface than this the indenter descends slowly."""
 DESCEND_MPS = 0.08
 PLUNGE_MPS = 0.015
+PROBE_MPS = 0.008
+"""The first descent, in which the onset of force is sought, from `PROBE_M` above the surface on."""
+PROBE_M = 0.008
 LIFT_MPS = 0.12
 TRANSFER_MPS = 0.15
 DEPTH_ACCELERATION = 0.5
@@ -73,12 +77,16 @@ class Palpation:
     Targets that a soft stop passes over are in `skipped`; `failed` says why it gave up, if it did.
     """
 
-    def __init__(self, legs: tuple[Leg, ...], exam: Exam, limits: Limits, radius: float) -> None:
+    def __init__(self, legs: tuple[Leg, ...], exam: Exam, limits: Limits, radius: float, surface_noise: float = 0.0) -> None:
+        """`surface_noise`: standard deviation of the perceived surface [m]."""
         self._legs, self._exam, self._limits, self._radius = legs, exam, limits, radius
         self._regulator = DepthRegulator(PERIOD_S, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
         self._regulator.reset(-HOVER_M)
         self._depth = Axis(-HOVER_M, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05)
         self._regulation = Regulation(-HOVER_M, 0.0, -HOVER_M, 0.0, False, 0.0)
+        self._onset = OnsetEstimator(surface_noise)
+        self.offset = 0.0
+        """Outward shift of the perceived surface that the onset of force asks for [m]."""
         self._soft_stops = 0
         self._resume: float | None = None
         self.skipped: dict[int, str] = {}
@@ -129,7 +137,7 @@ class Palpation:
         ):
             self._soft_stop(contact.force)
         if self.doing is Doing.DESCEND:
-            self._descend()
+            self._descend(contact)
         elif self.doing is Doing.SETTLE:
             self._settle(contact)
         elif self.doing is Doing.SLIDE:
@@ -152,12 +160,30 @@ class Palpation:
         room = (1.0 - self._regulation.expected_force / self._regulator.force_max) / 0.3
         return min(max(room, floor), 1.0)
 
-    def _descend(self) -> None:
+    def _descend(self, contact: Contact) -> None:
+        if not self._onset.done:
+            self._probe(contact)
+            return
         near = self._depth.position > -SLOW_M - self._depth.velocity**2 / DEPTH_ACCELERATION
         there = self._deeper() if near else self._depth.step(self._exam.depth_m, DESCEND_MPS)
         self._settled = self._settled + PERIOD_S if self._slow_down(0.0) < CREEP else 0.0
         if there or self._settled > SETTLED_S:  # at depth, or as deep as the force allows
             self._enter(Doing.SETTLE)
+
+    def _probe(self, contact: Contact) -> None:
+        """The first descent: slow, down to where the tissue begins, wherever the camera said it would be."""
+        near = self._depth.position > -PROBE_M - self._depth.velocity**2 / DEPTH_ACCELERATION
+        self._onset.add(contact.depth, contact.force)
+        if self._onset.done:
+            self._shift(self._onset.correction())
+        elif self._depth.step(self._limits.depth_m, PROBE_MPS if near else DESCEND_MPS):
+            self.abandon(f"no tissue felt down to {self._limits.depth_m * 1e3:.0f} mm below the perceived surface")
+
+    def _shift(self, onset: float) -> None:
+        """Counts depth from where force set in; the commanded position stays where it is."""
+        self.offset -= onset
+        self._depth.position -= onset
+        self._regulator.shift(-onset)
 
     def _deeper(self) -> bool:
         """Goes on to full depth, the slower the nearer the force is to its limit; returns whether it is there."""
@@ -230,11 +256,11 @@ class Palpation:
             return Progress(setpoint, self.doing, -HOVER_M, False, False, int(leg.path.targets[-1]))
         place = self._legs[self._k].path.at(self._s.position)
         rate, regulation = self._s.velocity, self._regulation
-        arm = self._radius - regulation.depth
+        arm = self._radius + self.offset - regulation.depth
         linear = (place.dp + place.dn * arm) * rate - place.n * regulation.rate
         setpoint = Setpoint(
             ControlMode.CARTESIAN,
-            pose(place.R, centre(place.p, place.n, self._radius, regulation.depth)),
+            pose(place.R, centre(place.p, place.n, self._radius + self.offset, regulation.depth)),
             place.q,
             np.concatenate((linear, place.w * rate)),
             -place.n * regulation.force,

@@ -37,6 +37,8 @@ class Seen:
     triangles: Ints
     """Vertex indices, shape (l, 3)."""
     surface: Surface
+    noise: float = 0.0
+    """Standard deviation of the surface that perception estimates, its motion included [m]."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,6 +80,7 @@ class PlanningService(Service):
             "targets": status.target_count,
             "skipped_targets": {str(i): why for i, why in sorted(self._exam.skipped.items())},
             "peak_force_N": self._peak_force,
+            "surface_offset_m": self._exam.surface_offset,
         }
 
     def _read(self, inbox: Inbox) -> None:
@@ -116,6 +117,7 @@ class PlanningService(Service):
             vertices=vertices,
             triangles=np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3),
             surface=surface,
+            noise=float(targets.surface_noise),
         )
 
     def _lost(self, inbox: Inbox) -> tuple[str, ...]:

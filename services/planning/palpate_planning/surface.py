@@ -29,6 +29,8 @@ class Surface:
         self.X_WA = X_WA
         self.X_AW = inverse(X_WA)
         self._field = field
+        self.offset = 0.0
+        """Shift of the whole surface along its outward normals [m], from the onset of force."""
 
     @staticmethod
     def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> Surface:
@@ -74,7 +76,7 @@ class Surface:
         p_A = np.column_stack((xy_A, values[:, 0]))
         n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
         n_A /= np.linalg.norm(n_A, axis=1, keepdims=True)
-        return apply(self.X_WA, p_A), n_A @ self.X_WA[:3, :3].T
+        return apply(self.X_WA, p_A + self.offset * n_A), n_A @ self.X_WA[:3, :3].T
 
     def nearest(self, c_W: Array, iterations: int = 4) -> tuple[Array, Array, float]:
         """Foot of the perpendicular from c_W, shape (3,): surface point, outward normal (world), signed distance [m].
@@ -96,4 +98,5 @@ class Surface:
                 break
             limit = min(1.0, 0.02 / size)
             x, y = x + limit * float(slide[0]), y + limit * float(slide[1])
-        return self.X_WA[:3, :3] @ foot + self.X_WA[:3, 3], self.X_WA[:3, :3] @ n_A, distance
+        p_A = foot + self.offset * n_A
+        return self.X_WA[:3, :3] @ p_A + self.X_WA[:3, 3], self.X_WA[:3, :3] @ n_A, distance - self.offset

@@ -75,14 +75,16 @@ class World:
     """Closes the loop about an `Exam`, one planning period a step."""
 
     def __init__(self, settings: ExamInput, force: Callable[[float], float] | None = None, offset: float = 0.0) -> None:
-        """`force` by true depth; the true surface lies `offset` [m] along the normal above the perceived one."""
-        self.settings, self.force, self.offset = settings, force or hertz(2.4), offset
+        """`force` by true depth; the true surface lies `offset` [m] outward of the perceived one."""
+        self.settings, self.force = settings, force or hertz(2.4)
         self.exam = Exam(settings)
         self.kinematics = Kinematics(settings.robot, settings.limits)
         self.weight = ToolWeight.of(settings.robot)
         self.bias = np.array([0.7, -0.4, 1.1, 0.02, -0.03, 0.01])
         self.q = np.array(lbr.HOME)
         self.dome = seen_dome(settings)
+        self.truth = seen_dome(settings).surface
+        self.truth.offset = offset
         self.t = 0
         self.depth = self.pressed = 0.0
         self.answers: list[Seen | Unseen] = [self.dome]
@@ -95,8 +97,8 @@ class World:
 
     def _touch(self, X_WI: Array) -> Array:
         """Contact force on the tool at a pose, world axes; sets true depth and force."""
-        _, n, distance = self.dome.surface.nearest(X_WI[:3, 3])
-        self.depth = self.settings.robot.indenter_radius_m - distance + self.offset
+        _, n, distance = self.truth.nearest(X_WI[:3, 3])
+        self.depth = self.settings.robot.indenter_radius_m - distance
         self.pressed = self.force(self.depth)
         return n * self.pressed
 

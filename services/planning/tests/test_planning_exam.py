@@ -93,6 +93,33 @@ def test_raster_and_points_lift_between_strokes(pattern: Pattern, mode: Mode, st
     assert order.count(Phase.SCAN) == strokes
 
 
+@pytest.mark.parametrize("offset", [-0.005, -0.0003, 0.0003, 0.004])
+def test_onset_of_force_corrects_a_camera_that_is_off(offset: float) -> None:
+    world = World(known(region_m=(0.025, 0.0125)), offset=offset)
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    if abs(offset) < 1e-3:
+        assert world.exam.surface_offset == 0.0, "fine detail is left to the camera"
+    else:
+        assert world.exam.surface_offset == pytest.approx(offset, abs=4e-4)
+    steady = np.array([row[4] for row in world.rows if row[1]])
+    assert np.sqrt(np.mean((steady - 0.010) ** 2)) < 6e-4
+
+
+def test_a_moving_surface_is_not_shifted() -> None:
+    world = World(known(region_m=(0.025, 0.0125)), offset=0.004)
+    world.answers = [replace(world.dome, noise=0.0035)]
+    world.run()
+    assert world.exam.surface_offset == 0.0
+
+
+def test_no_tissue_where_it_should_be_gives_up() -> None:
+    world = World(known(region_m=(0.025, 0.0125)), offset=-0.05)
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+    assert "no tissue felt" in world.exam.status.message
+
+
 def test_force_limit_makes_depth_yield() -> None:
     world = World(known(), hertz(30.0))
     world.run()
