@@ -18,8 +18,8 @@ from palpate_bus import codec
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.lockstep import NEVER, InputBuffer, Received, Stepper
 from palpate_bus.messages import Advance, RunControl, ServiceReport
+from palpate_bus.outlet import Outlet
 from palpate_bus.service import Service
-from palpate_bus.spool import CHUNK_TYPE, Spool, recording
 from palpate_bus.transport import Publisher, Sample, Subscription
 from palpate_bus.wire import message_key, topic_key
 
@@ -94,10 +94,7 @@ class LockstepNode:
         self._stepper = Stepper(service, rules)
         self._role = self._stepper.role
         self._link = Link(session, service.role, rules, domain, gid)
-        self._publishers = {
-            name: Publisher(session, topic_key(port.topic, domain), rules.qos[port.topic.qos], gid)
-            for name, port in self._stepper.ports.items()
-        }
+        self._outlet = Outlet(session, service.role, rules, domain, gid)
         self._data = {
             name: Subscription(session, topic_key(buffer.topic, domain)) for name, buffer in self._stepper.buffers.items()
         }
@@ -114,11 +111,6 @@ class LockstepNode:
             if self._own_events
             else None
         )
-        self._spool = Spool(service.role, tuple(self._stepper.ports)) if recording() else None
-        self._chunks = Publisher(
-            session, message_key(f"palpate/record/{service.role}", CHUNK_TYPE, domain), rules.qos["event"], gid
-        )
-        self._chunk_sequence = 0
         self._decode_advance = codec.decoder(advance_type)
         self._encode_advance = codec.encoder(advance_type)
         self._advance_sequence = 0
@@ -132,10 +124,7 @@ class LockstepNode:
         """Runs the service to the end of the run. Raises what the service raises, after reporting it, or RunAborted."""
         try:
             self._handshake()
-            for port, payload in self._stepper.start():
-                self._publishers[port.topic.name].put(payload, port.sequence)
-                if self._spool is not None:
-                    self._spool.add(port.topic.name, payload, 0, port.sequence)
+            self._outlet.send(self._stepper.start(), 0)
             self._loop()
             self._report_end()
         except RunAborted:
@@ -156,9 +145,7 @@ class LockstepNode:
             if message is None:
                 continue
             if message.command == RunControl.HELLO:
-                for publisher in self._publishers.values():
-                    publisher.hello()
-                self._chunks.hello()
+                self._outlet.hello()
                 if self._advance_publisher is not None:
                     self._advance_publisher.hello()
                 missing = [s.key.split("/RIHS01")[0] for s in inputs if not s.heard]
@@ -180,7 +167,7 @@ class LockstepNode:
     def _loop(self) -> None:
         t = 0
         period = self._role.period
-        stepper, publishers, blocking, spool = self._stepper, self._publishers, self._blocking, self._spool
+        stepper, outlet, blocking = self._stepper, self._outlet, self._blocking
         while True:
             if t > self._horizon and not self._await_horizon(t):
                 return
@@ -191,28 +178,17 @@ class LockstepNode:
                 self._collect(buffer, t)
             sent = stepper.step(t)
             start = perf_counter_ns()
-            for port, payload in sent:
-                publishers[port.topic.name].put(payload, port.sequence)
+            outlet.send(sent, t)
             if self._advance_publisher is not None:
                 self._advance_sequence += 1
                 sequences = [stepper.ports[name].sequence for name in self._own_events]
                 self._advance_publisher.put(self._encode_advance(_advance(t, sequences)), self._advance_sequence)
-            if spool is not None:
-                for port, payload in sent:
-                    spool.add(port.topic.name, payload, t, port.sequence)
-                self._pass_on(spool.chunk(t))
             stepper.blame.send += perf_counter_ns() - start
             self._tick = t
             self._link.progress(t)
             while (message := self._link.poll()) is not None:
                 self._obey(message)
             t += period
-
-    def _pass_on(self, chunk: bytes | None) -> None:
-        """Sends a chunk to the recorder."""
-        if chunk is not None:
-            self._chunk_sequence += 1
-            self._chunks.put(chunk, self._chunk_sequence)
 
     def _await_horizon(self, t: int) -> bool:
         """Waits until tick `t` is granted; False when the run ends before it."""
@@ -266,8 +242,7 @@ class LockstepNode:
 
     def _report_end(self) -> None:
         """Reports digests, blame and the service's own facts, and waits for the conductor's receipt."""
-        if self._spool is not None:
-            self._pass_on(self._spool.chunk(self._tick, final=True))
+        self._outlet.flush(self._tick)
         facts = dict(self._service.finish())
         subscriptions = (*self._data.values(), *self._advances.values())
         detail = {

@@ -56,10 +56,12 @@ class Spool:
         self._data.append(payload)
         self._bytes += len(payload)
 
-    def chunk(self, t: int, final: bool = False) -> bytes | None:
-        """The chunk due at tick `t` [ns] in CDR, None when none is due."""
-        if not (final or t >= self._next or self._bytes > CHUNK_BYTES):
-            return None
+    def due(self, t: int) -> bool:
+        """Whether a chunk is due at tick `t` [ns]."""
+        return t >= self._next or self._bytes > CHUNK_BYTES
+
+    def chunk(self, t: int) -> bytes:
+        """What was sent since the last chunk, up to tick `t` [ns], in CDR."""
         self._next = t + CHUNK_PERIOD
         columns: Any = np.array(self._entries, np.int64).reshape(-1, 4)
         message = RecordChunk(

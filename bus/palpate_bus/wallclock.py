@@ -17,8 +17,9 @@ from palpate_bus.contract import MS, Contract, Edge
 from palpate_bus.distributed import Link, RunAborted
 from palpate_bus.lockstep import NEVER, Received, Stepper
 from palpate_bus.messages import RunControl, ServiceReport
+from palpate_bus.outlet import Outlet
 from palpate_bus.service import Service
-from palpate_bus.transport import Publisher, Subscription
+from palpate_bus.transport import Subscription
 from palpate_bus.wire import topic_key
 
 log = logging.getLogger(__name__)
@@ -35,10 +36,7 @@ class WallClockNode:
         self._service = service
         self._stepper = Stepper(service, rules, strict=False)
         self._link = Link(session, service.role, rules, domain, gid)
-        self._publishers = {
-            name: Publisher(session, topic_key(port.topic, domain), rules.qos[port.topic.qos], gid)
-            for name, port in self._stepper.ports.items()
-        }
+        self._outlet = Outlet(session, service.role, rules, domain, gid)
         self._data = {
             name: Subscription(session, topic_key(buffer.topic, domain), history=buffer.topic.latched)
             for name, buffer in self._stepper.buffers.items()
@@ -55,8 +53,7 @@ class WallClockNode:
         """Runs until the conductor ends the run."""
         try:
             epoch = self._await_start()
-            for port, payload in self._stepper.start():
-                self._publishers[port.topic.name].put(payload, port.sequence)
+            self._outlet.send(self._stepper.start(), 0)
             self._loop(epoch)
             self._finish()
         except RunAborted:
@@ -70,14 +67,11 @@ class WallClockNode:
         """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns]."""
         while True:
             message = self._link.poll(HANDSHAKE_POLL_S)
-            for subscription in self._data.values():
-                while subscription.get(0) is not None:
-                    pass
+            self._receive(0)  # a quicker service may have sent its latched topics already
             if message is None:
                 continue
             if message.command == RunControl.HELLO:
-                for publisher in self._publishers.values():
-                    publisher.hello()
+                self._outlet.hello()
                 missing = [
                     name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
                 ]
@@ -108,8 +102,7 @@ class WallClockNode:
             self._receive(t)
             sent = self._stepper.step(t)
             start = perf_counter_ns()
-            for port, payload in sent:
-                self._publishers[port.topic.name].put(payload, port.sequence)
+            self._outlet.send(sent, t)
             self._stepper.blame.send += perf_counter_ns() - start
             self._tick = t
             while (message := self._link.poll()) is not None:
@@ -148,6 +141,7 @@ class WallClockNode:
                 buffer.deliver(Received(sample.payload, t - buffer.delay, sample.sequence))
 
     def _finish(self) -> None:
+        self._outlet.flush(self._tick)
         facts = dict(self._service.finish())
         detail = {
             "digests": {},

@@ -18,18 +18,17 @@ def test_what_goes_in_comes_out(sent: list[Recorded]) -> None:
     spool = Spool("robot", TOPICS)
     for message in sent:
         spool.add(message.topic, message.payload, message.stamp, message.sequence)
-    chunk = spool.chunk(7, final=True)
-    assert chunk is not None
-    tick, received = unpack_chunk(chunk)
+    tick, received = unpack_chunk(spool.chunk(7))
     assert tick == 7
     assert list(received) == sent
 
 
 def test_a_chunk_is_due_once_a_period() -> None:
     spool = Spool("robot", TOPICS)
-    assert spool.chunk(CHUNK_PERIOD - 1) is None
-    assert spool.chunk(CHUNK_PERIOD) is not None
-    assert spool.chunk(CHUNK_PERIOD + 1) is None
+    assert not spool.due(CHUNK_PERIOD - 1)
+    assert spool.due(CHUNK_PERIOD)
+    spool.chunk(CHUNK_PERIOD)
+    assert not spool.due(CHUNK_PERIOD + 1)
 
 
 def test_garbage_is_an_error_of_the_codec() -> None:

@@ -274,9 +274,7 @@ class Conductor:
         self._grant(self.horizon + ticks * MS)
 
     def _watch(self) -> None:
-        if self._wallclock:
-            return
-        stalled = self.watchdog.stalled_for()
+        stalled = self.watchdog.longest_stall() if self._wallclock else self.watchdog.stalled_for()
         if stalled > self._patience.hard:
             role, sentence = self.watchdog.culprit()
             raise RunFailed(f"{role} blocks the run for {stalled:.0f} s: {sentence}")

@@ -43,6 +43,10 @@ class Watchdog:
         """Seconds since any service finished a tick."""
         return monotonic() - max(progress.moved for progress in self.progress.values())
 
+    def longest_stall(self) -> float:
+        """Seconds since the service that is furthest behind its own clock finished a tick (wall-clock runs)."""
+        return monotonic() - min(progress.moved for progress in self.progress.values())
+
     def forgive(self) -> None:
         """Starts the stall anew: while the run is paused nobody is to blame."""
         now = monotonic()

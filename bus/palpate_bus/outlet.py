@@ -1,0 +1,50 @@
+"""What a service sends: one publisher a topic, and the chunks for the recorder when the run has one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import zenoh
+
+from palpate_bus.contract import Contract
+from palpate_bus.lockstep import OutputPort
+from palpate_bus.spool import CHUNK_TYPE, Spool, recording
+from palpate_bus.transport import Publisher
+from palpate_bus.wire import message_key, topic_key
+
+
+class Outlet:
+    """The sending side of a node."""
+
+    def __init__(self, session: zenoh.Session, role: str, rules: Contract, domain: int, gid: bytes) -> None:
+        topics = rules.outputs(role)
+        self._publishers = {
+            topic.name: Publisher(session, topic_key(topic, domain), rules.qos[topic.qos], gid) for topic in topics
+        }
+        self._chunks = Publisher(session, message_key(f"palpate/record/{role}", CHUNK_TYPE, domain), rules.qos["event"], gid)
+        self._chunk_sequence = 0
+        self._spool = Spool(role, tuple(self._publishers)) if recording() else None
+
+    def hello(self) -> None:
+        """Tests every edge."""
+        for publisher in self._publishers.values():
+            publisher.hello()
+        self._chunks.hello()
+
+    def send(self, sent: Sequence[tuple[OutputPort, bytes]], t: int) -> None:
+        """Sends what a step at `t` [ns] produced, and passes it on to the recorder."""
+        publishers = self._publishers
+        for port, payload in sent:
+            publishers[port.topic.name].put(payload, port.sequence)
+        spool = self._spool
+        if spool is not None:
+            for port, payload in sent:
+                spool.add(port.topic.name, payload, t, port.sequence)
+            if spool.due(t):
+                self.flush(t)
+
+    def flush(self, t: int) -> None:
+        """Passes on what the recorder has not got yet."""
+        if self._spool is not None:
+            self._chunk_sequence += 1
+            self._chunks.put(self._spool.chunk(t), self._chunk_sequence)
