@@ -10,10 +10,10 @@ from palpate_bus.codec import Message, message_type
 from palpate_bus.messages import ExamState, ImpedanceSetpoint
 from palpate_bus.stamps import header
 
-from palpate_planning.exam import ExamStatus
 from palpate_planning.measure import Contact
 from palpate_planning.poses import quaternion
 from palpate_planning.setpoint import DAMPING_RATIO, Setpoint
+from palpate_planning.status import ExamStatus
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,12 @@ from palpate_planning.timing import PERIOD_S, Axis
 
 Array = NDArray[np.float64]
 
-SLOW_M = 0.006
-"""Nearer to the surface than this the indenter descends slowly."""
+SLOW_M = 0.003
+"""Nearer to the surface than this the indenter descends slowly: more than the surface can be wrong after the first touch."""
+HOP_M = 0.008
+"""Height of short ways between strokes ..."""
+HOP_LENGTH_M = 0.05
+"""... shorter than this; on longer ones and on free motions it is `HOVER_M`."""
 DESCEND_MPS = 0.08
 PLUNGE_MPS = 0.015
 PROBE_MPS = 0.008
@@ -120,6 +124,14 @@ class Palpation:
         i = int(np.searchsorted(path.visits, self._s.position + 1e-6, side="right")) - 1
         return int(path.targets[max(i, 0)])
 
+    @property
+    def _height(self) -> float:
+        """How high to lift: low before a short way, or to hop on within the stroke."""
+        if self.failed or self._k == len(self._legs) - 1:
+            return HOVER_M
+        way = self._legs[self._k + 1]
+        return HOP_M if self._resume is not None or (way.free is None and way.path.length < HOP_LENGTH_M) else HOVER_M
+
     def abandon(self, why: str) -> None:
         """Lifts off and ends."""
         self.failed = self.failed or why
@@ -206,7 +218,7 @@ class Palpation:
     def _lift(self) -> None:
         if self._s.velocity > 1e-4:
             self._s.step(self._s.position + self._s.velocity**2 / 0.3, max(self._s.velocity, 1e-3))
-        if not self._depth.step(-HOVER_M, LIFT_MPS):
+        if not self._depth.step(-self._height, LIFT_MPS):
             return
         if self.failed:
             self._enter(Doing.DONE)

@@ -15,10 +15,11 @@ from palpate_bus.stamps import duration_message, header
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
 
-from palpate_planning.exam import Exam, Observation, Phase, Unseen
+from palpate_planning.exam import Exam
 from palpate_planning.measure import Reading
 from palpate_planning.messages import path_message, setpoint_message, state_message
 from palpate_planning.prepare import Seen
+from palpate_planning.status import Observation, Phase, Unseen
 from palpate_planning.surface import Surface
 
 Array = NDArray[np.float64]

@@ -11,11 +11,12 @@ from palpate_models.frames import apply
 from palpate_models.load import exam_input
 from palpate_models.scenario import Exam as ExamSettings
 from palpate_models.scenario import ExamInput, Robot, Scenario
-from palpate_planning.exam import Exam, Observation, Outcome, Phase, Unseen
+from palpate_planning.exam import Exam
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.measure import Reading
 from palpate_planning.prepare import Seen
 from palpate_planning.setpoint import CARTESIAN_STIFFNESS, ControlMode, Setpoint
+from palpate_planning.status import Observation, Outcome, Phase, Unseen
 from palpate_planning.surface import Surface
 from palpate_planning.timing import PERIOD_S
 from palpate_planning.weight import ToolWeight
@@ -23,7 +24,7 @@ from palpate_planning.weight import ToolWeight
 Array = NDArray[np.float64]
 MS = 1_000_000
 
-BASE = Robot(base_xy_m=(-0.08, 0.0))
+BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
 """A placement from which all of the small regions of the tests are in reach."""
 
 

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from palpate_models.scenario import Mode, Pattern, Robot
-from palpate_planning.exam import Phase, Unseen
 from palpate_planning.setpoint import ControlMode
+from palpate_planning.status import Phase, Unseen
 from palpate_planning.timing import PERIOD_S
 from planning_fakes import World, hertz, known
 
@@ -237,7 +237,7 @@ def test_speed_of_the_tool_in_contact_is_the_one_asked_for(snake: World) -> None
 
 def test_before_the_robot_is_heard_nothing_is_asked_of_it() -> None:
     world = World(known())
-    from palpate_planning.exam import Observation
+    from palpate_planning.status import Observation
 
     outcome = world.exam.step(Observation(0, None))
     assert outcome.contact is None

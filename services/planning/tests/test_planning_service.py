@@ -19,10 +19,10 @@ from palpate_bus.messages import (
 from palpate_bus.stamps import header, nanoseconds
 from palpate_models import lbr
 from palpate_models.scenario import Exam, Scenario
-from palpate_planning.exam import Outcome, Phase
 from palpate_planning.messages import pose_message
 from palpate_planning.service import PlanningService, create
 from palpate_planning.setpoint import ControlMode, Setpoint
+from palpate_planning.status import Outcome, Phase
 from planning_fakes import BASE, World, known
 from scipy.spatial.transform import Rotation
 
