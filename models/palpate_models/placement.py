@@ -136,8 +136,7 @@ def plan_redundancy(
     seed = np.asarray(q_seed, dtype=float)
     if positions.ndim != 2 or positions.shape[1] != 3 or normals.shape != positions.shape or seed.shape != (7,):
         raise ValueError(
-            "want positions_W (n, 3), normals_W (n, 3), q_seed (7,), "
-            f"not {positions.shape}, {normals.shape}, {seed.shape}"
+            f"want positions_W (n, 3), normals_W (n, 3), q_seed (7,), not {positions.shape}, {normals.shape}, {seed.shape}"
         )
     for name, value in (("positions_W", positions), ("normals_W", normals), ("q_seed", seed)):
         if not np.isfinite(value).all():
@@ -277,3 +276,14 @@ def _judge(batch: _Batch, q: Array, refined: bool) -> PostureSequence:
         residual=residual,
         refined=refined,
     )
+
+
+def _main() -> None:
+    """Prints the best base placement for the default scenario, and what the present one achieves."""
+    from palpate_models import placement_base  # noqa: PLC0415 - it needs this module
+
+    print(placement_base.report())
+
+
+if __name__ == "__main__":
+    _main()

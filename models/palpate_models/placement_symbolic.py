@@ -28,11 +28,11 @@ from palpate_models.scenario import Robot
 
 GRAVITY = 9.81
 """[m/s^2]"""
-ELBOW_CLEARANCE_M = 0.20
+ELBOW_CLEARANCE_M = 0.15
 """The elbow stays at least this far above the indenter, so that upper arm and forearm keep off abdomen and table."""
 REACH_LENGTH_M = 0.4
 """Length that makes linear and angular rows of the Jacobian comparable: upper arm and forearm of the LBR iiwa 7."""
-WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.2, 5.0
+WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.0
 """What counts in a posture, each term of order one [A]."""
 
 
@@ -114,7 +114,7 @@ def arm(robot: Robot) -> ArmFunctions:
     elbow = origins[3]
 
     relative = q / ca.DM(np.array(POSITION_LIMIT))
-    low = (p[2] + ELBOW_CLEARANCE_M - elbow[2]) / 0.02
+    low = (p[2] + ELBOW_CLEARANCE_M - elbow[2]) / 0.03
     cost = (
         WEIGHT_LIMITS * ca.sum1(-ca.log(1 - relative**2))
         + WEIGHT_TORQUE * ca.sumsqr(torque / ca.DM(np.array(TORQUE_LIMIT)))

@@ -155,9 +155,9 @@ class Robot(_Section):
     indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Mass below the F/T sensor: stand-off and indenter."""
-    base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 0.70
-    """Height of the cubic base."""
-    base_xy_m: Vec2 = (0.0, 0.0)
+    base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 1.17
+    """Height of the base. The three defaults of its placement are what `python -m palpate_models.placement` finds best."""
+    base_xy_m: Vec2 = (0.03, 0.02)
     """Where the base stands in world."""
     base_yaw_rad: float = 0.0
     """How it is turned about the vertical."""

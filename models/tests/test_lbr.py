@@ -46,7 +46,7 @@ def test_upright_arm_has_the_published_height(model: pin.Model) -> None:
     pin.framesForwardKinematics(model, data, np.zeros(7))
     flange = data.oMf[model.getFrameId("lbr_link_ee")]
     # 1.266 m from the base to the flange of an iiwa 7 R800 (340 + 400 + 400 + 126 mm)
-    np.testing.assert_allclose(flange.translation, [0.0, 0.0, Robot().base_height_m + 1.266], atol=1e-12)
+    np.testing.assert_allclose(flange.translation, [*Robot().base_xy_m, Robot().base_height_m + 1.266], atol=1e-12)
     indenter = data.oMf[model.getFrameId("indenter")]
     tool = lbr.FLANGE_TO_FT_M + lbr.FT_TO_INDENTER_M
     np.testing.assert_allclose(flange.actInv(indenter).translation, [0.0, 0.0, tool], atol=1e-12)
