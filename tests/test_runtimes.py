@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 import zenoh
 from palpate_bus.composed import Composed
 from palpate_bus.contract import contract
+from palpate_bus.liveliness import NodeTokens
 from palpate_bus.stamps import NS
 from palpate_bus.wire import topic_key
 from palpate_bus.zenoh_config import close_session, mesh, open_session
@@ -180,3 +182,25 @@ def test_wall_clock_runs_the_same_services_to_the_announced_end() -> None:
     assert outcome.failure is None
     assert outcome.last_tick >= toy_services.END
     assert outcome.reports["control"]["blame"]["steps"] > 0.8 * toy_services.END / 1_000_000
+
+
+def test_a_peer_with_another_definition_of_a_message_is_named_within_a_second() -> None:
+    done: list[bool] = []
+    tokens: list[NodeTokens] = []
+    said: list[float] = []
+
+    def join(running: Running) -> None:
+        if at(running, 0.2, done):
+            outdated = contract().topics["joint_states"].model_copy(update={"type": "geometry_msgs/msg/WrenchStamped"})
+            tokens.append(NodeTokens(running.session, "stranger", 0))
+            tokens[0].subscription(outdated, contract().qos["control"])
+            said.append(time.monotonic())
+        if done and len(said) == 1 and running.conductor.outcome.trouble:
+            said.append(time.monotonic())
+
+    outcome = run_toys(join, {"TOY_END_S": "4"})
+    assert outcome.failure is None
+    (sentence,) = outcome.trouble
+    assert "topic joint_states: robot publishes sensor_msgs/msg/JointState" in sentence
+    assert "stranger wants geometry_msgs/msg/WrenchStamped" in sentence
+    assert said[1] - said[0] < 1.0

@@ -38,7 +38,11 @@ def _raw(session: zenoh.Session, out: str, back: str) -> tuple[Callable[[bytes],
         "express": True,
     }
     publisher: Any = session.declare_publisher(out, **options)
-    return publisher.put, lambda: queue.get().payload.to_bytes()
+
+    def receive() -> bytes:
+        return queue.get().payload.to_bytes()
+
+    return publisher.put, receive
 
 
 def _ours(session: zenoh.Session, out: str, back: str) -> tuple[Callable[[bytes], None], Callable[[], bytes]]:
@@ -64,6 +68,7 @@ KINDS = {"raw": _raw, "ours": _ours}
 
 def _echo(options: BusOptions) -> None:
     session = open_session(options)
+
     def serve(kind: str) -> None:
         send, receive = KINDS[kind](session, f"back/{kind}", f"out/{kind}")
         while (payload := receive()) != b"end":

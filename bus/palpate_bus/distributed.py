@@ -12,16 +12,15 @@ from time import monotonic, perf_counter_ns, time_ns
 from typing import Any
 
 import numpy as np
-import zenoh
 
 from palpate_bus import codec
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.lockstep import NEVER, InputBuffer, Received, Stepper
+from palpate_bus.member import Member
 from palpate_bus.messages import Advance, RunControl, ServiceReport
 from palpate_bus.outlet import Outlet
 from palpate_bus.service import Service
-from palpate_bus.transport import Publisher, Sample, Subscription
-from palpate_bus.wire import message_key, topic_key
+from palpate_bus.transport import Sample
 
 log = logging.getLogger(__name__)
 
@@ -40,11 +39,11 @@ class RunAborted(RuntimeError):
 class Link:
     """A node's side of the conversation with the conductor: control in, reports out."""
 
-    def __init__(self, session: zenoh.Session, role: str, rules: Contract, domain: int, gid: bytes) -> None:
-        self.role = role
-        self._control = Subscription(session, message_key("palpate/control", "palpation_msgs/msg/RunControl", domain))
-        key = message_key(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport", domain)
-        self._report = Publisher(session, key, rules.qos["event"], gid)
+    def __init__(self, member: Member) -> None:
+        self.role = member.role
+        self._member = member
+        self._control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
+        self._report = member.internal_publisher(f"palpate/report/{member.role}", "palpation_msgs/msg/ServiceReport", "event")
         self._sequence = 0
         self._decode = codec.decoder("palpation_msgs/msg/RunControl")
         self._encode = codec.encoder("palpation_msgs/msg/ServiceReport")
@@ -78,6 +77,8 @@ class Link:
     def progress(self, tick: int, waiting_for: str = "") -> None:
         """Reports progress if the last report is old enough."""
         if monotonic() - self._last_report > PROGRESS_S:
+            for complaint in self._member.complaints():
+                log.error("%s", complaint)
             self.report(ServiceReport.PROGRESS, tick, waiting_for)
 
     @property
@@ -89,27 +90,23 @@ class Link:
 class LockstepNode:
     """One service in distributed lockstep."""
 
-    def __init__(self, service: Service, session: zenoh.Session, rules: Contract, domain: int, gid: bytes) -> None:
+    def __init__(self, service: Service, member: Member) -> None:
+        rules = member.rules
         self._service = service
         self._stepper = Stepper(service, rules)
         self._role = self._stepper.role
-        self._link = Link(session, service.role, rules, domain, gid)
-        self._outlet = Outlet(session, service.role, rules, domain, gid)
-        self._data = {
-            name: Subscription(session, topic_key(buffer.topic, domain)) for name, buffer in self._stepper.buffers.items()
-        }
+        self._link = Link(member)
+        self._outlet = Outlet(member)
+        self._data = {name: member.subscription(buffer.topic) for name, buffer in self._stepper.buffers.items()}
         advance_type = "palpation_msgs/msg/Advance"
         producers = sorted({b.topic.producer for b in self._stepper.buffers.values() if b.edge.blocking and not b.topic.periodic})
         self._advances = {
-            producer: Subscription(session, message_key(f"palpate/advance/{producer}", advance_type, domain))
-            for producer in producers
+            producer: member.internal_subscription(f"palpate/advance/{producer}", advance_type) for producer in producers
         }
         self._event_topics = {producer: _event_topics(rules, producer) for producer in producers}
         self._own_events = _event_topics(rules, service.role)
         self._advance_publisher = (
-            Publisher(session, message_key(f"palpate/advance/{service.role}", advance_type, domain), rules.qos["control"], gid)
-            if self._own_events
-            else None
+            member.internal_publisher(f"palpate/advance/{service.role}", advance_type, "control") if self._own_events else None
         )
         self._decode_advance = codec.decoder(advance_type)
         self._encode_advance = codec.encoder(advance_type)

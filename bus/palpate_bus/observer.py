@@ -11,13 +11,14 @@ from typing import Any
 
 import zenoh
 
-from palpate_bus.contract import Contract, Topic
+from palpate_bus.contract import Topic
 from palpate_bus.distributed import Link, RunAborted
 from palpate_bus.lockstep import NEVER, Received, Stepper
+from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.service import Service
-from palpate_bus.transport import HELLO, Publisher
-from palpate_bus.wire import WireError, topic_key, unpack
+from palpate_bus.transport import HELLO
+from palpate_bus.wire import WireError, unpack
 
 log = logging.getLogger(__name__)
 
@@ -30,15 +31,16 @@ FIFO = 1 << 17
 class _Feed:
     """One observed topic."""
 
-    def __init__(self, session: zenoh.Session, topic: Topic, key: str, lossless: bool) -> None:
+    def __init__(self, member: Member, topic: Topic, lossless: bool) -> None:
         self.topic = topic
+        key = member.observed(topic)
         channel: Any = zenoh.handlers.FifoChannel(FIFO) if lossless else zenoh.handlers.RingChannel(RING)
         if topic.latched:
             self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
-                session, key, channel, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
+                member.session, key, channel, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
             )
         else:
-            self._subscriber = session.declare_subscriber(key, channel)
+            self._subscriber = member.session.declare_subscriber(key, channel)
         self._try = self._subscriber.handler.try_recv
         self.sequence = 0
         self.missed = 0
@@ -67,19 +69,13 @@ class _Feed:
 class ObservedService:
     """A service outside the barrier with its feeds: drained and stepped by whoever owns the thread."""
 
-    def __init__(
-        self, service: Service, session: zenoh.Session, rules: Contract, domain: int, gid: bytes, lossless: bool = False
-    ) -> None:
+    def __init__(self, service: Service, member: Member, lossless: bool = False) -> None:
         """`lossless` keeps every message of every topic, not just the latest of the periodic ones."""
-        self.stepper = Stepper(service, rules)
+        self.stepper = Stepper(service, member.rules)
         self.feeds = [
-            _Feed(session, buffer.topic, topic_key(buffer.topic, domain), lossless or not buffer.topic.periodic)
-            for buffer in self.stepper.buffers.values()
+            _Feed(member, buffer.topic, lossless or not buffer.topic.periodic) for buffer in self.stepper.buffers.values()
         ]
-        self.publishers = {
-            name: Publisher(session, topic_key(port.topic, domain), rules.qos[port.topic.qos], gid)
-            for name, port in self.stepper.ports.items()
-        }
+        self.publishers = {name: member.publisher(port.topic) for name, port in self.stepper.ports.items()}
         self.now = NEVER
         """Newest simulated time [ns] seen."""
         self._stepped = NEVER
@@ -122,10 +118,10 @@ class ObservedService:
 class ObserverNode:
     """One observing service in a process of its own."""
 
-    def __init__(self, service: Service, session: zenoh.Session, rules: Contract, domain: int, gid: bytes) -> None:
+    def __init__(self, service: Service, member: Member) -> None:
         self._service = service
-        self._link = Link(session, service.role, rules, domain, gid)
-        self._observed = ObservedService(service, session, rules, domain, gid)
+        self._link = Link(member)
+        self._observed = ObservedService(service, member)
 
     def run(self) -> None:
         """Observes until the conductor ends the run."""

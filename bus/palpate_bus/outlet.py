@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import zenoh
-
-from palpate_bus.contract import Contract
 from palpate_bus.lockstep import OutputPort
+from palpate_bus.member import Member
 from palpate_bus.spool import CHUNK_TYPE, Spool, recording
-from palpate_bus.transport import Publisher
-from palpate_bus.wire import message_key, topic_key
 
 
 class Outlet:
     """The sending side of a node."""
 
-    def __init__(self, session: zenoh.Session, role: str, rules: Contract, domain: int, gid: bytes) -> None:
-        topics = rules.outputs(role)
-        self._publishers = {
-            topic.name: Publisher(session, topic_key(topic, domain), rules.qos[topic.qos], gid) for topic in topics
-        }
-        self._chunks = Publisher(session, message_key(f"palpate/record/{role}", CHUNK_TYPE, domain), rules.qos["event"], gid)
+    def __init__(self, member: Member) -> None:
+        role = member.role
+        self._publishers = {topic.name: member.publisher(topic) for topic in member.rules.outputs(role)}
+        self._chunks = member.internal_publisher(f"palpate/record/{role}", CHUNK_TYPE, "event")
         self._chunk_sequence = 0
         self._spool = Spool(role, tuple(self._publishers)) if recording() else None
 

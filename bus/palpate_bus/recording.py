@@ -9,17 +9,14 @@ import logging
 from time import sleep
 from typing import Any, Protocol, runtime_checkable
 
-import zenoh
-
 from palpate_bus import codec
-from palpate_bus.contract import Contract, Topic
+from palpate_bus.contract import Topic
 from palpate_bus.distributed import Link, RunAborted
 from palpate_bus.lockstep import NEVER
+from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.service import Service
 from palpate_bus.spool import CHUNK_TYPE, unpack_chunk
-from palpate_bus.transport import Subscription
-from palpate_bus.wire import message_key
 
 log = logging.getLogger(__name__)
 
@@ -37,17 +34,15 @@ class RawRecorder(Protocol):
 class RecorderNode:
     """A recorder in a process of its own."""
 
-    def __init__(self, service: Service, session: zenoh.Session, rules: Contract, domain: int, gid: bytes) -> None:
+    def __init__(self, service: Service, member: Member) -> None:
         if not isinstance(service, RawRecorder):
             raise TypeError(f"the {service.role} service has no record(topic, payload, stamp, sequence)")
         self._service: Service = service
         self._recorder: RawRecorder = service
-        self._topics = rules.topics
-        self._link = Link(session, service.role, rules, domain, gid)
-        producers = [role.name for role in rules.roles.values() if not role.observer]
-        self._chunks = {
-            role: Subscription(session, message_key(f"palpate/record/{role}", CHUNK_TYPE, domain)) for role in producers
-        }
+        self._topics = member.rules.topics
+        self._link = Link(member)
+        producers = [role.name for role in member.rules.roles.values() if not role.observer]
+        self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
         self._lost: set[str] = set()
         self._messages = 0

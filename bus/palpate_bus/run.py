@@ -12,7 +12,6 @@ ROS_DOMAIN_ID, and what `zenoh_config` reads.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import sys
@@ -23,10 +22,10 @@ import zenoh
 
 from palpate_bus.contract import Contract, contract
 from palpate_bus.distributed import LockstepNode, RunAborted
+from palpate_bus.member import Member
 from palpate_bus.observer import ObserverNode
 from palpate_bus.recording import RawRecorder, RecorderNode
 from palpate_bus.service import Service
-from palpate_bus.transport import declare_alive
 from palpate_bus.wallclock import WallClockNode
 from palpate_bus.zenoh_config import close_session, open_session
 
@@ -68,10 +67,9 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
         service = create(load(os.environ["PALPATE_SCENARIO"]))
         session = open_session()
-        node = node_type(service, rules)(service, session, rules, domain, role_gid(role))
-        token: Any = declare_alive(session, domain, role)
-        node.run()
-        token.undeclare()
+        member = Member(session, role, rules, domain)
+        node_type(service, rules)(service, member).run()
+        member.leave()
     except RunAborted as aborted:
         logging.getLogger(role).warning("run ended early: %s", aborted)
         status = EXIT_FAILED
@@ -81,11 +79,6 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         logging.getLogger(role).exception("%s failed", role)
         status = EXIT_FAILED
     leave(session, status)
-
-
-def role_gid(role: str) -> bytes:
-    """16 bytes that identify a role's publishers in this process."""
-    return hashlib.sha256(f"{role} {os.getpid()}".encode()).digest()[:16]
 
 
 def leave(session: zenoh.Session | None, status: int) -> None:

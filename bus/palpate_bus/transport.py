@@ -108,33 +108,3 @@ class Subscription:
     def close(self) -> None:
         """Undeclares the subscriber."""
         self._subscriber.undeclare()
-
-
-def _alive_key(domain: int, role: str) -> str:
-    return f"palpate_alive/{domain}/{role}"
-
-
-def declare_alive(session: zenoh.Session, domain: int, role: str) -> zenoh.LivelinessToken:
-    """A token that vanishes with this process; keep it."""
-    return session.liveliness().declare_token(_alive_key(domain, role))
-
-
-class AliveWatch:
-    """Which roles were alive and are no more."""
-
-    def __init__(self, session: zenoh.Session, domain: int) -> None:
-        self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
-        self._subscriber = session.liveliness().declare_subscriber(_alive_key(domain, "*"), handler, history=True)
-        self._gone: set[str] = set()
-
-    def gone(self) -> frozenset[str]:
-        """The roles whose token vanished."""
-        while not self._queue.empty():
-            sample = self._queue.get_nowait()
-            role = str(sample.key_expr).rsplit("/", 1)[-1]
-            if sample.kind == zenoh.SampleKind.DELETE:
-                self._gone.add(role)
-            else:
-                self._gone.discard(role)
-        return frozenset(self._gone)

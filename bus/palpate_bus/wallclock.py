@@ -11,16 +11,13 @@ import logging
 from time import monotonic_ns, perf_counter_ns, sleep, time_ns
 from typing import Any
 
-import zenoh
-
-from palpate_bus.contract import MS, Contract, Edge
+from palpate_bus.contract import MS, Edge
 from palpate_bus.distributed import Link, RunAborted
 from palpate_bus.lockstep import NEVER, Received, Stepper
+from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.outlet import Outlet
 from palpate_bus.service import Service
-from palpate_bus.transport import Subscription
-from palpate_bus.wire import topic_key
 
 log = logging.getLogger(__name__)
 
@@ -32,13 +29,13 @@ HANDSHAKE_POLL_S = 0.02
 class WallClockNode:
     """One service on its own timer."""
 
-    def __init__(self, service: Service, session: zenoh.Session, rules: Contract, domain: int, gid: bytes) -> None:
+    def __init__(self, service: Service, member: Member) -> None:
         self._service = service
-        self._stepper = Stepper(service, rules, strict=False)
-        self._link = Link(session, service.role, rules, domain, gid)
-        self._outlet = Outlet(session, service.role, rules, domain, gid)
+        self._stepper = Stepper(service, member.rules, strict=False)
+        self._link = Link(member)
+        self._outlet = Outlet(member)
         self._data = {
-            name: Subscription(session, topic_key(buffer.topic, domain), history=buffer.topic.latched)
+            name: member.subscription(buffer.topic, history=buffer.topic.latched)
             for name, buffer in self._stepper.buffers.items()
         }
         self._sequences = dict.fromkeys(self._data, 0)

@@ -18,11 +18,10 @@ import zenoh
 from palpate_bus import codec
 from palpate_bus.contract import MS, Contract
 from palpate_bus.lockstep import NEVER, run_hash
+from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.observer import ObservedService
 from palpate_bus.stamps import NS
-from palpate_bus.transport import AliveWatch, Publisher, Subscription
-from palpate_bus.wire import message_key
 
 from palpate_conductor.collector import Collector
 from palpate_conductor.watchdog import Watchdog
@@ -100,27 +99,25 @@ class Conductor:
         `realtime` paces it at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends.
         With `wallclock` the services run on their own timers, and nothing is granted but the common start and the end.
         """
-        gid = b"palpate-conductr"
+        member = Member(session, collector.role, rules, domain)
+        self._member = member
         self._rules = rules
         self._workers = tuple(role for role in roles if not rules.roles[role].observer)
         self._observers = tuple(role for role in roles if rules.roles[role].observer)
         self._roles = roles
         self._collector = collector
-        self._observed = ObservedService(collector, session, rules, domain, gid, lossless=True)
+        self._observed = ObservedService(collector, member, lossless=True)
         self._patience = patience or Patience()
         self._realtime = realtime
         self._limit = limit
         self._wallclock = wallclock
         self._epoch = 0
-        key = message_key("palpate/control", "palpation_msgs/msg/RunControl", domain)
-        self._control = Publisher(session, key, rules.qos["event"], gid)
+        self._control = member.internal_publisher("palpate/control", "palpation_msgs/msg/RunControl", "event")
         self._encode = codec.encoder("palpation_msgs/msg/RunControl")
         self._decode = codec.decoder("palpation_msgs/msg/ServiceReport")
         self._reports = {
-            role: Subscription(session, message_key(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport", domain))
-            for role in roles
+            role: member.internal_subscription(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport") for role in roles
         }
-        self._alive = AliveWatch(session, domain)
         self._sequence = 0
         self.watchdog = Watchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = Outcome()
@@ -225,9 +222,12 @@ class Conductor:
                     self._close(role, detail)
                 elif message.state == ServiceReport.FAILED:
                     self._lose(role, detail.get("error", "unknown error"))
-            for role, how in {**dict.fromkeys(self._alive.gone(), "its connection is gone"), **died()}.items():
+            for role, how in {**dict.fromkeys(self._member.gone(), "its connection is gone"), **died()}.items():
                 if role in self._roles and role not in finished:
                     self._lose(role, how)
+            for complaint in self._member.complaints():
+                log.error("%s", complaint)
+                self.outcome.trouble.append(complaint)
             self._extend()
             self._watch()
             tell(self)

@@ -20,6 +20,8 @@ Mask = NDArray[np.bool_]
 
 RASTER = 0.001
 """Pitch of the raster [m]."""
+_EDGE_REACH = 0.01
+"""A lesion's edge runs at most so far from its labelled vertices [m]."""
 SCANNED_SHARE = 0.5
 """A lesion counts, as matched or missed, when this part of it was scanned."""
 
@@ -99,6 +101,10 @@ class TrueSurface:
         self._front = front
         self._mesh = Delaunay(truth.vertices[front, :2])
         self._height = LinearNDInterpolator(self._mesh, truth.vertices[front, 2])
+        total = np.zeros((len(truth.vertices), 3))
+        for k in range(3):
+            np.add.at(total, truth.triangles[facing, k], normal[facing])
+        self._steepness = LinearNDInterpolator(self._mesh, (np.linalg.norm(total, axis=1)[front] / total[front, 2]))
 
     def of(self, values: Array, xy: Array) -> Array:
         """A vertex quantity, shape (n,) or (n, k), at points xy [m], shape (p, 2); NaN off the surface."""
@@ -110,11 +116,7 @@ class TrueSurface:
 
     def steepness(self, xy: Array) -> Array:
         """Area of the surface over area in xy at points [1], shape (p,)."""
-        h = 0.002
-        step_x, step_y = np.array([h, 0.0]), np.array([0.0, h])
-        zx = (self.height(xy + step_x) - self.height(xy - step_x)) / (2 * h)
-        zy = (self.height(xy + step_y) - self.height(xy - step_y)) / (2 * h)
-        return np.asarray(np.sqrt(1 + np.nan_to_num(zx) ** 2 + np.nan_to_num(zy) ** 2))
+        return np.nan_to_num(self._steepness(xy), nan=1.0)
 
 
 def raster(low: Array, high: Array) -> Array:
@@ -134,7 +136,7 @@ def true_lesions(truth: Truth, surface: TrueSurface, scanned: Map | None) -> tup
             continue
         around = truth.vertices[inside, :2]
         points = raster(around.min(axis=0) - 0.01, around.max(axis=0) + 0.01)
-        mask = surface.of(inside.astype(float), points) >= 0.5
+        mask = lesion_of(truth, surface, points) == index
         weight = mask * surface.steepness(points) * RASTER**2
         area = float(weight.sum())
         seen = 0.0 if scanned is None else float(weight[_nearest(scanned, points, scanned.scanned)].sum()) / area
@@ -142,6 +144,27 @@ def true_lesions(truth: Truth, surface: TrueSurface, scanned: Map | None) -> tup
         lesions.append(TrueLesion(weight @ points / area, area, float(ratio.mean()), seen))
         masks.append((points, np.asarray(mask)))
     return lesions, masks
+
+
+def lesion_of(truth: Truth, surface: TrueSurface, points: Array) -> IntArray:
+    """The lesion in whose half-contrast area each point [m], shape (p, 2), lies, -1 elsewhere, shape (p,).
+
+    Half contrast: stiffness over background above halfway from 1 to the lesion's greatest. The labelled vertices say which lesion
+    a place belongs to, the interpolated stiffness where its edge runs between them.
+    """
+    owner = np.full(len(points), -1, dtype=np.int32)
+    labelled = np.flatnonzero(truth.lesion >= 0)
+    if not len(labelled):
+        return owner
+    ratio = truth.stiffness / truth.background
+    distance, nearest = cKDTree(truth.vertices[labelled, :2]).query(points, distance_upper_bound=_EDGE_REACH)
+    near = np.flatnonzero(np.isfinite(distance))
+    lesion = truth.lesion[labelled[nearest[near]]]
+    half = np.zeros(int(truth.lesion.max()) + 1)
+    np.maximum.at(half, truth.lesion[labelled], 0.5 * (1.0 + ratio[labelled]))
+    inside = surface.of(ratio, points[near]) >= half[lesion]
+    owner[near[inside]] = lesion[inside]
+    return owner
 
 
 def score(centroids: Array, found: Map | None, truth: Truth) -> Scores:
@@ -204,7 +227,7 @@ def _dice(found: Map, truth: Truth, surface: TrueSurface) -> float | None:
     points = raster(found.vertices[:, :2].min(axis=0), found.vertices[:, :2].max(axis=0))
     points = points[_nearest(found, points, found.scanned)]
     area = surface.steepness(points)
-    lesion = surface.of((truth.lesion >= 0).astype(float), points) >= 0.5
+    lesion = lesion_of(truth, surface, points) >= 0
     finding = _owner(found, points) >= 0
     both = float(area[lesion & finding].sum())
     total = float(area[lesion].sum() + area[finding].sum())

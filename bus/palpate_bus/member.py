@@ -1,0 +1,78 @@
+"""A role's membership of the bus: its session, its liveliness tokens, and how it publishes and subscribes by the contract.
+
+What it declares shows in the ROS graph (`ros2 node list`, `ros2 topic info`). A peer that publishes or wants a topic of the
+contract with another type or hash can never meet us; that is silent in ROS 2, so `complaints` says it.
+"""
+
+from __future__ import annotations
+
+from time import monotonic
+
+import zenoh
+
+from palpate_bus.contract import Contract, Topic
+from palpate_bus.liveliness import GraphWatch, NodeTokens, mismatches
+from palpate_bus.transport import Publisher, Subscription
+from palpate_bus.wire import message_key, topic_key
+
+CHECK_S = 0.5
+"""How often the graph is looked at."""
+
+
+class Member:
+    """One role on the bus."""
+
+    def __init__(self, session: zenoh.Session, role: str, rules: Contract, domain: int) -> None:
+        self.session = session
+        self.role = role
+        self.rules = rules
+        self.domain = domain
+        self.graph = GraphWatch(session, domain)
+        self._tokens = NodeTokens(session, role, domain)
+        self._said: set[str] = set()
+        self._checked = 0.0
+
+    def publisher(self, topic: Topic) -> Publisher:
+        """A publisher of a topic of the contract."""
+        qos = self.rules.qos[topic.qos]
+        return Publisher(self.session, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos))
+
+    def subscription(self, topic: Topic, history: bool = False) -> Subscription:
+        """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
+        self._tokens.subscription(topic, self.rules.qos[topic.qos])
+        return Subscription(self.session, topic_key(topic, self.domain), history)
+
+    def observed(self, topic: Topic) -> str:
+        """Declares a subscription that the caller makes; returns the key."""
+        self._tokens.subscription(topic, self.rules.qos[topic.qos])
+        return topic_key(topic, self.domain)
+
+    def internal_publisher(self, name: str, type_name: str, qos: str) -> Publisher:
+        """A publisher of the runtime's own messages."""
+        return Publisher(self.session, message_key(name, type_name, self.domain), self.rules.qos[qos], self._tokens.node.gid)
+
+    def internal_subscription(self, name: str, type_name: str) -> Subscription:
+        """A subscription to the runtime's own messages."""
+        return Subscription(self.session, message_key(name, type_name, self.domain))
+
+    def complaints(self) -> list[str]:
+        """New mismatches of message types on the bus, each said once; looks at most every `CHECK_S`."""
+        now = monotonic()
+        if now - self._checked < CHECK_S:
+            return []
+        self._checked = now
+        if not self.graph.changes():
+            return []
+        new = [sentence for sentence in mismatches(self.graph.alive.values()) if sentence not in self._said]
+        self._said.update(new)
+        return new
+
+    def gone(self) -> frozenset[str]:
+        """Roles that were on the bus and are no more."""
+        self.graph.changes()
+        return self.graph.gone()
+
+    def leave(self) -> None:
+        """Withdraws the tokens."""
+        self._tokens.undeclare()
+        self.graph.close()
