@@ -31,6 +31,7 @@ class Member:
         self._tokens = NodeTokens(session, role, domain)
         self._said: set[str] = set()
         self._checked = 0.0
+        self._changed = False
 
     def publisher(self, topic: Topic) -> Publisher:
         """A publisher of a topic of the contract."""
@@ -61,16 +62,21 @@ class Member:
         if now - self._checked < CHECK_S:
             return []
         self._checked = now
-        if not self.graph.changes():
+        self._catch_up()
+        if not self._changed:
             return []
+        self._changed = False
         new = [sentence for sentence in mismatches(self.graph.alive.values()) if sentence not in self._said]
         self._said.update(new)
         return new
 
     def gone(self) -> frozenset[str]:
         """Roles that were on the bus and are no more."""
-        self.graph.changes()
+        self._catch_up()
         return self.graph.gone()
+
+    def _catch_up(self) -> None:
+        self._changed = bool(self.graph.changes()) or self._changed
 
     def leave(self) -> None:
         """Withdraws the tokens."""

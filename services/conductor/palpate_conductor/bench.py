@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import platform
 import tempfile
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,8 @@ def measure(scenario: Scenario, console: Console) -> dict[str, Any]:
     parts: dict[str, Any] = {}
     for point in sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name):
         with console.status(f"{point.name}: cost of a step"):
-            parts[point.name] = point.load()()
+            measure_part: Callable[[], dict[str, float]] = point.load()
+            parts[point.name] = measure_part()
     figures["parts"] = parts
     runs: dict[str, Any] = {}
     cases = (

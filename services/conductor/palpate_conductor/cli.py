@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 from datetime import datetime
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
 from palpate_bus.contract import contract
+from palpate_bus.router import DEFAULT_ENDPOINT, serve
 from palpate_bus.zenoh_config import BusConfigError, close_session, open_session
 from palpate_models.load import ScenarioError, load_scenario, scenario_names
 from palpate_models.scenario import Scenario
@@ -184,8 +186,22 @@ def bench(
     run_bench(scenario, out, Console())
 
 
+@app.command()
+def router(
+    listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on; may be repeated.")] = None,
+) -> None:
+    """Run a zenoh router for services in containers or on several machines, until a signal."""
+    console = Console(stderr=True)
+    try:
+        serve(listen or (DEFAULT_ENDPOINT,), ready=console.print)
+    except BusConfigError as error:
+        _fail(console, EXIT_BAD_INPUT, str(error))
+
+
 def main() -> None:
-    """Entry point."""
+    """Entry point: our commands, and those that other packages register under `palpate.commands`."""
+    for point in sorted(entry_points(group="palpate.commands"), key=lambda point: point.name):
+        app.add_typer(point.load(), name=point.name)
     try:
         app()
     except BrokenPipeError:

@@ -159,7 +159,7 @@ def lesion_of(truth: Truth, surface: TrueSurface, points: Array) -> IntArray:
     ratio = truth.stiffness / truth.background
     distance, nearest = cKDTree(truth.vertices[labelled, :2]).query(points, distance_upper_bound=_EDGE_REACH)
     near = np.flatnonzero(np.isfinite(distance))
-    lesion = truth.lesion[labelled[nearest[near]]]
+    lesion = truth.lesion[labelled[np.asarray(nearest)[near]]]
     half = np.zeros(int(truth.lesion.max()) + 1)
     np.maximum.at(half, truth.lesion[labelled], 0.5 * (1.0 + ratio[labelled]))
     inside = surface.of(ratio, points[near]) >= half[lesion]
