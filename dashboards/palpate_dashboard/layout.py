@@ -24,7 +24,7 @@ def _scene() -> Any:
         contents=["+ $origin/**", "- /world/camera/depth"],
         background=(24, 27, 33),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, color=(255, 255, 255, 18)),
-        eye_controls=_eye((1.42, -1.12, 1.58), (0.42, -0.02, 1.05), (0.0, 0.0, 1.0)),
+        eye_controls=_eye((1.16, -0.80, 1.46), (0.42, -0.02, 1.02), (0.0, 0.0, 1.0)),
         overrides={
             "/world/tool/travelled": rrb.VisibleTimeRanges([whole_past]),
             "/world/perception/normals": hidden,
@@ -71,12 +71,13 @@ def blueprint(region_m: tuple[float, float], centre_m: tuple[float, float], dept
             rrb.TextDocumentView(name="Status", origin="/text/status"),
             rrb.TextDocumentView(name="Services", origin="/text/services"),
             rrb.TextLogView(name="Log", origin="/log"),
+            rrb.TextDocumentView(name="Legend", origin="/text/legend"),
         ),
         rrb.StateTimelineView(name="Phase and driver", origin="/state"),
         _plot("Normal force [N]", "/plots/force", -1.0, 1.1 * force_limit_n),
         _plot("Depth [mm]", "/plots/depth", -5.0, 1.8e3 * depth_m),
         rrb.Tabs(
-            _plot("Joint torque [% of limit]", "/plots/torque", -100.0, 100.0),
+            rrb.TimeSeriesView(name="Joint torque [% of limit]", origin="/plots/torque"),
             rrb.TimeSeriesView(name="Real-time factor [1]", origin="/plots/pace"),
             _plot("Progress [%]", "/plots/progress", 0.0, 100.0),
         ),

@@ -13,9 +13,11 @@ from palpate_dashboard import palette
 from palpate_dashboard.columns import TIMELINE, Columns, arrows, deformations, transforms
 from palpate_dashboard.geometry import Array, Carry, Indices, VertexNormals
 
-METRES_PER_NEWTON: Final = 0.015
-"""Length of the force arrow: 10 N are 15 cm."""
-RESOLUTION_M: Final = 1e-4
+METRES_PER_NEWTON: Final = 0.03
+"""Length of the force arrow: 5 N are 15 cm."""
+BESIDE_M: Final = np.array((0.035, -0.035, 0.0))
+"""The arrow stands so far beside the tool, in world, on the viewer's side: in its place the tool would hide it."""
+RESOLUTION_M: Final = 2e-4
 """Vertices move in steps of this, so that what stands still is bit for bit the same and compresses to nothing."""
 CLOUD_POINTS: Final = 6000
 """At most so many points of the perceived cloud are drawn."""
@@ -49,6 +51,8 @@ class Scene:
         self._force_shown = False
         self._trail: list[NDArray[np.float64]] = []
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        red = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004], show_labels=True)
+        recording.log("world/tool/force", red, static=True)
 
     def at(self, t: int) -> None:
         """Sets the simulated time [ns] of what is logged row by row."""
@@ -97,7 +101,7 @@ class Scene:
         if self._drawn is not None and np.array_equal(rounded, self._drawn):
             return
         self._drawn = rounded
-        normals = np.round(self._normals(rounded), 2)
+        normals = np.round(self._normals(rounded) * 64.0) / np.float32(64.0)
         self._columns.add("world/abdomen", deformations, t, (rounded, normals))
 
     def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Array, scanned: NDArray[np.bool_]) -> None:
@@ -132,7 +136,7 @@ class Scene:
     def lens(self, k: Array, width: int, height: int) -> None:
         """Intrinsics of the camera, shape (3, 3) [px]."""
         view = rr.Pinhole(
-            image_from_camera=k, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.3
+            image_from_camera=k, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.2
         )
         self._recording.log("world/camera", view, static=True)
 
@@ -150,6 +154,11 @@ class Scene:
         shape = rr.Points3D(thinned, colors=[palette.POINTS], radii=[0.0012])
         self._recording.log("world/perception/points", shape)
 
+    def clear_cloud(self, t: int) -> None:
+        """Takes the cloud away: it would hide the abdomen's colours."""
+        self.at(t)
+        self._recording.log("world/perception/points", rr.Points3D([]))
+
     def perceived(self, t: int, vertices: NDArray[np.float32], triangles: Indices) -> None:
         """The perceived rest surface."""
         self.at(t)
@@ -162,7 +171,7 @@ class Scene:
     def targets(self, t: int, positions: Array, normals: Array) -> None:
         """Palpation points and outward normals, shapes (n, 3)."""
         self.at(t)
-        points = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.0015])
+        points = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.001])
         self._recording.log("world/perception/targets", points)
         needles = rr.Arrows3D(origins=positions, vectors=0.02 * normals, colors=[palette.TARGETS], radii=[0.0004])
         self._recording.log("world/perception/normals", needles)
@@ -170,7 +179,7 @@ class Scene:
     def planned(self, t: int, positions: Array) -> None:
         """The planned path of the tool, shape (n, 3)."""
         self.at(t)
-        shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(1.5)])
+        shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(0.5)])
         self._recording.log("world/plan/path", shape)
 
     def tool(self, t: int, position: NDArray[np.float64], in_contact: bool) -> None:
@@ -187,19 +196,15 @@ class Scene:
             return
         self.at(t)
         color = palette.PRESSED if in_contact else palette.TRAVELLED
-        shape = rr.LineStrips3D([np.array(self._trail)], colors=[color], radii=[rr.Radius.ui_points(1.2)])
+        shape = rr.LineStrips3D([np.array(self._trail)], colors=[color], radii=[rr.Radius.ui_points(0.7)])
         self._recording.log("world/tool/travelled", shape)
         del self._trail[:-1]
 
     def force(self, t: int, position: NDArray[np.float64], force: NDArray[np.float64]) -> None:
-        """The contact force [N], shape (3,), that presses on the indenter at `position`."""
+        """The contact force [N], shape (3,), that presses on the indenter at `position`; drawn beside the tool."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:
             vector = METRES_PER_NEWTON * force if shown else np.zeros(3)
-            self._columns.add("world/tool/force", arrows, t, np.concatenate((position, vector)))
+            label = f"{np.linalg.norm(force):.1f} N" if shown else ""
+            self._columns.add("world/tool/force", arrows, t, (position + BESIDE_M, vector, label))
         self._force_shown = shown
-
-    def style(self) -> None:
-        """What does not change about entities that do."""
-        shape = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004])
-        self._recording.log("world/tool/force", shape, static=True)

@@ -66,8 +66,11 @@ class DashboardService(Service):
 
     role = "dashboard"
 
-    def __init__(self, scenario: Scenario, path: Path, live: Live) -> None:
-        """Uses the exam's input and the robot of `scenario`, not its phantom. Raises OSError if `path` is not writable."""
+    def __init__(self, scenario: Scenario, path: Path, live: Live, *, paced: bool = True) -> None:
+        """Uses the exam's input and the robot of `scenario`, not its phantom; `paced`: whether the pace is worth showing.
+
+        Raises OSError if `path` is not writable.
+        """
         given = exam_input(scenario)
         self._name = scenario.name
         self._path = path
@@ -79,7 +82,7 @@ class DashboardService(Service):
         self._columns = Columns(self._recording)
         self._scene = Scene(self._recording, self._columns)
         self._map = StiffnessMap(self._recording, exam.region_m, exam.centre_m)
-        self._plots = Plots(self._recording, self._columns, limit)
+        self._plots = Plots(self._recording, self._columns, limit, words.LEGEND)
         self._shapes = dict(_shapes(given.robot))
         for box in table.boxes(given.robot):
             self._scene.box(box.name, box.X_WB, box.size, FURNITURE.get(box.name, palette.STEEL))
@@ -89,6 +92,7 @@ class DashboardService(Service):
         self._pressed_n = 0.0
         self._found: list[str] = []
         self._robot = "no status yet"
+        self._paced = paced
         self._pace: float | None = None
         self._pace_mark = (0, perf_counter())
         self._steps = 0
@@ -122,7 +126,7 @@ class DashboardService(Service):
                     self._seen[topic] = message
                     self._due[topic] = t + period
                     draw(t, message)
-        if self._is_due("pace", t, 1000 * MS):
+        if self._paced and self._is_due("pace", t, 1000 * MS):
             self._due["pace"] = t + 1000 * MS
             self._measure_pace(t)
         if self._is_due("send", t, self._send_period):
@@ -215,6 +219,8 @@ class DashboardService(Service):
         phase = plots.PHASES[message.phase][0]
         if self._plots.state(t, "state/phase", phase):
             self._scene.extend_trail(t, self._in_contact)
+            if phase == "approach":
+                self._scene.clear_cloud(t)
         self._in_contact = bool(message.in_contact)
         self._plots.say(t, "log/exam", message.message, "ERROR" if phase == "aborted" else "INFO")
         self._plots.force(t, message.normal_force)

@@ -7,6 +7,18 @@ from collections.abc import Iterable, Sequence
 LEVELS = ("ok", "warning", "ERROR", "stale")
 """diagnostic_msgs/DiagnosticStatus levels."""
 
+LEGEND = """
+| in the scene | |
+|---|---|
+| abdomen | skin where not scanned; then pale as the background, blue softer, red stiffer |
+| blue line | planned path of the indenter |
+| green, brown line | travelled path, free and in contact |
+| red arrow beside the tool | true normal force, 5 N are 15 cm |
+| violet outline | true lesion at half contrast: switch it off under `world/truth` |
+| white points | palpation targets; light blue: perceived points |
+| pyramid | view of the depth camera |
+"""
+
 
 def status(
     scenario: str, phase: str, message: str, counts: tuple[int, int, int], depth_mm: float, force_n: float,
