@@ -10,7 +10,7 @@ import json
 import platform
 import tempfile
 from collections.abc import Callable
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,11 @@ def _figures(result: RunResult) -> dict[str, Any]:
     }
 
 
+def _load(point: EntryPoint) -> Callable[[], dict[str, float]]:
+    loaded: Callable[[], dict[str, float]] = point.load()
+    return loaded
+
+
 def measure(scenario: Scenario, console: Console) -> dict[str, Any]:
     """All figures, by name. Takes a few minutes."""
     figures: dict[str, Any] = {"platform": fingerprint()}
@@ -44,11 +49,10 @@ def measure(scenario: Scenario, console: Console) -> dict[str, Any]:
     parts: dict[str, Any] = {}
     for point in sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name):
         with console.status(f"{point.name}: cost of a step"):
-            measure_part: Callable[[], dict[str, float]] = point.load()
-            parts[point.name] = measure_part()
+            parts[point.name] = _load(point)()
     figures["parts"] = parts
     runs: dict[str, Any] = {}
-    cases = (
+    cases: tuple[tuple[str, Callable[[Path], RunResult]], ...] = (
         ("composed", lambda out: run_composed(scenario, out, lambda _: None, ())),
         ("distributed", lambda out: run_distributed(scenario, out, lambda _: None, ())),
         ("distributed, recorder and viewer", lambda out: run_distributed(scenario, out, lambda _: None, OBSERVERS)),

@@ -201,7 +201,10 @@ def router(
 def main() -> None:
     """Entry point: our commands, and those that other packages register under `palpate.commands`."""
     for point in sorted(entry_points(group="palpate.commands"), key=lambda point: point.name):
-        app.add_typer(point.load(), name=point.name)
+        try:
+            app.add_typer(point.load(), name=point.name)
+        except ImportError as error:
+            print(f"palpate: the command {point.name} of {point.value} cannot be loaded: {error}", file=sys.stderr)
     try:
         app()
     except BrokenPipeError:
