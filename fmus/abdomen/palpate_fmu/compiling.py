@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import subprocess
 import sys
 import tempfile
@@ -50,7 +51,7 @@ def platforms(version: int, names: Sequence[str] | None = None) -> tuple[Platfor
 
     Raises ValueError naming one that is not known.
     """
-    known = {platform.tuple_3: platform for platform in PLATFORMS if version >= 3 or platform.folder_2}
+    known = {target.tuple_3: target for target in PLATFORMS if version >= 3 or target.folder_2}
     if names is None:
         return tuple(known.values())
     for name in names:
@@ -60,11 +61,10 @@ def platforms(version: int, names: Sequence[str] | None = None) -> tuple[Platfor
 
 
 def native() -> str:
-    """This machine's platform, by its name in FMI 3.0."""
-    machine = {"arm64": "aarch64", "amd64": "x86_64"}.get(os.uname().machine if hasattr(os, "uname") else "x86_64")
-    machine = machine or os.uname().machine
-    system = {"darwin": "darwin", "win32": "windows"}.get(sys.platform, "linux")
-    return f"{machine}-{system}"
+    """The platform of this machine, by its name in FMI 3.0."""
+    name = platform.machine().lower()
+    machine = {"arm64": "aarch64", "amd64": "x86_64"}.get(name, name)
+    return f"{machine}-{platform.system().lower()}"
 
 
 def fmi_headers() -> Path:
@@ -74,27 +74,27 @@ def fmi_headers() -> Path:
     return Path(fmpy.__file__).parent / "c-code"
 
 
-def compile_library(folder: Path, sources: Sequence[str], platform: Platform, includes: Sequence[Path] = ()) -> bytes:
+def compile_library(folder: Path, sources: Sequence[str], target: Platform, includes: Sequence[Path] = ()) -> bytes:
     """The shared library of `sources` in `folder` for a platform; remembered in a cache by their content.
 
     Raises CompileError.
     """
     flags = [*WARNINGS, *OPTIMISE, *(f"-I{path}" for path in includes)]
-    key = hashlib.sha256(f"{metadata.version('ziglang')} {platform} {WARNINGS} {OPTIMISE} {list(sources)}".encode())
+    key = hashlib.sha256(f"{metadata.version('ziglang')} {target} {WARNINGS} {OPTIMISE} {list(sources)}".encode())
     for path in sorted([*folder.glob("*.[ch]"), *(header for include in includes for header in include.glob("*.h"))]):
         key.update(path.name.encode() + b"\0" + path.read_bytes())
-    cached = _cache() / f"{key.hexdigest()}{platform.suffix}"
+    cached = _cache() / f"{key.hexdigest()}{target.suffix}"
     if cached.is_file():
         return cached.read_bytes()
     with tempfile.TemporaryDirectory() as work:
-        out = Path(work) / f"library{platform.suffix}"
+        out = Path(work) / f"library{target.suffix}"
         link = ["-shared", "-fvisibility=hidden", "-s", "-o", str(out), *sources]
-        if "windows" not in platform.triple:
+        if "windows" not in target.triple:
             link += ["-fPIC", "-lm"]
-        command = [sys.executable, "-m", "ziglang", "cc", "-target", platform.triple, *flags, *link]
+        command = [sys.executable, "-m", "ziglang", "cc", "-target", target.triple, *flags, *link]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode or not out.is_file():
-            raise CompileError(f"cannot compile for {platform.tuple_3}:\n{done.stderr}")
+            raise CompileError(f"cannot compile for {target.tuple_3}:\n{done.stderr}")
         library = out.read_bytes()
     cached.parent.mkdir(parents=True, exist_ok=True)
     partial = cached.with_suffix(f".{os.getpid()}")

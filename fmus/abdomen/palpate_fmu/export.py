@@ -6,7 +6,7 @@ import shutil
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from palpate_models.phantom import PhantomModel, build_phantom
@@ -49,12 +49,13 @@ def build_fmu(
     targets: Sequence[str] | None = None,
     radius_m: float = 0.015,
     model: PhantomModel | None = None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Writes the FMU of a phantom to `out` and returns that path.
 
     `version` is FMI's, 2 or 3; `targets` are platforms by FMI 3.0's names, all by default; `radius_m` is the indenter's
-    start value; `model` replaces the surface and background that `phantom` would give. The same arguments give the same
-    bytes. Raises ExportError, CompileError or ValueError.
+    start value; `model` replaces the surface and background that `phantom` would give; `tell` is called with each platform
+    that is ready. The same arguments give the same bytes. Raises ExportError, CompileError or ValueError.
     """
     if version not in (2, 3):
         raise ValueError(f"FMI version {version} is not one of 2, 3")
@@ -75,9 +76,10 @@ def build_fmu(
             "resources/phantom.bin": encode_phantom(model, starts, token),
             **{f"sources/{path.name}": path.read_bytes() for path in sorted(folder.iterdir())},
         }
-        for platform in wanted:
-            place = platform.tuple_3 if version == 3 else platform.folder_2
-            files[f"binaries/{place}/{MODEL}{platform.suffix}"] = compile_library(folder, names, platform)
+        for target in wanted:
+            place = target.tuple_3 if version == 3 else target.folder_2
+            files[f"binaries/{place}/{MODEL}{target.suffix}"] = compile_library(folder, names, target)
+            tell(target.tuple_3)
     out.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name, content in files.items():
@@ -88,9 +90,15 @@ def build_fmu(
     return out
 
 
-def build_scenario_fmu(scenario: Scenario, out: Path, version: int = 3, targets: Sequence[str] | None = None) -> Path:
+def build_scenario_fmu(
+    scenario: Scenario,
+    out: Path,
+    version: int = 3,
+    targets: Sequence[str] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Path:
     """`build_fmu` for the phantom and the indenter of a scenario."""
-    return build_fmu(scenario.phantom, scenario.seed, out, version, targets, scenario.robot.indenter_radius_m)
+    return build_fmu(scenario.phantom, scenario.seed, out, version, targets, scenario.robot.indenter_radius_m, tell=tell)
 
 
 def _token(content: bytes, version: int) -> str:

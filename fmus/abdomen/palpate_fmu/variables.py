@@ -107,7 +107,7 @@ TABLE: tuple[Variable, ...] = (
     _input(1, "indenter_position", "inputs.position", "m", 10, (0.0, 0.0, 1.0), "Centre of the sphere at the end of the step"),
     _input(4, "indenter_velocity", "inputs.velocity", "m/s", 10, (0.0, 0.0, 0.0), "Velocity of the centre, for friction"),
     _input(7, "indenter_angular_velocity", "inputs.spin", "rad/s", 100, (0.0, 0.0, 0.0), "Angular velocity, for friction"),
-    Variable(10, "contact_force", "outputs.force", "Force of the tissue on the sphere, mean over the step", "N", (3,), group="STATE"),
+    Variable(10, "contact_force", "outputs.force", "Force on the sphere, mean of the step", "N", (3,), group="STATE"),
     Variable(13, "contact_torque", "outputs.torque", "Its torque about the sphere's centre", "N.m", (3,), group="STATE"),
     Variable(16, "indentation_depth", "outputs.depth", "Of the sphere's lowest point below the rest surface", "m", group="UNDER"),
     Variable(17, "surface_point", "outputs.point", "Point of the rest surface nearest to the centre", "m", (3,), group="UNDER"),
@@ -199,8 +199,7 @@ def c_table() -> str:
             of, count = variable.shape[0].upper(), variable.shape[1:]
         each = prod(extent for extent in count if isinstance(extent, int))
         low, high = (bound if variable.kind is not Kind.READ else 0.0 for bound in (variable.low, variable.high))
-        lines.append(
-            f"ROW({variable.vr}, {'INTEGER' if variable.integer else 'REAL'}, {variable.kind}, {of}, {each}, {float(low or 0)!r}, "
-            f'{float(high or 0)!r}, {variable.group}, {variable.member}, "{variable.name}")'
-        )
+        what = f"{variable.vr}, {'INTEGER' if variable.integer else 'REAL'}, {variable.kind}, {of}, {each}"
+        bounds = f"{float(low or 0)!r}, {float(high or 0)!r}"
+        lines.append(f'ROW({what}, {bounds}, {variable.group}, {variable.member}, "{variable.name}")')
     return "\n".join(lines) + "\n"

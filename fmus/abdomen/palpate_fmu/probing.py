@@ -1,0 +1,105 @@
+"""A probing motion: the sphere is pressed into an abdomen FMU along the surface normal, held, and withdrawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_fmu.instance import FmuInstance
+
+Array = NDArray[np.float64]
+
+GAP_M = 0.002
+"""Distance from the surface at which the motion starts and ends."""
+
+
+@dataclass(frozen=True)
+class Probing:
+    """What a probing motion gave; all of shape (n,)."""
+
+    time: Array
+    """[s]"""
+    depth: Array
+    """Of the sphere's lowest point below the rest surface [m]."""
+    force: Array
+    """On the sphere, along the surface normal [N]."""
+    contacts: NDArray[np.int32]
+    """Vertices in contact."""
+    energy: Array
+    """Stored [J]."""
+
+    def table(self) -> Array:
+        """The columns of the reference results, shape (n, 5)."""
+        return np.column_stack((self.time, self.depth, self.force, self.contacts, self.energy))
+
+
+COLUMNS = "time [s],indentation_depth [m],normal_force [N],contacts,elastic_energy [J]"
+
+
+def probe(
+    fmu: FmuInstance,
+    at_m: tuple[float, float] = (0.0, 0.05),
+    depth_m: float = 0.010,
+    speed_mps: float = 0.02,
+    hold_s: float = 1.0,
+    step_s: float = 1e-3,
+    start_s: float = 0.0,
+) -> Probing:
+    """Presses at a point (x, y) of the abdomen frame [m] to a depth, holds it and withdraws, from `start_s` on.
+
+    The FMU must be fresh. Its sphere moves along the normal of the rest surface beneath (x, y, 0.05 m).
+    """
+    motion = fmu.port(["indenter_position", "indenter_velocity"])
+    position, velocity = motion["indenter_position"], motion["indenter_velocity"]
+    place = fmu.port(["surface_point", "surface_normal"])
+    result = fmu.port(["indentation_depth", "normal_force", "elastic_energy"])
+    counter = fmu.port(["contacts"])
+    radius = float(fmu.get("indenter_radius"))
+    position[:] = (*at_m, 0.05)
+    motion.push()
+    place.pull()
+    point, normal = place["surface_point"].copy(), place["surface_normal"].copy()
+    way = (depth_m + GAP_M) / speed_mps
+    steps = round((2 * way + hold_s) / step_s)
+    rows = np.empty((steps, 5))
+    for k in range(steps):
+        t = (k + 1) * step_s
+        if t < way:
+            depth, rate = speed_mps * t - GAP_M, speed_mps
+        elif t < way + hold_s:
+            depth, rate = depth_m, 0.0
+        else:
+            depth, rate = depth_m - speed_mps * (t - way - hold_s), -speed_mps
+        position[:] = point + (radius - depth) * normal
+        velocity[:] = -rate * normal
+        motion.push()
+        fmu.step(start_s + k * step_s, step_s)
+        rows[k] = (start_s + t, *result.pull()[:2], int(counter.pull()[0]), result.values[2])
+    return Probing(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3].astype(np.int32), rows[:, 4])
+
+
+def plot_probing(probing: Probing, out: Path, title: str) -> None:
+    """Force against depth, and force over time, as a PNG."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
+
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot(1e3 * probing.depth, probing.force, color="#1f5fa8")
+    left.set(xlabel="indentation depth [mm]", ylabel="normal force [N]", title="force against depth")
+    right.plot(probing.time, probing.force, color="#1f5fa8", label="normal force [N]")
+    right.plot(probing.time, 1e3 * probing.depth, color="#888888", linewidth=1, label="depth [mm]")
+    right.set(xlabel="time [s]", title="press, hold, withdraw")
+    right.legend(frameon=False)
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.axhline(0, color="#cccccc", linewidth=0.8, zorder=0)
+    figure.suptitle(title)
+    figure.savefig(out, dpi=130)
+
+
+def write_csv(probing: Probing, out: Path) -> None:
+    """The columns as text, exact."""
+    np.savetxt(out, probing.table(), fmt="%.17g", delimiter=",", header=COLUMNS, comments="")
