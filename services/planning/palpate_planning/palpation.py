@@ -167,10 +167,10 @@ class Palpation:
         )
         return self._progress(contact)
 
-    def _slow_down(self, floor: float) -> float:
-        """Part of the speed that the expected force leaves: all of it below 70 % of the limit, `floor` at 100 %."""
-        room = (1.0 - self._regulation.expected_force / self._regulator.force_max) / 0.3
-        return min(max(room, floor), 1.0)
+    def _slow_down(self, full: float, none: float, floor: float) -> float:
+        """Part of the speed that the expected force leaves: all below `full` of the limit, none at `none`, yet `floor`."""
+        force = self._regulation.expected_force / self._regulator.force_max
+        return min(max((none - force) / (none - full), floor), 1.0)
 
     def _descend(self, contact: Contact) -> None:
         if not self._onset.done:
@@ -178,7 +178,7 @@ class Palpation:
             return
         near = self._depth.position > -SLOW_M - self._depth.velocity**2 / DEPTH_ACCELERATION
         there = self._deeper() if near else self._depth.step(self._exam.depth_m, DESCEND_MPS)
-        self._settled = self._settled + PERIOD_S if self._slow_down(0.0) < CREEP else 0.0
+        self._settled = self._settled + PERIOD_S if self._slow_down(0.7, 1.0, 0.0) < CREEP else 0.0
         if there or self._settled > SETTLED_S:  # at depth, or as deep as the force allows
             self._enter(Doing.SETTLE)
 
@@ -199,7 +199,7 @@ class Palpation:
 
     def _deeper(self) -> bool:
         """Goes on to full depth, the slower the nearer the force is to its limit; returns whether it is there."""
-        return self._depth.step(self._exam.depth_m, PLUNGE_MPS * self._slow_down(0.01))
+        return self._depth.step(self._exam.depth_m, PLUNGE_MPS * self._slow_down(0.7, 1.0, 0.01))
 
     def _settle(self, contact: Contact) -> None:
         self._deeper()
@@ -212,7 +212,7 @@ class Palpation:
         self._deeper()
         path = self._legs[self._k].path
         allowed = self._limit.at(self._s.position + self._s.velocity * PERIOD_S)
-        if self._s.step(path.length, max(allowed * self._slow_down(0.3), 1e-3)):
+        if self._s.step(path.length, max(allowed * self._slow_down(1.0, 1.1, 0.3), 1e-3)):
             self._enter(Doing.LIFT)
 
     def _lift(self) -> None:

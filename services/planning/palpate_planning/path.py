@@ -10,7 +10,7 @@ from palpate_models import lbr
 from palpate_models.scenario import Limits
 from scipy.interpolate import CubicSpline
 
-from palpate_planning.poses import angular_velocity, least_twist, orthonormal
+from palpate_planning.poses import angular_velocity, frame, least_twist
 from palpate_planning.surface import Surface
 from palpate_planning.timing import SpeedLimit
 
@@ -92,8 +92,8 @@ class SurfacePath:
 
 def _frame(y: Array) -> Array:
     """Orientation from a spline's columns: z opposite to the normal, x near the interpolated x."""
-    z = -y[3:6] / np.linalg.norm(y[3:6])
-    return orthonormal(np.column_stack((y[6:9], y[6:9], z)), z)
+    n = y[3:6]
+    return frame(y[6:9], -n / np.sqrt(n @ n))
 
 
 def lay(surface: Surface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:

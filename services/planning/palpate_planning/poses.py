@@ -6,6 +6,8 @@ point lies `depth` below the surface point p along the inward normal. Spin about
 
 from __future__ import annotations
 
+from math import atan2, sqrt
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,11 +36,13 @@ def least_twist(z_W: Array, R_ref: Array) -> Array:
     return np.stack((x, y, z), axis=-1)
 
 
-def orthonormal(R: Array, z: Array) -> Array:
-    """R with its z axis set to unit z exactly and x, y made orthonormal to it."""
-    x = R[:, 0] - z * float(z @ R[:, 0])
-    x = x / np.linalg.norm(x)
-    return np.column_stack((x, cross(z, x), z))
+def frame(x_near: Array, z: Array) -> Array:
+    """The rotation, shape (3, 3), with unit z as its z axis and its x axis as near to x_near as it can be."""
+    x = x_near - z * float(z @ x_near)
+    x = x / np.sqrt(x @ x)
+    R = np.empty((3, 3))
+    R[:, 0], R[:, 1], R[:, 2] = x, cross(z, x), z
+    return R
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -75,6 +79,6 @@ def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
     """w_W [rad/s] that turns R0 into R1 in dt [s], shape (3,)."""
     D = R1 @ R0.T
     v = 0.5 * np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
-    s = float(np.linalg.norm(v))
-    angle = float(np.arctan2(s, 0.5 * (np.trace(D) - 1.0)))
+    s = sqrt(float(v @ v))
+    angle = atan2(s, 0.5 * (float(D[0, 0] + D[1, 1] + D[2, 2]) - 1.0))
     return np.asarray(v * ((angle / s if s > 1e-9 else 1.0) / dt))

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from palpate_models import lbr
 from palpate_models.scenario import Robot
 
+from palpate_planning.poses import cross
+
 Array = NDArray[np.float64]
 
 GRAVITY = 9.80665
@@ -39,7 +41,7 @@ class ToolWeight:
     def wrench(self, R_WS: Array) -> Array:
         """The weight as the sensor sees it: force [N] and torque [N m] at its origin in its axes, shape (6,)."""
         force = R_WS.T @ np.array((0.0, 0.0, -self.mass * self._gravity))
-        return np.concatenate((force, np.cross(self.com_S, force)))
+        return np.concatenate((force, cross(self.com_S, force)))
 
     def start_tare(self) -> None:
         """Forgets earlier readings; the bias stays as it is until the first reading."""
