@@ -2,15 +2,18 @@
 
 Cartesian, with e the pose error and all task quantities in axes of the desired indenter frame D:
 
-    F   = K clip(e) + B (V_d - V) + F_ff,  B_i = 2 zeta_i sqrt(K_i m_i)
+    F   = K clip(e) + B (V_d - V) + F_ff,  B_i = 2 zeta_i sqrt(K_i m_i) - b_i
     tau = J^T F + N^T tau_0 + C(q, qd) qd + friction(qd_d)
 
-m_i = 1 / (J M^-1 J^T)_ii is the effective mass along axis i (Khatib 1995, doi 10.1177/027836499501400103); N is the
-dynamically consistent null-space projector (Khatib 1987, doi 10.1109/JRA.1987.1087068). The rotational spring is the
-gradient of 1/2 phi^T K phi, phi the rotation vector, so the springs store energy and never create any.
+m_i and b_i are the inertia and the joints' own viscous friction along axis i while the other axes are held: diagonals of
+(J M^-1 J^T)^-1 and (J D^-1 J^T)^-1. So the ratio of damping that the arm shows is the one asked for. N is the dynamically
+consistent null-space projector (Khatib 1987, doi 10.1109/JRA.1987.1087068). The rotational spring is the gradient of
+1/2 phi^T K phi, phi the rotation vector, so the springs store energy and never create any.
 """
 
 from __future__ import annotations
+
+from math import isfinite
 
 import numpy as np
 import pinocchio as pin
@@ -34,8 +37,15 @@ JOINT_DAMPING_RATIO = 0.7
 """Of the joint spring in mode JOINT and of the null-space posture [1]."""
 STICTION_SPEED = 0.02
 """Joint speed at which half of the Coulomb friction is compensated [rad/s]; keeps the compensation smooth."""
-SINGULAR_MOBILITY = 1e-3
-"""Added to the task mobility [1/kg, 1/(kg m^2)] where it has lost rank."""
+LEAST_DAMPING = 0.1
+"""Part of the designed damping that is commanded even where friction alone would do: friction is known badly."""
+DEAD_TIME_S = 2e-3
+"""From measuring to acting: a tick of transport, one of holding the torque, half of velocity's age, rounded up."""
+SPRING_RATE = 150.0
+"""Fastest undamped frequency of a spring [rad/s], 0.3 over the dead time: past it sampled damping adds energy."""
+REGULARISATION = 1e-3
+"""Added to a matrix of the task [1/kg, 1/(kg m^2)] where it has lost rank."""
+_EYE = np.eye(6)
 
 
 class ImpedanceController:
@@ -49,7 +59,7 @@ class ImpedanceController:
         self._clip = np.array([POSITION_CLIP_M] * 3 + [ROTATION_CLIP_RAD] * 3)
         self._rotate = np.zeros((6, 6))  # world axes to D's, for linear and angular parts
         self._error = np.zeros(6)
-        self._rhs = np.zeros((6, 2), order="F")
+        self._has_friction = bool((model.viscous_friction > 0).all())
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
@@ -60,7 +70,7 @@ class ImpedanceController:
 
         Raises ValueError if `q` or `qd` is not finite or not of shape (7,).
         """
-        if q.shape != (DOF,) or qd.shape != (DOF,) or not np.isfinite(q.dot(q) + qd.dot(qd)):
+        if q.shape != (DOF,) or qd.shape != (DOF,) or not isfinite(q.dot(q) + qd.dot(qd)):
             raise ValueError(f"joint state: q = {q}, qd = {qd}: must be {DOF} finite values each")
         self.model.update(q, qd)
         raw = self._cartesian(q, qd, reference) if reference.mode is Mode.CARTESIAN else self._joint(q, qd, reference)
@@ -90,31 +100,39 @@ class ImpedanceController:
         mobility = JM.dot(J.T)
         V_desired = rotate.dot(reference.V_WD)
 
-        spring = self._spring(reference)
-        damping = 2 * reference.damping_ratio * np.sqrt(reference.stiffness / mobility.diagonal())
-        F = spring + damping * (V_desired - J.dot(qd)) + rotate.dot(reference.F_W)
+        inertia = _inverse(mobility)
+        stiffness, damping = self._gains(reference, J, mobility, inertia)
+        F = self._spring(reference, stiffness) + damping * (V_desired - J.dot(qd)) + rotate.dot(reference.F_W)
 
         posture = self._posture(q, qd, reference)
-        rhs = self._rhs
-        rhs[:, 0] = JM.dot(posture)
-        rhs[:, 1] = V_desired - J.dot(reference.qd)
-        solution = _solve(mobility, rhs)
-        null = posture - J.T.dot(solution[:, 0])
-        excess = np.abs(null).max() / NULL_TORQUE_NM
-        if excess > 1:
-            null /= excess  # scaled as a whole, so that it stays in the null space
-        qd_desired = reference.qd + JM.T.dot(solution[:, 1])
+        null = posture - J.T.dot(inertia.dot(JM.dot(posture)))
+        if null.dot(null) > NULL_TORQUE_NM**2:
+            null *= NULL_TORQUE_NM / max(np.abs(null).max(), NULL_TORQUE_NM)  # as a whole: it stays in the null space
+        qd_desired = reference.qd + JM.T.dot(inertia.dot(V_desired - J.dot(reference.qd)))
         qd_desired = np.minimum(np.maximum(qd_desired, -model.velocity_limit), model.velocity_limit)
         torque: Array = J.T.dot(F) + null + model.coriolis + self._friction(qd_desired)
         return torque
 
-    def _spring(self, reference: Reference) -> Array:
+    def _gains(self, reference: Reference, J: Array, mobility: Array, inertia: Array) -> tuple[Array, Array]:
+        """Stiffness that sampling can bear and damping that goes with it, in D's axes, shapes (6,)."""
+        # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
+        mass = np.minimum(inertia.diagonal(), 4 / mobility.diagonal())
+        if not self._has_friction:
+            stiffness = np.minimum(reference.stiffness, SPRING_RATE**2 * mass)
+            return stiffness, 2 * reference.damping_ratio * np.sqrt(stiffness * mass)
+        friction = _inverse((J / self.model.viscous_friction).dot(J.T)).diagonal()
+        ceiling = np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S))
+        stiffness = np.minimum(reference.stiffness, ceiling)
+        damping = 2 * reference.damping_ratio * np.sqrt(stiffness * mass)
+        return stiffness, np.maximum(damping - friction, LEAST_DAMPING * damping)
+
+    def _spring(self, reference: Reference, stiffness: Array) -> Array:
         """Force and torque of the Cartesian springs on the indenter, in D's axes, shape (6,)."""
         model, error, R_WD = self.model, self._error, reference.R_WD
         R_DI = R_WD.T.dot(model.R_WI)
         error[:3] = (reference.p_WD - model.p_WI).dot(R_WD)
         error[3:] = -pin.log3(R_DI)
-        spring: Array = reference.stiffness * np.minimum(np.maximum(error, -self._clip), self._clip)
+        spring: Array = stiffness * np.minimum(np.maximum(error, -self._clip), self._clip)
         spring[3:] = pin.Jlog3(R_DI).dot(spring[3:])  # d phi = J_l^-1 w with w in D's axes, and J_l^-T = Jlog3
         return spring
 
@@ -126,10 +144,10 @@ class ImpedanceController:
         return torque
 
 
-def _solve(mobility: Array, rhs: Array) -> Array:
-    """Solution of `mobility x = rhs` by Cholesky, shape of `rhs`; regularised where the arm is singular."""
-    _, solution, info = dposv(mobility, rhs)
-    if info != 0 or not np.isfinite(solution.sum()):
-        _, solution, info = dposv(mobility + SINGULAR_MOBILITY * np.eye(6), rhs)
-    result: Array = solution
+def _inverse(matrix: Array) -> Array:
+    """Inverse of a symmetric positive definite matrix by Cholesky, shape (6, 6); regularised where the arm is singular."""
+    _, inverse, info = dposv(matrix, _EYE)
+    if info != 0:
+        _, inverse, info = dposv(matrix + REGULARISATION * _EYE, _EYE)
+    result: Array = inverse
     return result

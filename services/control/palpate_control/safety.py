@@ -18,19 +18,19 @@ class LimitRepulsion:
 
     def __init__(self, lower: Array, upper: Array, torque_limit: Array, zone: float) -> None:
         """Limits [rad] and torque limits [N m], shapes (7,); `zone` [rad], 0 switches the repulsion off."""
-        self._edge_low = lower + zone
-        self._edge_high = upper - zone
+        self._middle, self._half = (lower + upper) / 2, (upper - lower) / 2 - zone
         self._gain = REPULSION_FRACTION * torque_limit / max(zone, 1e-9) ** 2 if zone > 0 else np.zeros_like(lower)
         self._cap = REPULSION_FRACTION * torque_limit
 
     def torque(self, q: Array) -> Array | None:
         """Torque away from the limits [N m], shape (7,), or None where no joint is in its zone (the usual case)."""
-        if (q > self._edge_low).all() and (q < self._edge_high).all():
+        off = q - self._middle
+        depth = np.abs(off) - self._half
+        if np.maximum.reduce(depth) <= 0:
             return None
-        below = np.maximum(self._edge_low - q, 0.0)
-        above = np.maximum(q - self._edge_high, 0.0)
-        push: Array = self._gain * (below * below - above * above)
-        return np.minimum(np.maximum(push, -self._cap), self._cap)
+        depth = np.maximum(depth, 0.0)
+        push: Array = -np.sign(off) * np.minimum(self._gain * depth * depth, self._cap)
+        return push
 
 
 class TorqueShaper:

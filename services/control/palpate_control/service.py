@@ -58,9 +58,7 @@ class ControlService(Service):
         if joints.name != _NAMES:
             return self._reject_joints(t, f"joint states name {joints.name}, not {_NAMES}")
         try:
-            torque = self._controller.torque(
-                np.array(joints.position), np.array(joints.velocity), self._reference.at(t)
-            )
+            torque = self._controller.torque(np.array(joints.position), np.array(joints.velocity), self._reference.at(t))
         except ValueError as error:
             return self._reject_joints(t, str(error))
         np.maximum(self._peak, np.abs(torque), out=self._peak)

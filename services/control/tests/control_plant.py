@@ -1,0 +1,93 @@
+"""A plant for the controller's tests: the arm on pinocchio, with joint friction, stepped at 1 kHz, and a contact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+from palpate_control.model import ArmModel
+from palpate_control.reference import Mode, Reference, Setpoint
+from palpate_models.lbr import urdf
+from palpate_models.scenario import Robot
+
+DT = 1e-3
+ROBOT = Robot()
+WORKING = (
+    np.deg2rad([0.0, 90.0, 0.0, -60.0, 0.0, 30.0, 0.0]),
+    np.deg2rad([15.0, 95.0, -5.0, -95.0, 5.0, -5.0, 20.0]),
+    np.deg2rad([-20.0, 80.0, 10.0, -30.0, -10.0, 60.0, -40.0]),
+)
+"""Postures over the table, tool about vertical: folded, in between, and stretched out [rad]."""
+
+External = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Position and velocity of the indenter in world -> force on it [N], each shape (3,)."""
+
+
+def no_force(p: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Free space."""
+    return np.zeros(3)
+
+
+class Plant:
+    """Rigid-body dynamics without gravity (the driver's compensation is exact), viscous friction implicit, Coulomb smooth."""
+
+    def __init__(self, q: np.ndarray, robot: Robot = ROBOT) -> None:
+        self.model = pin.buildModelFromXML(urdf(robot))
+        self.model.gravity.linear = np.zeros(3)
+        self.data = self.model.createData()
+        self.frame = self.model.getFrameId("indenter")
+        self.q, self.qd = np.array(q, dtype=float), np.zeros(7)
+        self.viscous = np.diag(self.model.damping)
+        self.coulomb = self.model.upperDryFrictionLimit
+
+    def tip(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rotation, position and Jacobian (6, 7) of the indenter in world."""
+        J = pin.computeFrameJacobian(self.model, self.data, self.q, self.frame, pin.LOCAL_WORLD_ALIGNED)
+        pose = pin.updateFramePlacement(self.model, self.data, self.frame)
+        return pose.rotation.copy(), pose.translation.copy(), J
+
+    def step(self, torque: np.ndarray, external: External = no_force) -> None:
+        """A millisecond."""
+        _, p, J = self.tip()
+        force = J[:3].T @ external(p, J[:3] @ self.qd)
+        bias = pin.nonLinearEffects(self.model, self.data, self.q, self.qd)
+        M = pin.crba(self.model, self.data, self.q)
+        M = np.triu(M) + np.triu(M, 1).T
+        friction = self.coulomb * np.tanh(self.qd / 1e-3)
+        # Coulomb friction is implicit too, by its slope, so that it does not chatter on the light wrist
+        slope = np.diag(self.coulomb * (1 - np.tanh(self.qd / 1e-3) ** 2) / 1e-3)
+        left = M + DT * (self.viscous + slope)
+        right = M @ self.qd + DT * (torque - bias + force - friction + slope @ self.qd)
+        self.qd = np.linalg.solve(left, right)
+        self.q = self.q + DT * self.qd
+
+    def energy(self) -> float:
+        """Kinetic energy [J]."""
+        return 0.5 * float(self.qd @ pin.crba(self.model, self.data, self.q) @ self.qd)
+
+
+def setpoint(arm: ArmModel, q: np.ndarray, stamp: int = 0, mode: Mode = Mode.CARTESIAN, **changes: object) -> Setpoint:
+    """A set-point that holds posture `q`, with `changes`."""
+    arm.update(np.asarray(q, dtype=float), np.zeros(7))
+    fields: dict[str, object] = {
+        "mode": mode,
+        "stamp": stamp,
+        "R_WD": arm.R_WI.copy(),
+        "p_WD": arm.p_WI.copy(),
+        "V_WD": np.zeros(6),
+        "F_W": np.zeros(6),
+        "stiffness": np.array([2000.0, 2000.0, 5000.0, 200.0, 200.0, 200.0]),
+        "damping_ratio": np.full(6, 0.8),
+        "q": np.array(q, dtype=float),
+        "qd": np.zeros(7),
+        "joint_stiffness": np.full(7, 20.0) if mode is Mode.CARTESIAN else np.full(7, 500.0),
+    }
+    return Setpoint(**(fields | changes))  # type: ignore[arg-type]
+
+
+def reference(setpoint_: Setpoint) -> Reference:
+    """A set-point as the law follows it, without extrapolation."""
+    names = ("mode", "R_WD", "p_WD", "V_WD", "F_W", "stiffness", "damping_ratio", "q", "qd")
+    values = {name: getattr(setpoint_, name) for name in names}
+    return Reference(**values, qdd=np.zeros(7), joint_stiffness=setpoint_.joint_stiffness)
