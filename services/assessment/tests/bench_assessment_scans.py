@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 _Point: Any = message_type("geometry_msgs/msg/Point")
 _Vector3: Any = message_type("geometry_msgs/msg/Vector3")
 
-SURFACE_SD, SURFACE_LENGTH = 0.0004, 0.012
+SURFACE_SD, SURFACE_LENGTH = 0.0001, 0.012
 """Error of the perceived surface [m] and its correlation length: perception's own figures."""
 CONTROL_SD, CONTROL_S = 0.0003, 0.2
 """Depth error of the regulation [m] and its correlation time [s]."""

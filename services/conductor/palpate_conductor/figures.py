@@ -147,10 +147,13 @@ class _Drawing:
 
 
 def draw_map(path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str) -> None:
-    """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A) with the truth, where known, into a PNG file."""
-    drawing = _Drawing(message, findings, truth)
-    if not len(drawing.triangles):
+    """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A) with the truth, where known, into a PNG file.
+
+    Nothing is drawn of a map on which nothing was scanned.
+    """
+    if not np.asarray(message.scanned).any():
         return
+    drawing = _Drawing(message, findings, truth)
     figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
     FigureCanvasAgg(figure)
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)
@@ -226,11 +229,15 @@ def _bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
     bar.outline.set_visible(False)
 
 
+def _percent(confidence: float) -> str:
+    return f"{100 * confidence:.0f} %" if confidence < 0.99 else "over 99 %"
+
+
 def _summary(drawing: _Drawing) -> str:
     if not drawing.findings:
         return "no finding"
     return "; ".join(
         f"{f.quadrant}, {f.stiffness_ratio:.1f} times stiffer "
-        f"({f.stiffness_ratio_lower:.1f} to {f.stiffness_ratio_upper:.1f}), confidence {100 * f.confidence:.0f} %"
+        f"({f.stiffness_ratio_lower:.1f} to {f.stiffness_ratio_upper:.1f}), confidence {_percent(f.confidence)}"
         for f in drawing.findings
     )

@@ -116,6 +116,8 @@ class Report(_Row):
     start_time_s: float
     """Wall time from the command to the first tick."""
     run_hash: str | None
+    digests: dict[str, str]
+    """Of each hashed topic: where two runs differ, they say in which."""
     failure: str | None
     """Service and cause; null when the run completed."""
     lost: dict[str, float]
@@ -165,6 +167,7 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
         real_time_factor=result.sim_time_s / max(result.wall_time_s, 1e-9),
         start_time_s=result.start_time_s,
         run_hash=result.run_hash,
+        digests=result.digests,
         failure=result.failure,
         lost={role: t / 1e9 for role, t in result.lost.items()},
         samples=len(c.samples),
