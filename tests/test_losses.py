@@ -43,18 +43,19 @@ def kill_in_contact(role: str, folder: Path, *options: str) -> Killed:
     run = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     assert run.stderr is not None
     lines: list[str] = []
-    killed_at = named_after = float("nan")
+    killed_at: float | None = None
+    named_after: float | None = None
     for line in run.stderr:
         lines.append(line)
-        if KILL_AFTER_PHASE in line.split() and killed_at != killed_at:
+        if KILL_AFTER_PHASE in line.split() and killed_at is None:
             time.sleep(1.0)
             children = psutil.Process(run.pid).children(recursive=True)
             target = next(child for child in children if f"palpate_{role}" in child.cmdline())
             target.kill()
             killed_at = time.monotonic()
-        if f"{role} lost at tick" in line and named_after != named_after:
+        if killed_at is not None and f"{role} lost at tick" in line and named_after is None:
             named_after = time.monotonic() - killed_at
-    return Killed(run.wait(timeout=120), lines, named_after, folder)
+    return Killed(run.wait(timeout=120), lines, float("inf") if named_after is None else named_after, folder)
 
 
 @pytest.mark.parametrize("role", ["control", "planning"])
