@@ -89,7 +89,10 @@ def _text(root: ET.Element) -> bytes:
 
 
 def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes) -> bytes:
-    """modelDescription.xml of FMI 3.0, where a variable is an array."""
+    """modelDescription.xml of FMI 3.0, where a variable is an array.
+
+    Outputs depend on no input of the same instant: a step sees its inputs, and a master finds no algebraic loop.
+    """
     root = ET.Element(
         "fmiModelDescription",
         fmiVersion="3.0",
@@ -124,9 +127,10 @@ def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Si
     structure = ET.SubElement(root, "ModelStructure")
     outputs = [v for v in table if _causality(v)["causality"] == "output"]
     calculated = [v for v in table if _causality(v)["causality"] == "calculatedParameter"]
-    for name, members in (("Output", outputs), ("InitialUnknown", [*outputs, *calculated])):
+    knowns = " ".join(str(v.vr) for v in table if v.parameter or v.kind is Kind.INPUT)
+    for name, members, dependencies in (("Output", outputs, ""), ("InitialUnknown", [*outputs, *calculated], knowns)):
         for variable in members:
-            ET.SubElement(structure, name, valueReference=str(variable.vr))
+            ET.SubElement(structure, name, valueReference=str(variable.vr), dependencies=dependencies)
     return _text(root)
 
 
@@ -184,7 +188,9 @@ def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Si
     for name, members in (("Outputs", outputs), ("InitialUnknowns", unknowns)):
         group = ET.SubElement(structure, name)
         for member in members:
-            ET.SubElement(group, "Unknown", index=str(member))
+            unknown = ET.SubElement(group, "Unknown", index=str(member))
+            if name == "Outputs":
+                unknown.set("dependencies", "")
     return _text(root)
 
 

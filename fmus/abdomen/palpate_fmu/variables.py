@@ -103,7 +103,7 @@ def _parameter(
 
 
 TABLE: tuple[Variable, ...] = (
-    Variable(0, "time", "outputs.time", "Simulated time", "s", role=Role.INDEPENDENT, group="STATE"),
+    Variable(0, "time", "outputs.time", "Simulated time", "s", role=Role.INDEPENDENT, group="STATE", versions=(3,)),
     _input(1, "indenter_position", "inputs.position", "m", 10, (0.0, 0.0, 1.0), "Centre of the sphere at the end of the step"),
     _input(4, "indenter_velocity", "inputs.velocity", "m/s", 10, (0.0, 0.0, 0.0), "Velocity of the centre, for friction"),
     _input(7, "indenter_angular_velocity", "inputs.spin", "rad/s", 100, (0.0, 0.0, 0.0), "Angular velocity, for friction"),

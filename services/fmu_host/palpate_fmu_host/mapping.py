@@ -1,0 +1,91 @@
+"""The map of an FMU's variables to topic fields, read from YAML.
+
+role: tissue
+frame: abdomen                       # of the FMU's points and vectors
+inputs:
+  sim/tool_state:
+    indenter_position: {field: pose.position, kind: point}
+    indenter_radius: radius          # short for {field: radius}
+outputs:
+  sim/contact_wrench:
+    wrench.force: {variable: contact_force, kind: vector}
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+
+
+class MapError(ValueError):
+    """A map that does not fit the contract or the FMU. Names the entry and what is allowed."""
+
+
+class Kind(StrEnum):
+    """How values change with the frame."""
+
+    PLAIN = "plain"
+    POINT = "point"
+    VECTOR = "vector"
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Kind = Kind.PLAIN
+    unit: str | None = None
+    """Unit of the topic's field, where the contract does not give one."""
+
+
+class InputEntry(_Entry):
+    """Where an FMU's input or tunable parameter comes from."""
+
+    field: str
+
+
+class OutputEntry(_Entry):
+    """What a topic's field is filled with: a variable, something of the scenario, or a constant."""
+
+    variable: str | None = None
+    scenario: str | None = None
+    value: float | str | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> OutputEntry:
+        if sum(source is not None for source in (self.variable, self.scenario, self.value)) != 1:
+            raise ValueError("want exactly one of variable, scenario, value")
+        return self
+
+
+def _short(key: str) -> BeforeValidator:
+    return BeforeValidator(lambda entry: {key: entry} if isinstance(entry, str) else entry)
+
+
+class FmuMap(BaseModel):
+    """A map. `inputs` by topic and variable, `outputs` by topic and field."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    role: str
+    frame: str | None = None
+    """Frame of the FMU's points and vectors."""
+    inputs: dict[str, dict[str, Annotated[InputEntry, _short("field")]]] = {}
+    outputs: dict[str, dict[str, Annotated[OutputEntry, _short("variable")]]]
+    parameters: dict[str, float | list[float]] = {}
+    """Start values of parameters and inputs."""
+
+
+def load_map(path: Path) -> FmuMap:
+    """A map from a YAML file. Raises MapError naming what is wrong with it."""
+    try:
+        raw: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return FmuMap.model_validate(raw)
+    except (OSError, yaml.YAMLError) as error:
+        raise MapError(f"{path}: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise MapError(f"{path.name}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
