@@ -48,8 +48,10 @@ AT_HOME_RAD = 0.01
 class Exam:
     """Runs one examination. `step` each planning period; `status` says where it stands."""
 
-    def __init__(self, known: ExamInput) -> None:
+    def __init__(self, known: ExamInput, *, lockstep: bool = True) -> None:
+        """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes."""
         self._known = known
+        self._lockstep = lockstep
         self._kinematics = Kinematics(known.robot, known.limits)
         plane = Surface.plane(np.array(known.X_WA))
         self._sense = ContactSense(self._kinematics, ToolWeight.of(known.robot), plane, known.robot.indenter_radius_m)
@@ -146,7 +148,7 @@ class Exam:
             if float(np.abs(self._follower.q - goal).max()) < AT_HOME_RAD:
                 return True
             start, seen = self._follower.q.copy(), self._seen
-            self._motion = Thought(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen))
+            self._motion = Thought(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen), lockstep=self._lockstep)
         elif self._motion.due(now.t):
             self._follower.start(self._motion.result())
             self._motion = None
@@ -196,7 +198,7 @@ class Exam:
         if self._thought is None:
             seen, start = self._seen, self._follower.q.copy()
             assert seen is not None
-            self._thought = Thought(now.t, PLAN_BUDGET, lambda: self._planner.examination(seen, start))
+            self._thought = Thought(now.t, PLAN_BUDGET, lambda: self._planner.examination(seen, start), lockstep=self._lockstep)
         elif self._thought.due(now.t):
             try:
                 plan = self._thought.result()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -37,10 +38,11 @@ class PlanningService(Service):
 
     role: ClassVar[str] = "planning"
 
-    def __init__(self, known: ExamInput) -> None:
+    def __init__(self, known: ExamInput, *, lockstep: bool = True) -> None:
+        """`lockstep` as in `Exam`."""
         self._known = known
         self._X_WA = np.array(known.X_WA)
-        self._exam = Exam(known)
+        self._exam = Exam(known, lockstep=lockstep)
         self._reading: Reading | None = None
         self._surface: Message | None = None
         self._valid = duration_message(VALID_FOR)
@@ -139,4 +141,4 @@ def _stop(inbox: Inbox) -> str:
 
 def create(scenario: Scenario) -> PlanningService:
     """The service for a scenario, of which it may know the exam input."""
-    return PlanningService(exam_input(scenario))
+    return PlanningService(exam_input(scenario), lockstep=os.environ.get("PALPATE_RUNTIME", "lockstep") == "lockstep")

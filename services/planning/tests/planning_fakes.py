@@ -14,6 +14,7 @@ from palpate_models.scenario import ExamInput, Robot, Scenario
 from palpate_planning.exam import Exam
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.measure import Reading
+from palpate_planning.poses import cross
 from palpate_planning.prepare import Seen
 from palpate_planning.setpoint import CARTESIAN_STIFFNESS, ControlMode, Setpoint
 from palpate_planning.status import Observation, Outcome, Phase, Unseen
@@ -30,7 +31,7 @@ BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
 
 def known(robot: Robot = BASE, **exam: object) -> ExamInput:
     """Exam input with a small region, so that an examination takes seconds."""
-    settings = {"region_m": (0.05, 0.0375), "spacing_m": 0.0125, **exam}
+    settings = {"region_m": (0.0375, 0.025), "spacing_m": 0.0125, **exam}
     return exam_input(Scenario(seed=3, robot=robot, exam=ExamSettings(**settings)))
 
 
@@ -108,16 +109,16 @@ class World:
             if not setpoint.limp:
                 self.q = self.q + 0.6 * (setpoint.q - self.q)
             return
-        for _ in range(3):  # an impedance that settles within a few steps
+        for _ in range(2):  # an impedance that settles within a few steps
             X = self.kinematics.pose(self.q)
             pull = setpoint.F_W + self._touch(X)
             sag = setpoint.X_WI[:3, :3] @ ((setpoint.X_WI[:3, :3].T @ pull) / CARTESIAN_STIFFNESS[:3])
             gap = setpoint.X_WI[:3, 3] + sag - X[:3, 3]
-            turn = np.cross(X[:3, :3].T, setpoint.X_WI[:3, :3].T).sum(axis=0) / 2
+            turn = sum(cross(X[:3, i], setpoint.X_WI[:3, i]) for i in range(3)) / 2
             J = self.kinematics.jacobian(self.q)
-            pinv = np.linalg.pinv(J)
-            null = (np.eye(7) - pinv @ J) @ (setpoint.q - self.q)
-            self.q = self.q + 0.25 * (pinv @ np.concatenate((gap, turn)) + null)
+            posture = setpoint.q - self.q
+            task = np.concatenate((gap, turn)) - J @ posture
+            self.q = self.q + 0.4 * (J.T @ np.linalg.solve(J @ J.T + 1e-9 * np.eye(6), task) + posture)
 
     def step(self) -> Outcome:
         """One planning period."""

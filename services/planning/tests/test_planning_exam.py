@@ -41,12 +41,13 @@ def test_snake_goes_through_all_phases_in_order(snake: World) -> None:
     ]
     assert snake.exam.status.end_tick == snake.t - 10_000_000 + 1_000_000_000
     assert snake.exam.status.targets_skipped == 0
-    assert snake.exam.status.target_index == snake.exam.status.target_count - 1 or snake.exam.status.target_count == 20
+    assert snake.exam.status.target_count == 12
+    assert snake.exam.status.target_index == 11
 
 
 def test_depth_is_true_while_samples_count(snake: World) -> None:
     steady = np.array([(row[3], row[4]) for row in snake.rows if row[1]])
-    assert len(steady) > 500
+    assert len(steady) > 300
     assert np.sqrt(np.mean((steady[:, 1] - 0.010) ** 2)) < 3e-4
     assert np.abs(steady[:, 1] - steady[:, 0]).max() < 1e-3
 
@@ -72,20 +73,22 @@ def test_the_path_covers_the_targets(snake: World) -> None:
         assert np.linalg.norm(centres - target, axis=1).min() < 0.008  # radius less depth is 5 mm
 
 
-def test_two_runs_are_the_same_to_the_bit(snake: World) -> None:
-    again = World(known())
-    again.run()
-    assert len(again.setpoints) == len(snake.setpoints)
-    for a, b in zip(snake.setpoints, again.setpoints, strict=True):
+def test_two_runs_are_the_same_to_the_bit() -> None:
+    worlds = [World(known(region_m=(0.025, 0.0125))) for _ in range(2)]
+    for world in worlds:
+        world.run()
+    assert len(worlds[0].setpoints) == len(worlds[1].setpoints)
+    for a, b in zip(worlds[0].setpoints, worlds[1].setpoints, strict=True):
         assert a.mode is b.mode
         assert np.array_equal(a.X_WI, b.X_WI)
         assert np.array_equal(a.q, b.q)
         assert np.array_equal(a.F_W, b.F_W)
 
 
-@pytest.mark.parametrize(("pattern", "mode", "strokes"), [(Pattern.RASTER, Mode.CONTINUOUS, 4), (Pattern.SNAKE, Mode.POINT, 20)])
+@pytest.mark.parametrize(("pattern", "mode", "strokes"), [(Pattern.RASTER, Mode.CONTINUOUS, 3), (Pattern.SNAKE, Mode.POINT, 6)])
 def test_raster_and_points_lift_between_strokes(pattern: Pattern, mode: Mode, strokes: int) -> None:
-    world = World(known(pattern=pattern, mode=mode))
+    region = (0.025, 0.0125) if mode is Mode.POINT else (0.025, 0.025)
+    world = World(known(pattern=pattern, mode=mode, region_m=region))
     world.run()
     assert world.exam.status.phase is Phase.DONE
     order = phases(world)
@@ -121,7 +124,7 @@ def test_no_tissue_where_it_should_be_gives_up() -> None:
 
 
 def test_force_limit_makes_depth_yield() -> None:
-    world = World(known(), hertz(30.0))
+    world = World(known(region_m=(0.025, 0.0125)), hertz(30.0))
     world.run()
     assert world.exam.status.phase is Phase.DONE
     steady = [row for row in world.rows if row[1]]
