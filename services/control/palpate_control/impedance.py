@@ -5,10 +5,12 @@ Cartesian, with e the pose error and all task quantities in axes of the desired 
     F   = K clip(e) + B (V_d - V) + F_ff,  B_i = 2 zeta_i sqrt(K_i m_i) - b_i
     tau = J^T F + N^T tau_0 + C(q, qd) qd + friction(qd_d)
 
-m_i and b_i are the inertia and the joints' own viscous friction along axis i while the other axes are held: diagonals of
-(J M^-1 J^T)^-1 and (J D^-1 J^T)^-1. So the ratio of damping that the arm shows is the one asked for. N is the dynamically
-consistent null-space projector (Khatib 1987, doi 10.1109/JRA.1987.1087068). The rotational spring is the gradient of
-1/2 phi^T K phi, phi the rotation vector, so the springs store energy and never create any.
+m_i and b_i are the inertia and the joints' own viscous friction along axis i while the other axes are held: the diagonal of
+(J M^-1 J^T)^-1 and what it gains a second when M + T D takes the place of M. So the arm shows the ratio of damping that
+is asked for. N is the null-space projector of Khatib (1987, doi 10.1109/JRA.1987.1087068), consistent with M + T D: at
+10 Nms/rad a joint's torque makes it move, not accelerate, and consistency with M alone lets the posture drag the indenter
+along by millimetres. The rotational spring is the gradient of 1/2 phi^T K phi, phi the rotation vector, so the springs
+store energy and never create any.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
-from palpate_control.model import DOF, ArmModel
+from palpate_control.model import DOF, SLOW_S, ArmModel
 from palpate_control.reference import Mode, Reference
 from palpate_control.safety import LimitRepulsion, TorqueShaper
 
@@ -59,7 +61,6 @@ class ImpedanceController:
         self._clip = np.array([POSITION_CLIP_M] * 3 + [ROTATION_CLIP_RAD] * 3)
         self._rotate = np.zeros((6, 6))  # world axes to D's, for linear and angular parts
         self._error = np.zeros(6)
-        self._has_friction = bool((model.viscous_friction > 0).all())
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
@@ -96,33 +97,30 @@ class ImpedanceController:
         rotate[:3, :3] = R_DW
         rotate[3:, 3:] = R_DW
         J = rotate.dot(model.J_W)
-        JM = J.dot(model.mobility)
-        mobility = JM.dot(J.T)
+        JW = J.dot(model.slow_mobility)
+        slow_inertia = _inverse(JW.dot(J.T))
         V_desired = rotate.dot(reference.V_WD)
 
-        inertia = _inverse(mobility)
-        stiffness, damping = self._gains(reference, J, mobility, inertia)
+        stiffness, damping = self._gains(reference, J.dot(model.mobility).dot(J.T), slow_inertia)
         F = self._spring(reference, stiffness) + damping * (V_desired - J.dot(qd)) + rotate.dot(reference.F_W)
 
         posture = self._posture(q, qd, reference)
-        null = posture - J.T.dot(inertia.dot(JM.dot(posture)))
+        null = posture - J.T.dot(slow_inertia.dot(JW.dot(posture)))
         if null.dot(null) > NULL_TORQUE_NM**2:
             null *= NULL_TORQUE_NM / max(np.abs(null).max(), NULL_TORQUE_NM)  # as a whole: it stays in the null space
-        qd_desired = reference.qd + JM.T.dot(inertia.dot(V_desired - J.dot(reference.qd)))
+        qd_desired = reference.qd + JW.T.dot(slow_inertia.dot(V_desired - J.dot(reference.qd)))
         qd_desired = np.minimum(np.maximum(qd_desired, -model.velocity_limit), model.velocity_limit)
         torque: Array = J.T.dot(F) + null + model.coriolis + self._friction(qd_desired)
         return torque
 
-    def _gains(self, reference: Reference, J: Array, mobility: Array, inertia: Array) -> tuple[Array, Array]:
-        """Stiffness that sampling can bear and damping that goes with it, in D's axes, shapes (6,)."""
+    @staticmethod
+    def _gains(reference: Reference, mobility: Array, slow_inertia: Array) -> tuple[Array, Array]:
+        """Stiffness that sampling can bear and the damping that goes with it, in D's axes, shapes (6,)."""
+        inertia = _inverse(mobility).diagonal()
+        friction = (slow_inertia.diagonal() - inertia) / SLOW_S
         # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
-        mass = np.minimum(inertia.diagonal(), 4 / mobility.diagonal())
-        if not self._has_friction:
-            stiffness = np.minimum(reference.stiffness, SPRING_RATE**2 * mass)
-            return stiffness, 2 * reference.damping_ratio * np.sqrt(stiffness * mass)
-        friction = _inverse((J / self.model.viscous_friction).dot(J.T)).diagonal()
-        ceiling = np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S))
-        stiffness = np.minimum(reference.stiffness, ceiling)
+        mass = np.minimum(inertia, 4 / mobility.diagonal())
+        stiffness = np.minimum(reference.stiffness, np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S)))
         damping = 2 * reference.damping_ratio * np.sqrt(stiffness * mass)
         return stiffness, np.maximum(damping - friction, LEAST_DAMPING * damping)
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 DOF = 7
+SLOW_S = 0.1
+"""Time scale on which motion is as much friction's as inertia's: postures and scans move this slowly or slower."""
 _AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -20,6 +22,7 @@ class ArmModel:
         p_WI: origin of I in world [m], shape (3,).
         J_W: Jacobian of V_WI_W (linear first, then angular, world axes, at I's origin), shape (6, 7).
         mobility: inverse of the joint-space inertia matrix [1/(kg m^2)], shape (7, 7).
+        slow_mobility: the same with friction, (M + D SLOW_S)^-1: displacement over SLOW_S rather than acceleration, (7, 7).
         gravity: torques that hold the arm against gravity [N m], shape (7,).
         coriolis: Coriolis and centrifugal torques C(q, qd) qd [N m], shape (7,).
     """
@@ -28,6 +31,7 @@ class ArmModel:
     p_WI: Array
     J_W: Array
     mobility: Array
+    slow_mobility: Array
     gravity: Array
     coriolis: Array
 
@@ -39,6 +43,9 @@ class ArmModel:
         if not self._model.existFrame(frame):
             raise ValueError(f"robot description has no link {frame!r}")
         self._data = self._model.createData()
+        self._slow_model = self._model.copy()
+        self._slow_model.armature = self._slow_model.armature + SLOW_S * self._model.damping
+        self._slow_data = self._slow_model.createData()
         self._frame = self._model.getFrameId(frame)
         self.position_lower: Array = self._model.lowerPositionLimit.copy()
         self.position_upper: Array = self._model.upperPositionLimit.copy()
@@ -56,6 +63,7 @@ class ArmModel:
         self.p_WI = pose.translation
         self.J_W = pin.getFrameJacobian(model, data, self._frame, _AXES)
         self.mobility = data.Minv
+        self.slow_mobility = pin.computeMinverse(self._slow_model, self._slow_data, q)
         self.gravity = pin.computeGeneralizedGravity(model, data, q)
         self.coriolis = pin.nonLinearEffects(model, data, q, qd) - self.gravity
 

@@ -30,7 +30,7 @@ def no_force(p: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 class Plant:
-    """Rigid-body dynamics without gravity (the driver's compensation is exact), viscous friction implicit, Coulomb smooth."""
+    """Rigid-body dynamics without gravity (the driver compensates it exactly), friction implicit, Coulomb smoothed."""
 
     def __init__(self, q: np.ndarray, robot: Robot = ROBOT) -> None:
         self.model = pin.buildModelFromXML(urdf(robot))
@@ -67,9 +67,9 @@ class Plant:
         return 0.5 * float(self.qd @ pin.crba(self.model, self.data, self.q) @ self.qd)
 
 
-def setpoint(arm: ArmModel, q: np.ndarray, stamp: int = 0, mode: Mode = Mode.CARTESIAN, **changes: object) -> Setpoint:
-    """A set-point that holds posture `q`, with `changes`."""
-    arm.update(np.asarray(q, dtype=float), np.zeros(7))
+def setpoint(arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: Mode = Mode.CARTESIAN, **changes: object) -> Setpoint:
+    """A set-point that holds posture `at`, with `changes`."""
+    arm.update(np.asarray(at, dtype=float), np.zeros(7))
     fields: dict[str, object] = {
         "mode": mode,
         "stamp": stamp,
@@ -79,7 +79,7 @@ def setpoint(arm: ArmModel, q: np.ndarray, stamp: int = 0, mode: Mode = Mode.CAR
         "F_W": np.zeros(6),
         "stiffness": np.array([2000.0, 2000.0, 5000.0, 200.0, 200.0, 200.0]),
         "damping_ratio": np.full(6, 0.8),
-        "q": np.array(q, dtype=float),
+        "q": np.array(at, dtype=float),
         "qd": np.zeros(7),
         "joint_stiffness": np.full(7, 20.0) if mode is Mode.CARTESIAN else np.full(7, 500.0),
     }

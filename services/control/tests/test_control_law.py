@@ -1,0 +1,237 @@
+"""The control law at rest: kinematics, springs, clips, limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from control_plant import ROBOT, WORKING, reference, setpoint
+from palpate_control import impedance, safety
+from palpate_control.impedance import ImpedanceController
+from palpate_control.model import SLOW_S, ArmModel
+from palpate_control.reference import Mode, Reference, Setpoint, rotation_from_quaternion
+from palpate_models.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
+
+REST = np.zeros(7)
+NO_POSTURE = {"joint_stiffness": np.zeros(7)}
+
+
+@pytest.fixture(scope="module")
+def arm() -> ArmModel:
+    return ArmModel(urdf(ROBOT))
+
+
+@pytest.fixture
+def unlimited(arm: ArmModel, monkeypatch: pytest.MonkeyPatch) -> ImpedanceController:
+    """The law without its rate limit."""
+    monkeypatch.setattr(safety, "TORQUE_RATE_NM", 1e9)
+    controller = ImpedanceController(arm)
+    controller._shaper = safety.TorqueShaper(arm.torque_limit, rate=1e9)
+    return controller
+
+
+def offset(arm: ArmModel, q: np.ndarray, twist: np.ndarray) -> Reference:
+    """A reference away from posture `q` by a displacement in world, without null-space posture."""
+    held = setpoint(arm, q, **NO_POSTURE)
+    moved = setpoint(arm, q, p_WD=held.p_WD + twist[:3], R_WD=pin.exp3(twist[3:]) @ held.R_WD, **NO_POSTURE)
+    return reference(moved)
+
+
+@pytest.mark.parametrize("q", WORKING)
+def test_jacobian_is_the_derivative_of_the_pose(arm: ArmModel, q: np.ndarray) -> None:
+    arm.update(q, REST)
+    J, R, p = arm.J_W.copy(), arm.R_WI.copy(), arm.p_WI.copy()
+    for i, dq in enumerate(1e-6 * np.eye(7)):
+        arm.update(q + dq, REST)
+        np.testing.assert_allclose((arm.p_WI - p) / 1e-6, J[:3, i], atol=1e-5)
+        np.testing.assert_allclose(pin.log3(arm.R_WI @ R.T) / 1e-6, J[3:, i], atol=1e-5)
+
+
+@pytest.mark.parametrize("q", WORKING)
+def test_mobility_inverts_the_inertia_and_coriolis_does_no_work_with_its_rate(arm: ArmModel, q: np.ndarray) -> None:
+    arm.update(q, REST)
+    identity = np.column_stack([arm.mobility @ arm.inverse_dynamics(q, REST, e) for e in np.eye(7)])
+    np.testing.assert_allclose(identity, np.eye(7), atol=1e-9)
+    slow = np.linalg.inv(np.linalg.inv(arm.mobility) + SLOW_S * np.diag(arm.viscous_friction))
+    np.testing.assert_allclose(arm.slow_mobility, slow, atol=1e-9)
+    assert arm.coriolis == pytest.approx(np.zeros(7), abs=1e-12)
+
+
+@pytest.mark.parametrize("q", WORKING)
+def test_no_error_no_torque(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
+    for mode in Mode:
+        assert unlimited.torque(q, REST, reference(setpoint(arm, q, mode=mode))) == pytest.approx(np.zeros(7), abs=1e-9)
+
+
+@pytest.mark.parametrize("q", WORKING)
+def test_springs_are_the_gradient_of_their_energy(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
+    ref = offset(arm, q, np.array([0.01, -0.02, 0.015, 0.2, -0.1, 0.15]))
+
+    def energy(at: np.ndarray) -> float:
+        arm.update(at, REST)
+        error = np.concatenate(((ref.p_WD - arm.p_WI) @ ref.R_WD, pin.log3(ref.R_WD.T @ arm.R_WI)))
+        return 0.5 * float(ref.stiffness @ error**2)
+
+    slope = [(energy(q + dq) - energy(q - dq)) / 2e-6 for dq in 1e-6 * np.eye(7)]
+    np.testing.assert_allclose(unlimited.torque(q, REST, ref), -np.array(slope), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.4])
+def test_no_energy_is_gained_around_a_loop(arm: ArmModel, unlimited: ImpedanceController, size: float) -> None:
+    """Work of the springs around closed joint paths, through the clipped range too (the larger size)."""
+    ref = offset(arm, WORKING[0], np.array([0.02, 0.01, -0.02, 0.1, 0.05, -0.1]))
+    ref.stiffness = ref.stiffness * 0.2  # no torque saturates
+    rng = np.random.default_rng(7)
+    angle = np.linspace(0, 2 * np.pi, 401)
+    across, along = rng.normal(size=(2, 7)) * size
+    path = WORKING[0] + np.outer(np.cos(angle), across) + np.outer(np.sin(angle), along)
+    torque = np.array([unlimited.torque(q, REST, ref) for q in path])
+    work = ((torque[1:] + torque[:-1]) / 2 * np.diff(path, axis=0)).sum(axis=1)
+    assert abs(work.sum()) < 2e-3 * np.abs(work).sum()
+
+
+def test_damping_takes_energy(arm: ArmModel, unlimited: ImpedanceController) -> None:
+    rng = np.random.default_rng(3)
+    for q in WORKING:
+        ref = reference(setpoint(arm, q, **NO_POSTURE))
+        for qd in rng.normal(size=(20, 7)) * 0.05:
+            torque = unlimited.torque(q, qd, ref) - arm.coriolis
+            assert torque @ qd <= 1e-12
+
+
+def test_feed_forward_wrench_is_exerted_on_the_environment(arm: ArmModel, unlimited: ImpedanceController) -> None:
+    F = np.array([1.0, -2.0, -8.0, 0.1, 0.2, -0.3])
+    torque = unlimited.torque(WORKING[1], REST, reference(setpoint(arm, WORKING[1], F_W=F)))
+    np.testing.assert_allclose(torque, arm.J_W.T @ F, atol=1e-9)
+
+
+def test_position_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController) -> None:
+    q = WORKING[1]
+    far, farther = (offset(arm, q, np.array([0.0, 0.0, z, 0, 0, 0])) for z in (0.2, 0.4))
+    for ref in (far, farther):  # axis-aligned with W, so that the clip of z is the clip of D's z
+        ref.R_WD = np.diag([1.0, -1.0, -1.0])
+        ref.stiffness = np.array([2000.0, 2000.0, 500.0, 0, 0, 0])
+    once, twice = unlimited.torque(q, REST, far), unlimited.torque(q, REST, farther)
+    np.testing.assert_allclose(once, twice, atol=1e-9)
+    np.testing.assert_allclose(once, arm.J_W[2] * 500 * impedance.POSITION_CLIP_M, atol=1e-9)
+
+
+def test_rotation_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController) -> None:
+    q = WORKING[1]
+    arm.update(q, REST)
+    axis = arm.R_WI[:, 0]
+    ref = offset(arm, q, np.concatenate((np.zeros(3), 2.0 * axis)))
+    np.testing.assert_allclose(
+        unlimited.torque(q, REST, ref), arm.J_W[3:].T @ axis * 200 * impedance.ROTATION_CLIP_RAD, atol=1e-8
+    )
+
+
+@pytest.mark.parametrize("q", WORKING)
+def test_null_space_torque_does_not_move_the_indenter(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
+    posture = q + np.array([0.3, -0.2, 0.5, 0.1, -0.4, 0.2, 0.3])
+    ref = reference(setpoint(arm, q, **{"q": posture, "joint_stiffness": np.full(7, 50.0)}))
+    torque = unlimited.torque(q, REST, ref)
+    assert np.abs(torque).max() == pytest.approx(impedance.NULL_TORQUE_NM)
+    np.testing.assert_allclose(arm.J_W @ arm.slow_mobility @ torque, np.zeros(6), atol=1e-9)
+
+
+def test_torque_changes_by_at_most_a_newton_metre_a_tick(arm: ArmModel) -> None:
+    controller = ImpedanceController(arm)
+    q = WORKING[1]
+    ref = offset(arm, q, np.array([0.1, 0.1, -0.1, 0.3, 0.3, 0.3]))
+    before = np.zeros(7)
+    for _ in range(200):
+        after = controller.torque(q, REST, ref)
+        assert np.abs(after - before).max() <= safety.TORQUE_RATE_NM + 1e-12
+        before = after
+    assert np.abs(before).max() > 20
+
+
+def test_command_and_gravity_together_stay_within_the_limits(arm: ArmModel, unlimited: ImpedanceController) -> None:
+    q = np.deg2rad([0.0, 90.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for sign in (-1, 1):
+        ref = reference(setpoint(arm, q, F_W=sign * np.array([0.0, 0.0, 900.0, 0, 0, 0])))
+        torque = unlimited.torque(q, REST, ref)
+        assert (np.abs(torque) <= TORQUE_LIMIT).all()
+        assert (np.abs(torque + arm.gravity) <= TORQUE_LIMIT + 1e-9).all()
+        assert max(abs(torque[1]), abs((torque + arm.gravity)[1])) == pytest.approx(TORQUE_LIMIT[1])
+
+
+@pytest.mark.parametrize("joint", range(7))
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_joint_limits_repel(arm: ArmModel, unlimited: ImpedanceController, joint: int, side: float) -> None:
+    q = np.array(HOME)
+    q[joint] = side * (POSITION_LIMIT[joint] - 0.06)
+    assert unlimited._repulsion.torque(q) is None
+    pushes = []
+    for inside in (0.04, 0.02, 0.0, -0.05):
+        q[joint] = side * (POSITION_LIMIT[joint] - inside)
+        ref = reference(setpoint(arm, q, mode=Mode.JOINT))
+        pushes.append(-side * unlimited.torque(q, REST, ref)[joint])
+    assert 0 < pushes[0] < pushes[1] < pushes[2] <= pushes[3]
+    assert pushes[3] == pytest.approx(safety.REPULSION_FRACTION * TORQUE_LIMIT[joint])
+
+
+def test_repulsion_can_be_switched_off(arm: ArmModel) -> None:
+    off = safety.LimitRepulsion(arm.position_lower, arm.position_upper, arm.torque_limit, 0.0)
+    assert off.torque(POSITION_LIMIT - 1e-3) is None
+
+
+def test_stretched_out_arm_gives_finite_torque(arm: ArmModel) -> None:
+    """Singular: the elbow is straight, wrist and shoulder axes coincide."""
+    controller = ImpedanceController(arm)
+    ref = offset(arm, np.zeros(7), np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.1]))
+    for _ in range(20):
+        assert np.isfinite(controller.torque(np.zeros(7), REST, ref)).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_joint_state_that_is_not_finite_is_refused(arm: ArmModel, bad: float) -> None:
+    controller = ImpedanceController(arm)
+    ref = reference(setpoint(arm, HOME))
+    q = np.array(HOME)
+    q[3] = bad
+    with pytest.raises(ValueError, match="must be 7 finite values"):
+        controller.torque(q, REST, ref)
+    with pytest.raises(ValueError, match="must be 7 finite values"):
+        controller.torque(np.array(HOME), np.full(7, bad), ref)
+    with pytest.raises(ValueError, match="must be 7 finite values"):
+        controller.torque(np.zeros(6), np.zeros(6), ref)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("p_WD", np.array([0.0, np.nan, 0.0])),
+        ("V_WD", np.full(6, np.inf)),
+        ("stiffness", np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])),
+        ("damping_ratio", np.full(6, -0.1)),
+        ("joint_stiffness", np.full(7, -1.0)),
+        ("R_WD", np.eye(3) * 2),
+    ],
+)
+def test_setpoint_names_its_bad_field(arm: ArmModel, field: str, value: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=field):
+        setpoint(arm, HOME, **{field: value})
+
+
+def test_quaternion_must_have_unit_length() -> None:
+    with pytest.raises(ValueError, match="norm"):
+        rotation_from_quaternion(0.0, 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(rotation_from_quaternion(1.001, 0.0, 0.0, 0.0), np.diag([1.0, -1.0, -1.0]), atol=1e-12)
+
+
+def test_model_refuses_another_robot() -> None:
+    joint = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>'
+    one = f'<robot name="x"><link name="a"/><link name="b"/>{joint}</robot>'
+    with pytest.raises(ValueError, match="1 joints"):
+        ArmModel(one)
+    with pytest.raises(ValueError, match="'probe'"):
+        ArmModel(urdf(ROBOT), frame="probe")
+
+
+def test_setpoint_is_immutable(arm: ArmModel) -> None:
+    held = setpoint(arm, HOME)
+    assert isinstance(held, Setpoint)
+    with pytest.raises(AttributeError):
+        held.stamp = 3  # type: ignore[misc]

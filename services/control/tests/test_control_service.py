@@ -1,0 +1,204 @@
+"""The control service: what it sends before, with, and after set-points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from palpate_bus import codec
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
+from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_control.service import ControlService, create
+from palpate_models.lbr import HOME, JOINT_NAMES
+from palpate_models.scenario import Scenario
+
+EXPIRY = 50 * MS
+
+
+class FakeInbox:
+    """An inbox with messages put in by hand."""
+
+    def __init__(self) -> None:
+        self.messages: dict[str, list[Any]] = {}
+        self.stamps: dict[str, int] = {}
+        self.fresh: dict[str, list[Any]] = {}
+
+    def put(self, topic: str, stamp: int, message: Any) -> None:
+        kind = contract().topics[topic].type
+        self.messages[topic] = codec.decode(codec.encode(message, kind), kind)
+        self.stamps[topic] = stamp
+        self.fresh.setdefault(topic, []).append(self.messages[topic])
+
+    def latest(self, topic: str) -> Any:
+        return self.messages.get(topic)
+
+    def new(self, topic: str) -> Iterable[Any]:
+        return self.fresh.pop(topic, [])
+
+    def stamp(self, topic: str) -> int | None:
+        return self.stamps.get(topic)
+
+    def lost(self, role: str) -> bool:
+        return False
+
+
+def joints(t: int, q: np.ndarray = HOME, names: tuple[str, ...] = JOINT_NAMES) -> Any:
+    return JointState(header(t), list(names), np.array(q, dtype=float), np.zeros(7), np.zeros(7))
+
+
+def setpoint(t: int, valid: int = 250 * MS, mode: int = ImpedanceSetpoint.MODE_JOINT, **changes: Any) -> Any:
+    none = Vector3(0.0, 0.0, 0.0)
+    fields = {
+        "header": header(t, "world"),
+        "mode": mode,
+        "pose": Pose(Point(0.3, 0.0, 1.5), Quaternion(1.0, 0.0, 0.0, 0.0)),
+        "twist": Twist(none, none),
+        "wrench": Wrench(none, none),
+        "stiffness": np.full(6, 200.0),
+        "damping_ratio": np.full(6, 0.8),
+        "joint_position": np.array(HOME) + 0.1,
+        "joint_velocity": np.zeros(7),
+        "joint_stiffness": np.full(7, 500.0),
+        "valid_for": duration_message(valid),
+    }
+    return ImpedanceSetpoint(**(fields | changes))
+
+
+class Rig:
+    """A service with its inbox, ticked by the millisecond with fresh joint states."""
+
+    def __init__(self) -> None:
+        self.service: ControlService = create(Scenario())
+        self.inbox = FakeInbox()
+        self.t = 0
+
+    def tick(self, count: int = 1, message: Any = None, **state: Any) -> Any:
+        for _ in range(count):
+            self.inbox.put("joint_states", self.t, message or joints(self.t, **state))
+            outbox = self.service.step(self.t, self.inbox)
+            self.t += MS
+        assert set(outbox) == {"control/joint_torque"}
+        return outbox["control/joint_torque"]
+
+    def send(self, message: Any) -> None:
+        self.inbox.put("planning/setpoint", self.t, message)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def valid_for(command: Any) -> int:
+    return nanoseconds(command.valid_for)
+
+
+def test_command_is_what_the_contract_says(rig: Rig) -> None:
+    topic = contract().topics["control/joint_torque"]
+    assert {t.name for t in contract().outputs("control")} == {topic.name}
+    rig.send(setpoint(0))
+    command = rig.tick(20)
+    again = codec.decode(codec.encode(command, topic.type), topic.type)
+    np.testing.assert_array_equal(again.torque, command.torque)
+    assert nanoseconds(command.header.stamp) == rig.t - MS
+    assert valid_for(command) == EXPIRY == (topic.expiry_ms or 0) * MS
+    low, high = topic.ranges["torque"]
+    assert (low <= command.torque).all() and (command.torque <= high).all()
+    assert np.abs(command.torque).max() > 1
+
+
+def test_zero_torque_before_the_first_setpoint(rig: Rig) -> None:
+    for command in (rig.service.step(0, rig.inbox)["control/joint_torque"], rig.tick(5)):
+        np.testing.assert_array_equal(command.torque, 0.0)
+        assert valid_for(command) == EXPIRY
+
+
+def test_expired_setpoint_ends_commanding(rig: Rig) -> None:
+    rig.send(setpoint(0, valid=100 * MS))
+    assert valid_for(rig.tick(101)) == EXPIRY
+    command = rig.tick()
+    assert valid_for(command) == 0
+    np.testing.assert_array_equal(command.torque, 0.0)
+    assert valid_for(rig.tick(30)) == 0
+    assert rig.service.finish()["ticks_without_command"] == 31
+
+
+def test_no_setpoint_outlives_the_contract(rig: Rig) -> None:
+    rig.send(setpoint(0, valid=10_000 * MS))
+    assert valid_for(rig.tick(251)) == EXPIRY
+    assert valid_for(rig.tick()) == 0
+
+
+def test_commanding_starts_again_from_zero_torque(rig: Rig) -> None:
+    rig.send(setpoint(0, valid=20 * MS))
+    rig.tick(60)
+    rig.send(setpoint(rig.t - 10 * MS))
+    command = rig.tick()
+    assert valid_for(command) == EXPIRY
+    assert 0 < np.abs(command.torque).max() <= 1.0
+
+
+def test_commands_own_their_arrays(rig: Rig) -> None:
+    rig.send(setpoint(0))
+    first = rig.tick(5).torque
+    kept = first.copy()
+    rig.tick(5)
+    np.testing.assert_array_equal(first, kept)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"joint_position": np.full(7, np.nan)}, "q ="),
+        ({"stiffness": np.full(6, -1.0)}, "stiffness"),
+        ({"mode": 7}, "mode = 7"),
+        ({"pose": Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 0.0))}, "quaternion"),
+        ({"pose": Pose(Point(np.inf, 0.0, 0.0), Quaternion(1.0, 0.0, 0.0, 0.0))}, "p_WD"),
+    ],
+)
+def test_bad_setpoint_is_refused_and_the_one_before_goes_on(rig: Rig, changes: dict[str, Any], named: str) -> None:
+    rig.send(setpoint(0))
+    rig.tick(10)
+    rig.send(setpoint(10 * MS, **changes))
+    command = rig.tick()
+    assert valid_for(command) == EXPIRY
+    assert np.isfinite(command.torque).all() and np.abs(command.torque).max() > 1
+    facts = rig.service.finish()
+    assert facts["setpoints_rejected"] == 1 and named in facts["problem"]
+
+
+@pytest.mark.parametrize("broken", ["nan", "names"])
+def test_bad_joint_states_leave_the_arm_to_the_driver(rig: Rig, broken: str) -> None:
+    rig.send(setpoint(0))
+    rig.tick(10)
+    bad = joints(rig.t, np.full(7, np.nan)) if broken == "nan" else joints(rig.t, names=JOINT_NAMES[::-1])
+    command = rig.tick(message=bad)
+    assert valid_for(command) == 0
+    np.testing.assert_array_equal(command.torque, 0.0)
+    assert rig.service.finish()["joint_states_rejected"] == 1
+
+
+def test_stale_joint_states_leave_the_arm_to_the_driver(rig: Rig) -> None:
+    rig.send(setpoint(0))
+    rig.tick(10)
+    late = rig.t - MS + 20 * MS
+    assert valid_for(rig.service.step(late, rig.inbox)["control/joint_torque"]) == EXPIRY
+    assert valid_for(rig.service.step(late + MS, rig.inbox)["control/joint_torque"]) == 0
+
+
+def test_same_messages_same_torques() -> None:
+    def run() -> bytes:
+        rig = Rig()
+        out = []
+        for k in range(60):
+            if k % 10 == 0:
+                rig.send(
+                    setpoint(rig.t - 10 * MS, mode=ImpedanceSetpoint.MODE_CARTESIAN if k >= 30 else ImpedanceSetpoint.MODE_JOINT)
+                )
+            out.append(rig.tick(q=np.array(HOME) + 1e-3 * k).torque.tobytes())
+        return b"".join(out)
+
+    assert run() == run()
