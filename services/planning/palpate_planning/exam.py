@@ -166,6 +166,9 @@ class Exam:
 
     def _look(self, now: Observation) -> Setpoint | None:
         status, frames = self.status, self._known.camera.frames
+        if not self._looks:
+            self._abort(now, "every look posture collides: check robot.base_xy_m, base_yaw_rad and base_height_m")
+            return None
         if self._asked is None:
             try:
                 if not self._move(now, self._looks[self._attempts]):

@@ -191,6 +191,13 @@ def test_three_blocked_views_abort() -> None:
     assert "gave up after 3 looks" in world.exam.status.message
 
 
+def test_without_a_free_posture_to_look_from_it_says_what_to_check() -> None:
+    world = World(known())
+    world.exam._looks.clear()
+    world.run()
+    assert "robot.base_xy_m" in world.exam.status.message
+
+
 def test_silent_perception_is_tried_again_and_given_up() -> None:
     world = World(known())
     world.run(lambda: world.exam.status.phase is Phase.LOOK)
