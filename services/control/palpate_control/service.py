@@ -33,7 +33,8 @@ class ControlService(Service):
     role: ClassVar[str] = "control"
 
     def __init__(self, robot: Robot, limits: Limits) -> None:
-        self._controller = ImpedanceController(ArmModel(urdf(robot)), limits.joint_margin_rad)
+        self.model = ArmModel(urdf(robot))
+        self._controller = ImpedanceController(self.model, limits.joint_margin_rad)
         self._reference = Extrapolator()
         topics = contract().topics
         self._setpoint_expiry = (topics["planning/setpoint"].expiry_ms or 0) * MS
