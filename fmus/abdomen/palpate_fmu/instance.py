@@ -16,8 +16,10 @@ from __future__ import annotations
 import ctypes
 import re
 import shutil
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import prod
 from pathlib import Path
 from types import TracebackType
@@ -99,6 +101,58 @@ def _variable(name: str, references: tuple[int, ...], shape: tuple[int, ...], v:
     return FmuVariable(name, references, shape, v.causality, v.variability, v.type, unit, v.min, v.max, v.description)
 
 
+_said = threading.local()
+
+
+def _hear(*arguments: Any) -> None:
+    """Keeps what an FMU says, by the thread in which it does: in the call that failed."""
+    message = arguments[-1]
+    said = _said.__dict__.setdefault("lines", [])
+    said.append(message.decode("utf-8", "replace") if isinstance(message, bytes) else str(message))
+    del said[:-20]
+
+
+def _heard() -> str:
+    """What was said since this was last asked."""
+    lines = _said.__dict__.pop("lines", [])
+    return "; ".join(lines)
+
+
+@cache
+def _callbacks_2() -> Any:
+    """FMI 2.0's callbacks, one set for all instances: FMPy's expansion of messages has one logger a process."""
+    from fmpy import calloc, fmi2, free  # noqa: PLC0415
+    from fmpy.logging import addLoggerProxy  # noqa: PLC0415
+
+    callbacks = fmi2.fmi2CallbackFunctions()
+    callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_hear)
+    callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(calloc)
+    callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(free)
+    try:
+        addLoggerProxy(ctypes.byref(callbacks))
+    except (OSError, AttributeError):
+        return callbacks  # a platform without it shows messages as their formats
+    return callbacks
+
+
+def _instantiate(folder: str, description: Any) -> Any:
+    """An instance by FMPy."""
+    from fmpy import fmi2, fmi3  # noqa: PLC0415
+
+    older = description.fmiVersion == "2.0"
+    fmu = (fmi2.FMU2Slave if older else fmi3.FMU3Slave)(
+        guid=description.guid,
+        unzipDirectory=folder,
+        modelIdentifier=description.coSimulation.modelIdentifier,
+        instanceName=description.modelName,
+    )
+    if older:
+        fmu.instantiate(callbacks=_callbacks_2())
+    else:
+        fmu.instantiate(logMessage=_hear)
+    return fmu
+
+
 class Port:
     """Variables of one type that are read or written together. `port[name]` is a view of the values, of the variable's shape."""
 
@@ -137,10 +191,8 @@ class FmuInstance:
 
     def __init__(self, path: Path, start_s: float = 0.0, values: Mapping[str, ArrayLike] | None = None) -> None:
         import fmpy  # noqa: PLC0415  (slow to import)
-        from fmpy.simulation import instantiate_fmu  # noqa: PLC0415
 
         self.path = Path(path)
-        self._said: list[str] = []
         self._folder: str | None = None
         self._fmu: Any = None
         try:
@@ -153,10 +205,10 @@ class FmuInstance:
         self.variables = read_variables(self.description)
         self._folder = str(fmpy.extract(str(path)))
         try:
-            self._fmu = instantiate_fmu(self._folder, self.description, fmi_type="CoSimulation", logger=self._hear)
+            self._fmu = _instantiate(self._folder, self.description)
         except Exception as error:
             self.close()
-            raise FmuError(f"{path}: cannot be instantiated on {fmpy.platform_tuple}: {error} {self._heard()}".strip()) from error
+            raise FmuError(f"{path}: cannot be instantiated on {fmpy.platform_tuple}: {error} {_heard()}".strip()) from error
         self._component = self._fmu.component
         self._bind()
         try:
@@ -173,20 +225,10 @@ class FmuInstance:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
-    def _hear(self, *arguments: Any) -> None:
-        message = arguments[-1]
-        self._said.append(message.decode("utf-8", "replace") if isinstance(message, bytes) else str(message))
-        del self._said[:-20]
-
-    def _heard(self) -> str:
-        said = "; ".join(self._said)
-        self._said.clear()
-        return said
-
     def _check(self, status: int, what: str) -> None:
         if status > 1:
             name = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")[min(status, 5)]
-            raise FmuError(f"{self.path.name}: {what}: fmi{self.version}{name}: {self._heard() or 'no message'}")
+            raise FmuError(f"{self.path.name}: {what}: fmi{self.version}{name}: {_heard() or 'no message'}")
 
     def _function(self, name: str) -> Callable[..., int]:
         """A function of the library itself: FMPy's wrappers cost several microseconds a call."""
@@ -213,7 +255,7 @@ class FmuInstance:
                 fmu.enterInitializationMode(startTime=start_s)
             fmu.exitInitializationMode()
         except Exception as error:
-            raise FmuError(f"{self.path.name}: initialization: {error}: {self._heard()}") from error
+            raise FmuError(f"{self.path.name}: initialization: {error}: {_heard()}") from error
 
     def port(self, names: Sequence[str]) -> Port:
         """The variables of some names, which must be of one type. Raises FmuError naming one that is not there."""

@@ -14,11 +14,18 @@ typedef struct {
     int has_stop, set_up;
 } Instance;
 
+/* The message is the format itself, so that a logger that cannot take further arguments shows it too. */
 static void forward(void *environment, const char *message) {
     const Instance *i = environment;
-    if (i->callbacks && i->callbacks->logger) {
-        i->callbacks->logger(i->callbacks->componentEnvironment, i->name ? i->name : "abdomen", fmi2Error, "logStatusError", "%s", message);
+    char escaped[1024];
+    size_t k = 0;
+    if (!i->callbacks || !i->callbacks->logger) return;
+    for (; *message && k + 3 < sizeof escaped; message++) {
+        if (*message == '%') escaped[k++] = '%';
+        escaped[k++] = *message;
     }
+    escaped[k] = 0;
+    i->callbacks->logger(i->callbacks->componentEnvironment, i->name ? i->name : "abdomen", fmi2Error, "logStatusError", escaped);
 }
 
 static fmi2Status status(int ok) { return ok ? fmi2OK : fmi2Error; }

@@ -1,0 +1,33 @@
+"""FMUs for the tests of this folder, for this platform only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from palpate_fmu.compiling import native
+from palpate_fmu.export import build_fmu
+from palpate_models.scenario import Breathing, Lesion, Phantom
+
+PHANTOM = Phantom(lesions=(Lesion(centre_m=(-0.05, -0.05)),), breathing=Breathing(amplitude_m=0.002), edge_m=0.008)
+
+
+@pytest.fixture(scope="session")
+def phantom() -> Phantom:
+    return PHANTOM
+
+
+@pytest.fixture(scope="session")
+def fmu3(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_fmu(PHANTOM, 1, tmp_path_factory.mktemp("fmi3") / "abdomen.fmu", 3, [native()])
+
+
+@pytest.fixture(scope="session")
+def fmu2(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_fmu(PHANTOM, 1, tmp_path_factory.mktemp("fmi2") / "abdomen.fmu", 2, [native()])
+
+
+@pytest.fixture(params=[2, 3], ids=["fmi2", "fmi3"])
+def fmu(request: pytest.FixtureRequest) -> Path:
+    chosen: Path = request.getfixturevalue(f"fmu{request.param}")
+    return chosen

@@ -1,0 +1,91 @@
+"""Building: the same bytes each time, valid C, clean under sanitizers, for every platform that FMI names."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+
+import fmpy
+import pytest
+from palpate_fmu.compiling import native, platforms
+from palpate_fmu.export import build_fmu, write_sources
+from palpate_fmu.phantom_file import ExportError, sizes_of
+from palpate_models.phantom import build_phantom
+from palpate_models.scenario import Lesion, Phantom, Stiffness
+
+HERE = Path(__file__).parent
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror")
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc here: warnings and sanitizers are not checked")
+
+
+def test_the_same_phantom_gives_the_same_bytes(fmu3: Path, phantom: Phantom, tmp_path: Path) -> None:
+    again = build_fmu(phantom, 1, tmp_path / "again.fmu", 3, [native()])
+    assert again.read_bytes() == fmu3.read_bytes()
+    other = build_fmu(phantom, 2, tmp_path / "other.fmu", 3, [native()])
+    tokens = {fmpy.read_model_description(str(path)).instantiationToken for path in (again, other)}
+    assert len(tokens) == 2
+
+
+def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
+    many = Phantom(lesions=tuple(Lesion(centre_m=(0.0, 0.01 * k)) for k in range(9)), edge_m=0.015)
+    with pytest.raises(ExportError, match=r"phantom\.lesions has 9 entries"):
+        build_fmu(many, 0, tmp_path / "x.fmu", 3, [native()])
+    slow = Phantom(stiffness=Stiffness(prony_g=(0.1,), prony_tau_s=(1e9,)), edge_m=0.015)
+    with pytest.raises(ExportError, match="prony_tau"):
+        build_fmu(slow, 0, tmp_path / "x.fmu", 3, [native()])
+    with pytest.raises(ValueError, match="FMI 2 has no platform 'aarch64-linux'"):
+        build_fmu(Phantom(), 0, tmp_path / "x.fmu", 2, ["aarch64-linux"])
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_sources_in_the_fmu_build_with_another_compiler(version: int, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc here")
+    path: Path = request.getfixturevalue(f"fmu{version}")
+    folder = Path(fmpy.extract(str(path), unzipdir=str(tmp_path / "unpacked")))
+    description = fmpy.read_model_description(str(folder))
+    names = description.buildConfigurations[0].sourceFileSets[0].sourceFiles
+    library = next((folder / "binaries").rglob("abdomen.*"))
+    library.unlink()
+    command = ["gcc", *STRICT, "-O2", "-fPIC", "-shared", "-o", str(library), *names, "-lm"]
+    subprocess.run(command, cwd=folder / "sources", check=True)
+    result = fmpy.simulate_fmu(str(folder), stop_time=0.01, output_interval=1e-3)
+    assert len(result) >= 10
+
+
+@needs_gcc
+@pytest.mark.parametrize("version", [2, 3])
+def test_sanitizers_find_nothing(version: int, request: pytest.FixtureRequest, phantom: Phantom, tmp_path: Path) -> None:
+    path: Path = request.getfixturevalue(f"fmu{version}")
+    folder = Path(fmpy.extract(str(path), unzipdir=str(tmp_path / "unpacked")))
+    names = write_sources(tmp_path / "c", version)
+    binary = tmp_path / "exercise"
+    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
+    command = ["gcc", *STRICT, "-O1", "-g", *sanitizers, f"-DFMI_VERSION={version}", "-I.", "-o", str(binary)]
+    subprocess.run([*command, str(HERE / "exercise.c"), *names, "-lm"], cwd=tmp_path / "c", check=True)
+    sizes = sizes_of(build_phantom(phantom, 1))
+    token = fmpy.read_model_description(str(path)).guid
+    done = subprocess.run(
+        [str(binary), str(folder / "resources"), token, str(sizes.vertices), str(sizes.triangles)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1"},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", [2, 3])
+def test_it_compiles_for_every_platform(version: int, tmp_path: Path) -> None:
+    path = build_fmu(Phantom(edge_m=0.015), 0, tmp_path / "all.fmu", version)
+    magic = {".so": b"\x7fELF", ".dll": b"MZ", ".dylib": b"\xcf\xfa\xed\xfe"}
+    with zipfile.ZipFile(path) as archive:
+        found = [name for name in archive.namelist() if name.startswith("binaries/")]
+        for name in found:
+            assert archive.read(name).startswith(magic[Path(name).suffix]), name
+    assert len(found) == len(platforms(version)) == (3 if version == 2 else 6)

@@ -1,0 +1,198 @@
+"""The FMU as importers see it: description, values, errors, rollback."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+from palpate_fmu.instance import FmuError, FmuInstance
+from palpate_fmu.variables import TABLE, Kind
+from palpate_models.phantom import build_phantom
+from palpate_models.scenario import Phantom
+
+
+def press(fmu: FmuInstance, steps: int = 300, first: int = 0) -> np.ndarray:
+    """Slides down into the abdomen from step `first` on; the force at each step."""
+    motion, wrench = fmu.port(["indenter_position", "indenter_velocity"]), fmu.port(["contact_force", "contact_torque"])
+    forces = []
+    for k in range(first, first + steps):
+        motion["indenter_position"][:] = (-0.05 + 1e-5 * k, -0.05, 0.012 - 4e-5 * k)
+        motion["indenter_velocity"][:] = (0.01, 0.0, -0.04)
+        motion.push()
+        fmu.step(k * 1e-3, 1e-3)
+        forces.append(wrench.pull().copy())
+    return np.array(forces)
+
+
+def test_the_description_is_valid(fmu: Path) -> None:
+    assert validate_fmu(str(fmu)) == []
+
+
+def test_every_real_number_has_a_unit_and_what_can_be_set_has_bounds(fmu: Path) -> None:
+    for v in fmpy.read_model_description(str(fmu)).modelVariables:
+        if v.type in ("Real", "Float64"):
+            assert v.unit, v.name
+        if v.causality in ("input", "parameter"):
+            assert v.min is not None, v.name
+            assert v.max is not None, v.name
+
+
+def test_value_references_do_not_overlap() -> None:
+    used: set[int] = set()
+    for v in TABLE:
+        fixed = [extent for extent in v.shape if isinstance(extent, int)]
+        count = (
+            1 if "vertices" in v.shape or "triangles" in v.shape else int(np.prod(fixed)) * (400 if "samples" in v.shape else 1)
+        )
+        own = set(range(v.vr, v.vr + count))
+        assert not own & used, v.name
+        used |= own
+
+
+def test_both_versions_give_the_same_numbers(fmu2: Path, fmu3: Path) -> None:
+    with FmuInstance(fmu2) as older, FmuInstance(fmu3) as newer:
+        forces = press(older)
+        np.testing.assert_array_equal(forces, press(newer))
+        assert np.abs(forces[:, 2]).max() > 1
+        sample = older.get("sample_displacement")
+        index = [
+            int(np.linalg.norm(newer.get("rest_position") - place, axis=1).argmin()) for place in older.get("sample_position")
+        ]
+        np.testing.assert_array_equal(sample, newer.get("surface_displacement")[index])
+        assert len(set(index)) == len(index) == 64
+        for name in (
+            "indentation_depth",
+            "normal_force",
+            "tangential_force",
+            "contacts",
+            "elastic_energy",
+            "breathing_excursion",
+        ):
+            assert older.get(name) == newer.get(name), name
+
+
+def test_what_can_be_read_is_what_was_exported(fmu3: Path, phantom: Phantom) -> None:
+    model = build_phantom(phantom, 1)
+    with FmuInstance(fmu3) as fmu:
+        for name, array in (
+            ("rest_position", model.vertices),
+            ("rest_normal", model.normals),
+            ("background", model.background),
+            ("lesion", model.lesion),
+            ("triangles", model.triangles),
+        ):
+            np.testing.assert_array_equal(fmu.get(name), array)
+        np.testing.assert_allclose(fmu.get("stiffness"), model.stiffness, rtol=1e-13)
+        for v in TABLE:
+            if v.kind is Kind.FIXED and 3 in v.versions:
+                assert np.isfinite(fmu.get(v.name)).all()
+
+
+def test_lesions_are_parameters(fmu3: Path, phantom: Phantom) -> None:
+    lesion = phantom.lesions[0]
+    moved = phantom.model_copy(update={"lesions": (lesion.model_copy(update={"centre_m": (0.04, 0.02), "contrast": 6.0}),)})
+    centre = np.zeros((8, 2))
+    centre[0] = (0.04, 0.02)
+    with FmuInstance(
+        fmu3, values={"lesion_centre": centre, "lesion_contrast": [6.0, *[1.0] * 7], "stiffness_scale": 1.25}
+    ) as fmu:
+        model = build_phantom(moved, 1)
+        np.testing.assert_allclose(fmu.get("stiffness"), 1.25 * model.stiffness, rtol=1e-13)
+        np.testing.assert_array_equal(fmu.get("lesion"), model.lesion)
+    with FmuInstance(fmu3, values={"lesion_count": 0}) as fmu:
+        np.testing.assert_array_equal(fmu.get("stiffness"), fmu.get("background"))
+        assert (fmu.get("lesion") == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("indenter_position", (np.nan, 0.0, 0.0), ("indenter_position", "nan", "-10 to 10")),
+        ("indenter_position", (0.0, np.inf, 0.0), ("indenter_position", "inf")),
+        ("indenter_velocity", (0.0, 0.0, 1e9), ("indenter_velocity", "1e+09")),
+        ("indenter_radius", -0.01, ("indenter_radius", "-0.01", "0.001 to 0.1")),
+        ("stiffness_scale", 2.0, ("stiffness_scale", "fixed")),
+        ("contact_force", (0.0, 0.0, 1.0), ("contact_force", "output")),
+    ],
+)
+def test_a_bad_value_is_refused_with_a_message_and_nothing_changes(
+    fmu: Path, name: str, value: object, words: tuple[str, ...]
+) -> None:
+    with FmuInstance(fmu) as one, FmuInstance(fmu) as other:
+        press(one)
+        press(other)
+        before = one.get("indenter_position")
+        with pytest.raises(FmuError, match="Error") as caught:
+            one.set(name, value)  # type: ignore[arg-type]
+        for word in words:
+            assert word in str(caught.value)
+        np.testing.assert_array_equal(one.get("indenter_position"), before)
+        np.testing.assert_array_equal(press(one, 50, 300), press(other, 50, 300))
+
+
+@pytest.mark.parametrize(
+    ("t", "dt", "word"),
+    [(0.1, 1e-3, "going back"), (0.5, 1e-3, "time reached"), (0.3, -1e-3, "want more than 0"), (0.3, np.nan, "nan"),
+     (np.nan, 1e-3, "nan"), (0.3, 1e9, "at most 60")],
+)  # fmt: skip
+def test_an_impossible_step_is_refused_with_a_message_and_nothing_changes(fmu: Path, t: float, dt: float, word: str) -> None:
+    with FmuInstance(fmu) as one, FmuInstance(fmu) as other:
+        press(one)
+        press(other)
+        with pytest.raises(FmuError, match=re.escape(word)):
+            one.step(t, dt)
+        np.testing.assert_array_equal(press(one, 50, 300), press(other, 50, 300))
+
+
+def test_parameters_that_disagree_are_refused(fmu: Path) -> None:
+    with pytest.raises(FmuError, match="prony_g must sum to less than 1"):
+        FmuInstance(fmu, values={"prony_g": [0.5, 0.5, 0.2, 0.0]})
+    with pytest.raises(FmuError, match="sub-steps"):
+        FmuInstance(fmu, values={"dashpot": 1e-4})
+
+
+def test_a_state_can_be_saved_and_loaded_even_by_another_instance(fmu: Path) -> None:
+    with FmuInstance(fmu, values={"friction": 0.5}) as one, FmuInstance(fmu) as other:
+        press(one)
+        saved = one.save()
+        ahead = press(one, 200, 300)
+        one.restore(saved)
+        np.testing.assert_array_equal(press(one, 200, 300), ahead)
+        other.restore(saved)
+        assert other.get("friction") == 0.5
+        np.testing.assert_array_equal(press(other, 200, 300), ahead)
+
+
+def test_a_long_step_is_cut_and_agrees_with_short_ones(fmu3: Path) -> None:
+    with FmuInstance(fmu3) as coarse, FmuInstance(fmu3) as fine:
+        for fmu, n in ((coarse, 1), (fine, 10)):
+            fmu.set("indenter_position", (0.0, 0.05, 0.02))
+            fmu.step(0.0, 1e-3)
+            for k in range(100):
+                for j in range(n):
+                    share = (k + (j + 1) / n) / 100
+                    fmu.set("indenter_position", (0.0, 0.05, 0.02 - 0.02 * share))
+                    fmu.step(1e-3 + 0.01 * k + 0.01 * j / n, 0.01 / n)
+        force = coarse.get("contact_force")[2]
+        assert force > 1
+        # A step gives its mean force: over 10 ms against over the last of them.
+        assert abs(force - fine.get("contact_force")[2]) < 0.03 * force
+        np.testing.assert_allclose(coarse.get("surface_displacement"), fine.get("surface_displacement"), atol=1e-12)
+
+
+def test_a_file_that_is_no_phantom_gives_no_instance(fmu3: Path, tmp_path: Path) -> None:
+    folder = Path(fmpy.extract(str(fmu3), unzipdir=str(tmp_path / "broken")))
+    data = (folder / "resources" / "phantom.bin").read_bytes()
+    description = fmpy.read_model_description(str(folder))
+    nan = data[:4000] + b"\xff" * 8 + data[4008:]
+    said: list[str] = []
+    for content in (b"", data[:100], data[:-1], b"X" + data[1:], data[:72] + b"\xff\xff\xff\x7f" + data[76:], nan):
+        (folder / "resources" / "phantom.bin").write_bytes(content)
+        said.clear()
+        with pytest.raises(Exception, match="instantiate"):
+            fmpy.simulation.instantiate_fmu(str(folder), description, logger=lambda *a: said.append(str(a[-1])))
+        assert "phantom.bin" in said[0]
