@@ -47,6 +47,8 @@ SPRING_RATE = 150.0
 """Fastest undamped frequency of a spring [rad/s], 0.3 over the dead time: past it sampled damping adds energy."""
 REGULARISATION = 1e-3
 """Added to a matrix of the task [1/kg, 1/(kg m^2)] where it has lost rank."""
+DESIGN_TICKS = 10
+"""Gains are designed for each set-point, and again after so many ticks: meanwhile the arm moves by milliradians."""
 _EYE = np.eye(6)
 
 
@@ -61,10 +63,15 @@ class ImpedanceController:
         self._clip = np.array([POSITION_CLIP_M] * 3 + [ROTATION_CLIP_RAD] * 3)
         self._rotate = np.zeros((6, 6))  # world axes to D's, for linear and angular parts
         self._error = np.zeros(6)
+        self._designed_for: Array | None = None
+        self._design_age = 0
+        self._stiffness = self._damping = np.zeros(6)
+        self._posture_damping = np.zeros(DOF)
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
         self._shaper.reset()
+        self._designed_for = None
 
     def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
         """Torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s].
@@ -101,10 +108,12 @@ class ImpedanceController:
         slow_inertia = _inverse(JW.dot(J.T))
         V_desired = rotate.dot(reference.V_WD)
 
-        stiffness, damping = self._gains(reference, J.dot(model.mobility).dot(J.T), slow_inertia)
-        F = self._spring(reference, stiffness) + damping * (V_desired - J.dot(qd)) + rotate.dot(reference.F_W)
+        if reference.stiffness is not self._designed_for or self._design_age >= DESIGN_TICKS:
+            self._design(reference, J, slow_inertia)
+        self._design_age += 1
+        F = self._spring(reference) + self._damping * (V_desired - J.dot(qd)) + rotate.dot(reference.F_W)
 
-        posture = self._posture(q, qd, reference)
+        posture = reference.joint_stiffness * (reference.q - q) + self._posture_damping * (reference.qd - qd)
         null = posture - J.T.dot(slow_inertia.dot(JW.dot(posture)))
         if null.dot(null) > NULL_TORQUE_NM**2:
             null *= NULL_TORQUE_NM / max(np.abs(null).max(), NULL_TORQUE_NM)  # as a whole: it stays in the null space
@@ -113,33 +122,29 @@ class ImpedanceController:
         torque: Array = J.T.dot(F) + null + model.coriolis + self._friction(qd_desired)
         return torque
 
-    @staticmethod
-    def _gains(reference: Reference, mobility: Array, slow_inertia: Array) -> tuple[Array, Array]:
-        """Stiffness that sampling can bear and the damping that goes with it, in D's axes, shapes (6,)."""
+    def _design(self, reference: Reference, J: Array, slow_inertia: Array) -> None:
+        """Gains for this set-point and posture: stiffness that sampling can bear and the damping that goes with it."""
+        mobility = J.dot(self.model.mobility).dot(J.T)
         inertia = _inverse(mobility).diagonal()
         friction = (slow_inertia.diagonal() - inertia) / SLOW_S
         # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
         mass = np.minimum(inertia, 4 / mobility.diagonal())
-        stiffness = np.minimum(reference.stiffness, np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S)))
-        damping = 2 * reference.damping_ratio * np.sqrt(stiffness * mass)
-        return stiffness, np.maximum(damping - friction, LEAST_DAMPING * damping)
+        self._stiffness = np.minimum(reference.stiffness, np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S)))
+        damping = 2 * reference.damping_ratio * np.sqrt(self._stiffness * mass)
+        self._damping = np.maximum(damping - friction, LEAST_DAMPING * damping)
+        free = self.model.mobility.diagonal()
+        self._posture_damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(reference.joint_stiffness / free)
+        self._designed_for, self._design_age = reference.stiffness, 0
 
-    def _spring(self, reference: Reference, stiffness: Array) -> Array:
+    def _spring(self, reference: Reference) -> Array:
         """Force and torque of the Cartesian springs on the indenter, in D's axes, shape (6,)."""
         model, error, R_WD = self.model, self._error, reference.R_WD
         R_DI = R_WD.T.dot(model.R_WI)
         error[:3] = (reference.p_WD - model.p_WI).dot(R_WD)
         error[3:] = -pin.log3(R_DI)
-        spring: Array = stiffness * np.minimum(np.maximum(error, -self._clip), self._clip)
+        spring: Array = self._stiffness * np.minimum(np.maximum(error, -self._clip), self._clip)
         spring[3:] = pin.Jlog3(R_DI).dot(spring[3:])  # d phi = J_l^-1 w with w in D's axes, and J_l^-T = Jlog3
         return spring
-
-    def _posture(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """Torque towards the posture, before projection, shape (7,)."""
-        stiffness = reference.joint_stiffness
-        damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(stiffness / self.model.mobility.diagonal())
-        torque: Array = stiffness * (reference.q - q) + damping * (reference.qd - qd)
-        return torque
 
 
 def _inverse(matrix: Array) -> Array:
