@@ -37,10 +37,10 @@ def deformations(rows: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]
     return columns.partition([len(positions) for positions, _ in rows])
 
 
-def arrows(rows: Sequence[tuple[NDArray[np.float64], NDArray[np.float64], str]]) -> Any:
-    """Arrows: a row is origin, vector, shapes (3,), and label."""
-    origins, vectors, labels = zip(*rows, strict=True)
-    return rr.Arrows3D.columns(origins=np.stack(origins), vectors=np.stack(vectors), labels=labels)
+def arrows(rows: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Any:
+    """Arrows: a row is origin and vector, shapes (3,)."""
+    origins, vectors = zip(*rows, strict=True)
+    return rr.Arrows3D.columns(origins=np.stack(origins), vectors=np.stack(vectors))
 
 
 class Columns:

@@ -24,7 +24,7 @@ def _scene() -> Any:
         contents=["+ $origin/**", "- /world/camera/depth"],
         background=(24, 27, 33),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, color=(255, 255, 255, 18)),
-        eye_controls=_eye((1.16, -0.80, 1.46), (0.42, -0.02, 1.02), (0.0, 0.0, 1.0)),
+        eye_controls=_eye((1.22, -0.72, 1.66), (0.41, -0.02, 1.12), (0.0, 0.0, 1.0)),
         overrides={
             "/world/tool/travelled": rrb.VisibleTimeRanges([whole_past]),
             "/world/perception/normals": hidden,

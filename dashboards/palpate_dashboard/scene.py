@@ -51,7 +51,7 @@ class Scene:
         self._force_shown = False
         self._trail: list[NDArray[np.float64]] = []
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        red = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004], show_labels=True)
+        red = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004])
         recording.log("world/tool/force", red, static=True)
 
     def at(self, t: int) -> None:
@@ -205,6 +205,5 @@ class Scene:
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:
             vector = METRES_PER_NEWTON * force if shown else np.zeros(3)
-            label = f"{np.linalg.norm(force):.1f} N" if shown else ""
-            self._columns.add("world/tool/force", arrows, t, (position + BESIDE_M, vector, label))
+            self._columns.add("world/tool/force", arrows, t, (position + BESIDE_M, vector))
         self._force_shown = shown

@@ -40,7 +40,7 @@ IMAGE_PERIOD: Final = 500 * MS
 MAP_PERIOD: Final = 1000 * MS
 SEND_PERIOD: Final = 1000 * MS
 """Simulated time that is collected into one chunk of the file."""
-SEND_PERIOD_LIVE: Final = 100 * MS
+SEND_PERIOD_LIVE: Final = 200 * MS
 """The same while someone watches."""
 ABOVE_SKIN_M: Final = 0.002
 """Outlines are drawn so far outside the surface."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 from uuid import uuid4
 
 import rerun as rr
+
+log = logging.getLogger(__name__)
 
 APPLICATION = "palpate"
 MEMORY_LIMIT = "512MiB"
@@ -40,6 +44,22 @@ class Live:
         raise ValueError(f"PALPATE_VIEWER={text}: want serve, serve:PORT, connect or connect:URL")
 
 
+def address(port: int) -> str:
+    """Where a browser on this machine sees the recording that is served at `port`."""
+    return f"http://localhost:{port + 1}/?url={quote(f'rerun+http://localhost:{port}/proxy', safe='')}"
+
+
+def _serve(port: int) -> Any:
+    """A sink that hosts the recording at `port`, and the web viewer at `port` + 1. Raises OSError if one is taken."""
+    try:
+        server = rr.GrpcServerSink(port=port, server_memory_limit=MEMORY_LIMIT)
+        rr.serve_web_viewer(web_port=port + 1, open_browser=False)
+    except RuntimeError as error:
+        raise OSError(f"PALPATE_VIEWER=serve:{port}: ports {port} and {port + 1} must be free: {error}") from error
+    log.info("watch the run at %s", address(port))
+    return server
+
+
 def open_recording(path: Path, live: Live, blueprint: Any, name: str) -> rr.RecordingStream:
     """A recording named `name` that goes to the file `path`, and to viewers as `live` says.
 
@@ -51,9 +71,7 @@ def open_recording(path: Path, live: Live, blueprint: Any, name: str) -> rr.Reco
     recording.set_log_time_enabled(False)
     sinks: list[Any] = [rr.FileSink(path)]
     if live.serve_port is not None:
-        server = rr.GrpcServerSink(port=live.serve_port, server_memory_limit=MEMORY_LIMIT)
-        sinks.append(server)
-        rr.serve_web_viewer(web_port=live.serve_port + 1, open_browser=False, connect_to=server.uri)
+        sinks.append(_serve(live.serve_port))
     if live.connect_url is not None:
         sinks.append(rr.GrpcSink(live.connect_url))
     recording.set_sinks(*sinks, default_blueprint=blueprint)
