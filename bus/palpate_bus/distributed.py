@@ -30,6 +30,8 @@ PROGRESS_S = 0.2
 """How often a node reports its progress, by wall clock."""
 CONDUCTOR_SILENT_S = 10.0
 """After this long without a word from the conductor a node leaves."""
+CONDUCTOR_AWAITED_S = 120.0
+"""The same before its first word: containers on a busy machine start tens of seconds apart."""
 
 
 class RunAborted(RuntimeError):
@@ -48,12 +50,14 @@ class Link:
         self._decode = codec.decoder("palpation_msgs/msg/RunControl")
         self._encode = codec.encoder("palpation_msgs/msg/ServiceReport")
         self._last_word = monotonic()
+        self._patience = CONDUCTOR_AWAITED_S
         self._last_report = 0.0
 
     def poll(self, timeout: float | None = None) -> Any | None:
         """The next control message, or None. Raises RunAborted when told so or when the conductor is silent."""
         while (sample := self._control.get(timeout)) is not None:
             self._last_word = monotonic()
+            self._patience = CONDUCTOR_SILENT_S
             try:
                 message = self._decode(sample.payload)
             except codec.CodecError:
@@ -62,8 +66,8 @@ class Link:
             if message.command == RunControl.ABORT:
                 raise RunAborted(message.reason)
             return message
-        if monotonic() - self._last_word > CONDUCTOR_SILENT_S:
-            raise RunAborted(f"no word from the conductor for {CONDUCTOR_SILENT_S:.0f} s")
+        if monotonic() - self._last_word > self._patience:
+            raise RunAborted(f"no word from the conductor for {self._patience:.0f} s")
         return None
 
     def report(self, state: int, tick: int, waiting_for: str = "", detail: object = None) -> None:
