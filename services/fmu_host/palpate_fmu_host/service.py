@@ -44,6 +44,8 @@ class FmuService(Service):
         rules: Contract | None = None,
     ) -> None:
         rules = rules or contract()
+        if table.role not in rules.roles:
+            raise MapError(f"there is no role {table.role!r}; roles are {', '.join(rules.roles)}")
         self._period = rules.roles[table.role].period
         self._time = -self._period
         self._fmu = FmuInstance(fmu_file, self._time / NS, table.parameters)

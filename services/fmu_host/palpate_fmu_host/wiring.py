@@ -65,8 +65,6 @@ class Wiring:
         self._table, self._fmu, self._rules = table, fmu, rules
         self._frames = frames
         self._scenario = scenario
-        if table.role not in rules.roles:
-            raise MapError(f"there is no role {table.role!r}; roles are {', '.join(rules.roles)}")
         self.inputs = tuple(self._input(name, entries) for name, entries in table.inputs.items())
         mine = {topic.name for topic in rules.outputs(table.role)}
         if missing := mine - table.outputs.keys():
@@ -86,11 +84,12 @@ class Wiring:
 
     def _input(self, name: str, entries: Mapping[str, InputEntry]) -> InputTopic:
         topic = self._topic(name, {row.name for row, _ in self._rules.inputs(self._table.role)}, "read")
-        port = self._fmu.port(list(entries))
+        chosen = {key: self._variable(key, f"{name}.{entry.field}") for key, entry in entries.items()}
+        port = self._fmu.port(list(chosen))
         moves = []
         for variable_name, entry in entries.items():
             where = f"{name}.{entry.field} -> {variable_name}"
-            variable = self._variable(variable_name, where)
+            variable = chosen[variable_name]
             if not (variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable")):
                 raise MapError(f"{where}: only inputs and tunable parameters can be set, this is {variable.causality}")
             self._fit(topic, entry.field, variable, where)

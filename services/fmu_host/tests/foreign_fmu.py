@@ -1,0 +1,141 @@
+"""An FMU that is not ours, built from a few lines of C: three first-order lags in millimetres, FMI 2.0 or 3.0."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+from palpate_fmu.compiling import compile_library, native, platforms
+
+SOURCE = """
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define EXPORT __attribute__((visibility("default")))
+
+typedef struct { double u[3], y[3], tau; } Lag;
+
+static Lag *lag_new(void) {
+    Lag *lag = calloc(1, sizeof *lag);
+    if (lag) lag->tau = 0.1;
+    return lag;
+}
+
+static int lag_step(Lag *lag, double dt) {
+    const double share = 1 - exp(-dt / lag->tau);
+    if (fabs(dt - 0.01) > 1e-9) return 3; /* a fixed step: 10 ms */
+    for (int k = 0; k < 3; k++) lag->y[k] += share * (lag->u[k] - lag->y[k]);
+    return 0;
+}
+
+#if FMI_VERSION == 2
+EXPORT void *fmi2Instantiate(const char *n, int t, const char *g, const char *r, const void *f, int v, int l) {
+    (void)n, (void)t, (void)r, (void)f, (void)v, (void)l;
+    return strcmp(g, "lag") ? NULL : lag_new();
+}
+EXPORT void fmi2FreeInstance(void *c) { free(c); }
+EXPORT int fmi2GetReal(void *c, const unsigned *vr, size_t n, double *v) {
+    for (size_t k = 0; k < n; k++) v[k] = ((double *)c)[vr[k]];
+    return 0;
+}
+EXPORT int fmi2SetReal(void *c, const unsigned *vr, size_t n, const double *v) {
+    for (size_t k = 0; k < n; k++) ((double *)c)[vr[k]] = v[k];
+    return 0;
+}
+EXPORT int fmi2DoStep(void *c, double t, double dt, int k) { (void)t, (void)k; return lag_step(c, dt); }
+EXPORT int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) {
+    (void)c, (void)a, (void)b, (void)d, (void)e, (void)f;
+    return 0;
+}
+EXPORT int fmi2EnterInitializationMode(void *c) { return !c; }
+EXPORT int fmi2ExitInitializationMode(void *c) { return !c; }
+#else
+#include <stdbool.h>
+EXPORT void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l, bool e, bool w,
+                                         const unsigned *i, size_t m, void *x, void *f, void *u) {
+    (void)n, (void)r, (void)v, (void)l, (void)e, (void)w, (void)i, (void)m, (void)x, (void)f, (void)u;
+    return strcmp(g, "lag") ? NULL : lag_new();
+}
+EXPORT void fmi3FreeInstance(void *c) { free(c); }
+static size_t at(unsigned vr) { return vr * 3; }
+static size_t many(unsigned vr) { return vr == 2 ? 1 : 3; }
+EXPORT int fmi3GetFloat64(void *c, const unsigned *vr, size_t n, double *v, size_t room) {
+    (void)room;
+    for (size_t k = 0; k < n; v += many(vr[k++])) memcpy(v, (double *)c + at(vr[k]), many(vr[k]) * sizeof *v);
+    return 0;
+}
+EXPORT int fmi3SetFloat64(void *c, const unsigned *vr, size_t n, const double *v, size_t room) {
+    (void)room;
+    for (size_t k = 0; k < n; v += many(vr[k++])) memcpy((double *)c + at(vr[k]), v, many(vr[k]) * sizeof *v);
+    return 0;
+}
+EXPORT int fmi3DoStep(void *c, double t, double dt, bool k, bool *e, bool *s, bool *r, double *last) {
+    (void)k;
+    *e = *s = *r = false;
+    *last = t + dt;
+    return lag_step(c, dt);
+}
+EXPORT int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f) {
+    (void)a, (void)b, (void)d, (void)e, (void)f;
+    return !c;
+}
+EXPORT int fmi3ExitInitializationMode(void *c) { return !c; }
+#endif
+"""
+
+_UNIT = (
+    '<UnitDefinitions><Unit name="mm"><BaseUnit m="1" factor="0.001"/></Unit>'
+    '<Unit name="s"><BaseUnit s="1"/></Unit></UnitDefinitions>'
+)
+
+
+def _description(version: int) -> str:
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription modelName="lag" '
+    if version == 3:
+        variables = "".join(
+            f'<Float64 name="{name}" valueReference="{vr}" causality="{causality}" variability="continuous" unit="mm"'
+            f'{start}><Dimension start="3"/></Float64>'
+            for name, vr, causality, start in (("u", 0, "input", ' start="0 0 0"'), ("y", 1, "output", ""))
+        )
+        return (
+            f'{head} fmiVersion="3.0" instantiationToken="lag"><CoSimulation modelIdentifier="lag" fixedInternalStepSize="0.01"/>'
+            f'{_UNIT}<ModelVariables><Float64 name="time" valueReference="9" causality="independent" variability="continuous"/>'
+            f'{variables}<Float64 name="tau" valueReference="2" causality="parameter" variability="tunable" unit="s"'
+            ' start="0.1"/>'
+            '</ModelVariables><ModelStructure><Output valueReference="1"/><InitialUnknown valueReference="1"/></ModelStructure>'
+            "</fmiModelDescription>"
+        )
+    scalars = "".join(
+        f'<ScalarVariable name="{name}[{k + 1}]" valueReference="{3 * vr + k}" causality="{causality}" variability="continuous">'
+        f'<Real unit="mm"{start}/></ScalarVariable>'
+        for name, vr, causality, start in (("u", 0, "input", ' start="0"'), ("y", 1, "output", ""))
+        for k in range(3)
+    )
+    unknowns = "".join(f'<Unknown index="{k}"/>' for k in (4, 5, 6))
+    return (
+        f'{head} fmiVersion="2.0" guid="lag"><CoSimulation modelIdentifier="lag"/>{_UNIT}<ModelVariables>{scalars}'
+        '<ScalarVariable name="tau" valueReference="6" causality="parameter" variability="tunable"><Real unit="s" start="0.1"/>'
+        f"</ScalarVariable></ModelVariables><ModelStructure><Outputs>{unknowns}</Outputs>"
+        f"<InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure></fmiModelDescription>"
+    )
+
+
+def build_lag(folder: Path, version: int) -> Path:
+    """Writes lag.fmu for this platform. FMPy wants every function of the standard to be there: the rest answers fmi2Error."""
+    from fmpy import fmi2, fmi3
+
+    slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
+    missing = [name for name in dir(slave) if name.startswith(f"fmi{version}") and f"{name}(" not in SOURCE]
+    rest = "".join(f"EXPORT int {name}(void) {{ return 3; }}\n" for name in missing)
+    source = folder / f"c{version}"
+    source.mkdir()
+    (source / "lag.c").write_text(f"#define FMI_VERSION {version}\n{SOURCE}{rest}")
+    (target,) = platforms(3, [native()])
+    path = folder / f"lag{version}.fmu"
+    place = target.tuple_3 if version == 3 else target.folder_2
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", _description(version))
+        archive.writestr("resources/readme.txt", "nothing")
+        archive.writestr(f"binaries/{place}/lag{target.suffix}", compile_library(source, ["lag.c"], target))
+    return path
