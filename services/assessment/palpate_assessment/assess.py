@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from palpate_assessment.contact import REACH, ReferenceContact
 from palpate_assessment.findings import CANDIDATE_RATIO, StiffArea, candidates, find
 from palpate_assessment.grid import MapGrid
-from palpate_assessment.inversion import POWER, Z90, Noise, Observations, estimate_noise, invert, observe
+from palpate_assessment.inversion import POWER, Z90, Noise, Observations, estimate_noise, invert, observe, spread_under
 from palpate_assessment.prior import HEALTHY, LESION, Field
 from palpate_assessment.sampling import Sample
 
@@ -73,10 +73,12 @@ def assess(
     posterior = invert(observations, healthy + Field(grid, LESION), mean)
     background = surroundings(posterior.mean, observations, grid, healthy, mean, scanned)
     found: list[StiffArea] = []
-    for _ in range(2 if refine else 0):
+    for round_ in range(2 if refine else 0):
         envelope = lesion_envelope(posterior.mean - background, grid, scanned)
         lesion = Field(grid, LESION, envelope)
-        observations = replace(observations, noise=estimate_noise(observations, posterior, healthy + lesion))
+        observations = replace(observations, spread=spread_under(observations.footprint, posterior.mean))
+        if round_ == 0:
+            observations = replace(observations, noise=estimate_noise(observations, posterior, healthy + lesion))
         posterior = invert(observations, healthy + lesion, mean, posterior.mean, iterations=4)
         background = mean + healthy.times((posterior.weights @ posterior.jacobian)[None])[0]
     if refine:

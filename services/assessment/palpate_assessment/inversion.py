@@ -43,20 +43,28 @@ class Noise:
     """Error of the perceived surface [m], correlated over `depth_length`."""
     depth_length: float = 0.015
     """[m]"""
-    depth_common: float = 0.0002
+    depth_common: float = 0.0001
     """Error of the perceived surface that is common to all samples [m]. A scan cannot tell it from a stiffer patient."""
-    model_common: float = 0.03
+    model_common: float = 0.02
     """Relative error of the contact model that is common to all samples [1]: the wall's discretisation and constants."""
     model_white: float = 0.01
     """That of a sample by itself [1]."""
+    model_edge: float = 0.06
+    """Relative error of the footprint, over the spread of log k_w under it [1]: the residual that POWER leaves."""
+    edge_length: float = 0.010
+    """Over which it is correlated [m]."""
 
-    def covariance(self, steep: Array, squared_distance: Array, relative: Array) -> Array:
+    def covariance(self, steep: Array, squared_distance: Array, relative: Array, spread: Array) -> Array:
         """Covariance of log(F / F_ref), shape (m, m).
 
-        `steep`: d log F / d depth [1/m]; `squared_distance` of the samples [m^2], shape (m, m); `relative` force noise [1].
+        `steep`: d log F / d depth [1/m]; `squared_distance` of the samples [m^2], shape (m, m); `relative` force noise [1];
+        `spread`: standard deviation of log k_w under each footprint [1].
         """
         smooth = self.depth_smooth**2 * np.exp(-0.5 * squared_distance / self.depth_length**2) + self.depth_common**2
         covariance = np.outer(steep, steep) * smooth + self.model_common**2
+        if spread.any():
+            edge = self.model_edge * spread
+            covariance += np.outer(edge, edge) * np.exp(-0.5 * squared_distance / self.edge_length**2)
         covariance[np.diag_indices(len(steep))] += (steep * self.depth_white) ** 2 + relative**2 + self.model_white**2
         return np.asarray(covariance)
 
@@ -76,11 +84,13 @@ class Observations:
     """Noise of the force over the force [1], shape (m,)."""
     footprint: Array
     """Weight of each node in each sample, rows sum to 1, shape (m, n)."""
+    spread: Array
+    """Standard deviation of log k_w under each footprint [1], shape (m,); zero before anything is known."""
 
     @cached_property
     def covariance(self) -> Array:
         """Of the noise, shape (m, m)."""
-        return self.noise.covariance(self.steep, self.squared_distance, self.relative)
+        return self.noise.covariance(self.steep, self.squared_distance, self.relative, self.spread)
 
 
 @dataclass(frozen=True)
@@ -124,7 +134,14 @@ def observe(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact,
         squared_distance=cdist(position, position, "sqeuclidean"),
         relative=np.array([s.force_noise for s in samples]) / force,
         footprint=footprints(samples, grid, contact),
+        spread=np.zeros(len(samples)),
     )
+
+
+def spread_under(footprint: Array, z: Array) -> Array:
+    """Standard deviation of log k_w `z`, shape (n,), under each footprint, shape (m,)."""
+    mean = footprint @ z
+    return np.asarray(np.sqrt(np.maximum(footprint @ z**2 - mean**2, 0.0)))
 
 
 def footprints(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact) -> Array:
@@ -166,7 +183,8 @@ def invert(observations: Observations, prior: Field, mean: float, start: Array |
     return Posterior(z, np.sqrt(variance), jacobian, residual, weights)
 
 
-_SCALES = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
+_SMOOTH = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
+_WHITE = (0.03, 0.12, 0.5)
 """Standard deviations of depth errors that are tried [mm]."""
 
 
@@ -178,13 +196,14 @@ def estimate_noise(observations: Observations, posterior: Posterior, prior: Fiel
     """
     J = posterior.jacobian
     signal = prior.times(J) @ J.T
-    noise = chosen = observations.noise
+    o = observations
+    noise = chosen = o.noise
     best = -np.inf
-    for smooth in _SCALES:
-        for white in _SCALES[:-1]:
+    for smooth in _SMOOTH:
+        for white in _WHITE:
             common = max(Noise.depth_common, 0.5e-3 * smooth)
             tried = replace(noise, depth_smooth=1e-3 * smooth, depth_white=1e-3 * white, depth_common=common)
-            covariance = tried.covariance(observations.steep, observations.squared_distance, observations.relative)
+            covariance = tried.covariance(o.steep, o.squared_distance, o.relative, o.spread)
             half = cholesky(signal + covariance, lower=True)
             scaled = solve_triangular(half, posterior.residual, lower=True)
             evidence = -0.5 * float(scaled @ scaled) - float(np.log(np.diag(half)).sum())

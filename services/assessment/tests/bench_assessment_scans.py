@@ -26,7 +26,7 @@ from palpate_models.phantom.field import gaussian_field
 from palpate_models.scenario import Lesion, Phantom, Scenario
 from palpate_tissue.tissue import Tissue
 from scipy.interpolate import CloughTocher2DInterpolator
-from scipy.signal import lfilter
+from scipy.ndimage import gaussian_filter1d
 
 Array = NDArray[np.float64]
 
@@ -35,8 +35,8 @@ _Vector3: Any = message_type("geometry_msgs/msg/Vector3")
 
 SURFACE_SD, SURFACE_LENGTH = 0.0001, 0.012
 """Error of the perceived surface [m] and its correlation length: perception's own figures."""
-CONTROL_SD, CONTROL_S = 0.0003, 0.2
-"""Depth error of the regulation [m] and its correlation time [s]."""
+CONTROL_SD, CONTROL_S = 0.0001, 0.15
+"""Depth error of the regulation [m] and its correlation time [s]: smooth, as an arm moves."""
 FORCE_SD = 0.03
 """Noise of the force at 100 Hz [N]."""
 
@@ -116,11 +116,10 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
     for times, path in snake(region or exam.region_m, exam.spacing_m, exam.speed_mps, tissue.dt):
         p, n = shape(path)
         off = wrong(p)
-        decay = np.exp(-tissue.dt / CONTROL_S)
-        drive = rng.standard_normal(len(times)) * CONTROL_SD * errors * np.sqrt(1 - decay**2)
+        drift = gaussian_filter1d(rng.standard_normal(len(times)), CONTROL_S / np.sqrt(2) / tissue.dt)
+        drift *= errors * CONTROL_SD / max(float(drift.std()), 1e-12)
         wanted = exam.depth_m * np.minimum(1.0, (times - times[0]) / 0.3)
-        measured = wanted + lfilter([1.0], [1.0, -decay], drive)
-        # depth yields to the working force limit, as planning does it
+        measured = wanted + drift
         centre = p + n * (robot.indenter_radius_m - (measured - off))[:, None]
         velocity = np.gradient(centre, tissue.dt, axis=0)
         force = np.zeros(len(times))

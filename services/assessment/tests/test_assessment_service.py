@@ -1,0 +1,126 @@
+"""The service, driven by states of a sphere that slides over the real tissue."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bench_assessment_scans import FakeInbox, Scan, examine, scan
+from palpate_assessment.service import AssessmentService, create
+from palpate_bus.codec import encode
+from palpate_bus.contract import contract
+from palpate_bus.messages import ExamState
+from palpate_conductor.evidence import centroids_of, map_of
+from palpate_conductor.scoring import score
+from palpate_models.load import exam_input
+from palpate_models.scenario import Exam, Lesion, Phantom, Scenario
+
+REGION = (0.11, 0.10)
+
+
+@pytest.fixture(scope="module")
+def small() -> Scan:
+    """A small region over a lesion: 9 lines, half a minute of simulated time."""
+    lesion = Lesion(centre_m=(-0.012, -0.01), radii_m=(0.024, 0.020), contrast=4.0)
+    return scan(Scenario(seed=4, phantom=Phantom(lesions=(lesion,)), exam=Exam(region_m=REGION)))
+
+
+def test_finds_the_lesion(small: Scan) -> None:
+    stiffness_map, findings, samples = examine(small)
+    s = score(centroids_of(findings), map_of(stiffness_map), small.truth)
+    assert (s.matched, s.missed, s.false_positives) == (1, 0, 0)
+    assert s.localisation_error_m is not None
+    assert s.localisation_error_m < 0.005
+    assert s.dice is not None
+    assert s.dice > 0.8
+    assert findings.final
+    assert findings.findings[0].quadrant == "RLQ"
+    assert len(samples) > 150
+
+
+def test_absolute_stiffness_is_the_tissues(small: Scan) -> None:
+    stiffness_map, _, _ = examine(small)
+    found = map_of(stiffness_map)
+    away = found.scanned & (np.linalg.norm(found.vertices[:, :2] - (-0.012, -0.01), axis=1) > 0.045)
+    nearest = np.argmin(
+        np.linalg.norm(found.vertices[away][:, None, :2] - small.truth.vertices[None, :, :2], axis=2)
+        + (small.truth.vertices[None, :, 2] < -0.08),
+        axis=1,
+    )
+    ratio = found.stiffness[away] / small.truth.stiffness[nearest]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.06)
+
+
+def test_messages_keep_the_contract(small: Scan) -> None:
+    stiffness_map, findings, samples = examine(small)
+    topics = contract().topics
+    for name, message in (
+        ("assessment/map", stiffness_map),
+        ("assessment/findings", findings),
+        ("assessment/samples", samples[0]),
+    ):
+        assert encode(message, topics[name].type)
+        assert message.header.frame_id == topics[name].frame
+    n = len(stiffness_map.stiffness)
+    assert len(stiffness_map.vertices) == 3 * n
+    assert stiffness_map.triangles.max() < n
+    assert (stiffness_map.stiffness_lower < stiffness_map.stiffness).all()
+    assert (stiffness_map.stiffness < stiffness_map.stiffness_upper).all()
+    assert set(np.unique(stiffness_map.finding)) == {-1, 0}
+    low, high = topics["assessment/map"].ranges["stiffness"]
+    assert low < stiffness_map.stiffness.min()
+    assert stiffness_map.stiffness.max() < high
+
+
+def test_the_same_states_give_the_same_bytes(small: Scan) -> None:
+    first, second = (examine(small) for _ in range(2))
+    types = contract().topics
+    for a, b in zip(first[:2], second[:2], strict=True):
+        name = "assessment/map" if hasattr(a, "stiffness") else "assessment/findings"
+        assert encode(a, types[name].type) == encode(b, types[name].type)
+
+
+def test_maps_grow_and_the_findings_come_once(small: Scan) -> None:
+    service = AssessmentService(exam_input(small.scenario))
+    stamps, finals = [], 0
+    surface = [small.surface]
+    for state in [*small.states, small.states[-1], small.states[-1]]:
+        t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
+        outbox = service.step(t, FakeInbox({"exam/state": [state], "perception/surface": surface}))
+        surface = []
+        if "assessment/map" in outbox:
+            stamps.append(t)
+        finals += "assessment/findings" in outbox
+    assert len(stamps) >= 5
+    assert min(np.diff(stamps)) >= 0.5e9
+    assert finals == 1
+
+
+def test_an_examination_without_samples_ends_with_no_findings(small: Scan) -> None:
+    service = create(small.scenario)
+    outbox = service.step(10_000_000, FakeInbox({"exam/state": [small.states[-1]]}))
+    assert outbox["assessment/findings"].final
+    assert outbox["assessment/findings"].findings == []
+    assert "assessment/map" not in outbox
+
+
+def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> None:
+    service = AssessmentService(exam_input(small.scenario))
+    half = small.states[: len(small.states) // 2]
+    surface = [small.surface]
+    for state in half:
+        t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
+        service.step(t, FakeInbox({"exam/state": [state], "perception/surface": surface}))
+        surface = []
+    last = small.states[-1]
+    aborted = ExamState(**{**vars(last), "phase": ExamState.PHASE_ABORTED})
+    outbox = service.step(60_000_000_000, FakeInbox({"exam/state": [aborted]}))
+    assert outbox["assessment/findings"].final
+    assert 0.2 < outbox["assessment/map"].scanned.mean() < 0.8
+
+
+def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
+    service = create(small.scenario)
+    wrong = type(small.surface)(**vars(small.surface))
+    wrong.header = type(small.surface.header)(small.surface.header.stamp, "camera")
+    with pytest.raises(ValueError, match="perception/surface"):
+        service.step(0, FakeInbox({"perception/surface": [wrong]}))
