@@ -32,7 +32,7 @@ TASK_TOLERANCE = 1e-5
 """Residual of a target that counts as reached [m, rad]."""
 PRESSING_FORCE_N = 15.0
 """Normal force that postures are judged at: the working force limit."""
-_IK_STEPS, _PROJECTION_STEPS, _IPOPT_STEPS = 40, 12, 80
+_IK_STEPS, _PROJECTION_STEPS, _IPOPT_STEPS, _SAMPLES = 40, 12, 80, 16
 _LARGEST_STEP_RAD = 0.15
 
 
@@ -61,7 +61,7 @@ class _Batch:
 
     def __init__(self, robot: Robot, positions: Array, normals: Array, limit: Array, force: float) -> None:
         n = len(positions)
-        self.count, self.limit, self.force = n, limit, force
+        self.robot, self.count, self.limit, self.force = robot, n, limit, force
         self.base = base_of(robot)
         self.positions = positions
         self.frames = surface_frames(normals)
@@ -102,6 +102,24 @@ class _Batch:
             q = np.clip(q, -self.limit, self.limit)
         return q
 
+    def part(self, indices: NDArray[np.intp]) -> _Batch:
+        """Some of the targets."""
+        return _Batch(self.robot, self.positions[indices], self.frames[indices, :, 2], self.limit, self.force)
+
+    def search(self, q: Array) -> Array:
+        """Inverse kinematics from postures `q`, cheaper ones preferred, shape (n, 7)."""
+        return self.solve(self.solve(q, _IK_STEPS, 0.05), _PROJECTION_STEPS, 0.0)
+
+    def from_one(self, start: Array) -> Array:
+        """Inverse kinematics of all targets from one posture, shape (n, 7)."""
+        return self.search(np.tile(np.clip(start, -self.limit, self.limit), (self.count, 1)))
+
+    def verdict(self, q: Array) -> tuple[int, float]:
+        """How bad postures are: targets missed, then the mean cost of the others, in steps that rounding does not turn."""
+        reached = self.reached(q)[1]
+        cost = np.array(self._cost(q.T, self._base, self.force)[0])[0]
+        return int((~reached).sum()), round(float(cost[reached].mean()), 3) if reached.any() else 0.0
+
     def reached(self, q: Array) -> tuple[Array, Mask]:
         """Norm of the residual (n,) and whether the target is reached, facing the right way (n,)."""
         residual = np.linalg.norm(self.task(q)[0], axis=1)
@@ -125,7 +143,8 @@ def plan_redundancy(
         robot: the robot with its base placement and tool.
         positions_W: origins of the indenter frame (the sphere's centre) in world, in path order [m], shape (n, 3).
         normals_W: outward unit surface normals in world, shape (n, 3).
-        q_seed: a posture to start from, e.g. the present one [rad], shape (7,); it chooses between solutions.
+        q_seed: a posture to start from, e.g. the present one [rad], shape (7,); it decides between branches
+            that are equally good.
         joint_margin_rad: kept from every joint limit.
         force_n: normal force that the postures must press with.
 
@@ -158,7 +177,7 @@ def plan_redundancy(
 
 
 def _seeds(batch: _Batch, seed: Array) -> list[Array]:
-    """Postures to start inverse kinematics from: the caller's, then elbow-up ones that face the targets' centre."""
+    """Postures to start inverse kinematics from: the caller's, and elbow-up ones that face the targets' centre."""
     x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
     azimuth = np.arctan2(y, x) - batch.base[3]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
@@ -167,25 +186,17 @@ def _seeds(batch: _Batch, seed: Array) -> list[Array]:
 
 
 def _inverse_kinematics(batch: _Batch, seed: Array) -> Array:
-    """A posture for each target, shape (n, 7): from the seeds in turn, then from the nearest reached neighbour."""
-    q = np.tile(np.clip(seed, -batch.limit, batch.limit), (batch.count, 1))
-    missing, reached = np.full(batch.count, np.inf), np.zeros(batch.count, dtype=bool)
-
-    def attempt(start: Array) -> None:
-        nonlocal q, missing, reached
-        trial = batch.solve(batch.solve(start, _IK_STEPS, 0.05), _PROJECTION_STEPS, 0.0)
+    """A posture for each target, shape (n, 7), from the best seed, then from the nearest neighbour that was reached."""
+    sample = batch.part(np.unique(np.linspace(0, batch.count - 1, min(_SAMPLES, batch.count)).round().astype(int)))
+    best = min(_seeds(batch, seed), key=lambda start: sample.verdict(sample.from_one(start)))
+    q = batch.from_one(best)
+    missing, reached = batch.reached(q)
+    if reached.any() and not reached.all():
+        distance = np.linalg.norm(batch.positions[:, None] - batch.positions[reached], axis=2)
+        trial = batch.search(q[np.flatnonzero(reached)[distance.argmin(axis=1)]])
         residual, good = batch.reached(trial)
         better = ~reached & (good | (residual < missing))
         q = np.where(better[:, None], trial, q)
-        missing, reached = np.where(better, residual, missing), reached | good
-
-    for start in _seeds(batch, seed):
-        attempt(np.tile(np.clip(start, -batch.limit, batch.limit), (batch.count, 1)))
-        if reached.any():
-            break
-    if reached.any() and not reached.all():
-        distance = np.linalg.norm(batch.positions[:, None] - batch.positions[reached], axis=2)
-        attempt(q[np.flatnonzero(reached)[distance.argmin(axis=1)]])
     return q
 
 
