@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examination import palpate_run
 from palpate_bus.codec import decode
 from palpate_bus.composed import Composed
 from palpate_bus.contract import Topic, contract
 from palpate_bus.service import Service
 from palpate_bus.stamps import NS
 from palpate_conductor.collector import Collector
+from palpate_conductor.processes import compose_file
 from palpate_conductor.run import WORKERS, load_services
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
@@ -129,10 +131,11 @@ def examine(scenario: Scenario, tissue: Service) -> Examined:
     return Examined(collector.collected, run.run_hash(), tape)
 
 
+SETTINGS = ("exam.region_m=[0.05, 0.05]", "exam.centre_m=[-0.055, -0.055]", "camera.frames=5")
+
+
 def _scenario() -> Scenario:
-    return load_scenario(
-        "rlq_guarding", ("exam.region_m=[0.05, 0.05]", "exam.centre_m=[-0.055, -0.055]", "camera.frames=5"), seed=3
-    )
+    return load_scenario("rlq_guarding", SETTINGS, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -165,15 +168,35 @@ def test_a_recorded_examination_gives_the_same_wrench_and_surface(with_native: E
     print(f"force {difference / scale:.1e} of {scale:.1f} N over {len(wrenches)} steps, surface {moved:.1e} m")
 
 
+@pytest.fixture(scope="module")
+def with_fmu() -> Examined:
+    return examine(_scenario(), create_fmu(_scenario()))
+
+
 @pytest.mark.slow
-def test_an_examination_with_the_fmu_has_the_same_findings(with_native: Examined) -> None:
-    hosted = examine(_scenario(), create_fmu(_scenario()))
-    native_findings, findings = with_native.collected.findings.findings, hosted.collected.findings.findings
+def test_an_examination_with_the_fmu_has_the_same_findings(with_native: Examined, with_fmu: Examined) -> None:
+    native_findings, findings = with_native.collected.findings.findings, with_fmu.collected.findings.findings
     assert len(findings) == len(native_findings) >= 1
     for found, expected in zip(findings, native_findings, strict=True):
         np.testing.assert_allclose(_vector(found.centroid), _vector(expected.centroid), atol=1e-4)
         assert found.stiffness_ratio == pytest.approx(expected.stiffness_ratio, rel=1e-2)
         assert found.area == pytest.approx(expected.area, rel=1e-2)
+
+
+@pytest.mark.slow
+def test_one_line_of_the_compose_file_puts_it_on_the_bus(
+    with_fmu: Examined, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a process of its own it gives, to the bit, what it gives in one process with all others."""
+    text = compose_file().read_text(encoding="utf-8")
+    assert text.count("palpate_tissue") == 1
+    swapped = tmp_path / "docker-compose.yml"
+    swapped.write_text(text.replace("palpate_tissue", "palpate_fmu_host"), encoding="utf-8")
+    monkeypatch.setenv("PALPATE_COMPOSE", str(swapped))
+    finished = palpate_run("rlq_guarding", tmp_path / "out", "--no-record", "--seed", "3", settings=SETTINGS)
+    assert finished.status == 0, finished.output
+    assert "FMI 3.0" in (tmp_path / "out" / "logs" / "tissue.log").read_text(encoding="utf-8")
+    assert finished.report["run_hash"] == with_fmu.run_hash
 
 
 def _vector(message: Any) -> np.ndarray:

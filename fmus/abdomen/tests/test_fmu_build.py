@@ -87,5 +87,7 @@ def test_it_compiles_for_every_platform(version: int, tmp_path: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         found = [name for name in archive.namelist() if name.startswith("binaries/")]
         for name in found:
-            assert archive.read(name).startswith(magic[Path(name).suffix]), name
+            library = archive.read(name)
+            assert library.startswith(magic[Path(name).suffix]), name
+            assert f"fmi{version}DoStep".encode() in library, name
     assert len(found) == len(platforms(version)) == (3 if version == 2 else 6)
