@@ -188,7 +188,7 @@ def bench(
 
 @app.command()
 def router(
-    listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on; may be repeated.")] = None,
+    listen: Annotated[list[str] | None, typer.Argument(help="Endpoints to listen on, e.g. tcp/0.0.0.0:7447.")] = None,
 ) -> None:
     """Run a zenoh router for services in containers or on several machines, until a signal."""
     console = Console(stderr=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -9,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -75,8 +76,12 @@ class LocalProcesses:
         self._scenario_files = scenario_files
         self._extra = dict(extra)
         self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
-        self.bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
-        """How each role, and the conductor, joins the bus."""
+        router = os.environ.get("PALPATE_ROUTER") or None
+        bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
+        self.bus = {role: replace(options, router=router) for role, options in bus.items()}
+        """How each role, and the conductor, joins the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
+        endpoints = {role: options.listen[0] for role, options in bus.items()}
+        (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, subprocess.Popen[bytes]] = {}
 
