@@ -31,6 +31,9 @@ SMALLEST = 4.0e-4
 """Area of the smallest finding [m^2]: the footprint's own, about 16 mm in radius, halved."""
 CONFIDENCE = 0.95
 """Posterior probability that a finding must have."""
+EDGE_LEVEL = 0.4
+"""Level of the outline between background (0) and plateau (1): what blur the inversion leaves lowers the half contrast to it
+(calibrated on areas of simulated scans, see README)."""
 PRIOR_ODDS = 0.05
 """Odds that a given candidate is a lesion, before its data are weighed."""
 _LESION_MEAN, _LESION_SD = 1.1, 0.5
@@ -69,14 +72,14 @@ def candidates(excess: Array, grid: MapGrid, reached: Mask) -> list[Mask]:
 
 
 def outline(excess: Array, candidate: Mask, grid: MapGrid) -> Mask:
-    """The part of a candidate, and of its surroundings, above half contrast: halfway from the background to its plateau.
+    """The part of a candidate, and of its surroundings, above half the contrast of its plateau to the background.
 
     `excess`: log-ratio to the local background, shape (n,). The plateau is the mean of the stiffer half of the candidate.
     """
     ratio = np.exp(excess)
     inside = np.sort(ratio[candidate])
     plateau = float(inside[len(inside) // 2 :].mean())
-    level = 0.5 * (1.0 + plateau)
+    level = 1.0 + EDGE_LEVEL * (plateau - 1.0)
     labels, _ = label((ratio > level).reshape(grid.z.shape))
     peak = labels.ravel()[np.argmax(np.where(candidate, ratio, 0.0))]
     return np.asarray((labels.ravel() == peak) & (peak > 0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from bench_assessment_scans import FakeInbox, Scan, examine, scan
@@ -15,6 +17,7 @@ from palpate_models.load import exam_input
 from palpate_models.scenario import Exam, Lesion, Phantom, Scenario
 
 REGION = (0.11, 0.10)
+Examined = tuple[Any, Any, list[Any]]
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +27,14 @@ def small() -> Scan:
     return scan(Scenario(seed=4, phantom=Phantom(lesions=(lesion,)), exam=Exam(region_m=REGION)))
 
 
-def test_finds_the_lesion(small: Scan) -> None:
-    stiffness_map, findings, samples = examine(small)
+@pytest.fixture(scope="module")
+def examined(small: Scan) -> Examined:
+    """Its map, findings and samples."""
+    return examine(small)
+
+
+def test_finds_the_lesion(small: Scan, examined: Examined) -> None:
+    stiffness_map, findings, samples = examined
     s = score(centroids_of(findings), map_of(stiffness_map), small.truth)
     assert (s.matched, s.missed, s.false_positives) == (1, 0, 0)
     assert s.localisation_error_m is not None
@@ -37,8 +46,8 @@ def test_finds_the_lesion(small: Scan) -> None:
     assert len(samples) > 150
 
 
-def test_absolute_stiffness_is_the_tissues(small: Scan) -> None:
-    stiffness_map, _, _ = examine(small)
+def test_absolute_stiffness_is_the_tissues(small: Scan, examined: Examined) -> None:
+    stiffness_map, _, _ = examined
     found = map_of(stiffness_map)
     away = found.scanned & (np.linalg.norm(found.vertices[:, :2] - (-0.012, -0.01), axis=1) > 0.045)
     nearest = np.argmin(
@@ -50,8 +59,8 @@ def test_absolute_stiffness_is_the_tissues(small: Scan) -> None:
     assert np.median(ratio) == pytest.approx(1.0, abs=0.06)
 
 
-def test_messages_keep_the_contract(small: Scan) -> None:
-    stiffness_map, findings, samples = examine(small)
+def test_messages_keep_the_contract(examined: Examined) -> None:
+    stiffness_map, findings, samples = examined
     topics = contract().topics
     for name, message in (
         ("assessment/map", stiffness_map),
@@ -71,10 +80,9 @@ def test_messages_keep_the_contract(small: Scan) -> None:
     assert stiffness_map.stiffness.max() < high
 
 
-def test_the_same_states_give_the_same_bytes(small: Scan) -> None:
-    first, second = (examine(small) for _ in range(2))
+def test_the_same_states_give_the_same_bytes(small: Scan, examined: Examined) -> None:
     types = contract().topics
-    for a, b in zip(first[:2], second[:2], strict=True):
+    for a, b in zip(examined[:2], examine(small)[:2], strict=True):
         name = "assessment/map" if hasattr(a, "stiffness") else "assessment/findings"
         assert encode(a, types[name].type) == encode(b, types[name].type)
 
