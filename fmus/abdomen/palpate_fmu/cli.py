@@ -18,6 +18,7 @@ from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuError, FmuInstance, read_variables
 from palpate_fmu.phantom_file import ExportError
 from palpate_fmu.probing import plot_probing, probe, write_csv
+from palpate_fmu.running import run_and_plot
 
 EXIT_BAD_INPUT = 2
 MESHES = (".obj", ".stl", ".ply")
@@ -99,16 +100,18 @@ def simulate(
     speed: Annotated[float, typer.Option(min=0.001, max=0.2, help="How fast [m/s].")] = 0.02,
     hold: Annotated[float, typer.Option(min=0, max=60, help="How long it is held [s].")] = 1.0,
 ) -> None:
-    """Press into an abdomen, hold and withdraw; plot the force against the depth."""
+    """Press into an abdomen, hold and withdraw, and plot the force against the depth; run any other FMU and plot its outputs."""
     console = Console(stderr=True)
     try:
         with FmuInstance(file) as fmu:
-            missing = {"indenter_position", "indentation_depth", "normal_force"} - fmu.variables.keys()
-            if missing:
-                _fail(console, f"{file}: cannot be probed: it has no {', '.join(sorted(missing))}")
-            probing = probe(fmu, at, depth, speed, hold)
+            abdomen = {"indenter_position", "indentation_depth", "normal_force"} <= fmu.variables.keys()
+            probing = probe(fmu, at, depth, speed, hold) if abdomen else None
+        names = () if probing else run_and_plot(file, out)
     except FmuError as error:
         _fail(console, f"{error} (this machine is {native()})")
+    if probing is None:
+        console.print(f"{out}: {', '.join(names)}", highlight=False)
+        return
     write_csv(probing, out.with_suffix(".csv"))
     plot_probing(probing, out, f"{file.name} at ({1e3 * at[0]:.0f}, {1e3 * at[1]:.0f}) mm")
     console.print(f"{out}: greatest force {probing.force.max():.2f} N at {1e3 * probing.depth.max():.1f} mm", highlight=False)

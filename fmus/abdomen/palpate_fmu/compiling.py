@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -96,10 +97,11 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, incl
         if done.returncode or not out.is_file():
             raise CompileError(f"cannot compile for {target.tuple_3}:\n{done.stderr}")
         library = out.read_bytes()
-    cached.parent.mkdir(parents=True, exist_ok=True)
-    partial = cached.with_suffix(f".{os.getpid()}")
-    partial.write_bytes(library)
-    partial.replace(cached)
+    with contextlib.suppress(OSError):  # a home that cannot be written has no cache
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        partial = cached.with_suffix(f".{os.getpid()}")
+        partial.write_bytes(library)
+        partial.replace(cached)
     return library
 
 

@@ -203,3 +203,30 @@ def build_description() -> bytes:
         ET.SubElement(files, "SourceFile", name=name)
     ET.SubElement(configuration, "Library", name="m", external="true")
     return _text(root)
+
+
+def documentation(version: int, about: str, sizes: Sizes) -> bytes:
+    """documentation/index.html: what the variables are."""
+    html = ET.Element("html", lang="en")
+    ET.SubElement(ET.SubElement(html, "head"), "title").text = MODEL
+    body = ET.SubElement(html, "body")
+    ET.SubElement(body, "h1").text = "The soft abdomen"
+    ET.SubElement(body, "p").text = about
+    ET.SubElement(body, "p").text = (
+        "indenter_position is where the sphere is at the end of a step; it moves there on a straight line. contact_force is the "
+        "force on the sphere, mean over the step. Displacements are along the inward normals at rest. A refused call returns an "
+        "error with a message and leaves the instance as it was."
+    )
+    table = ET.SubElement(body, "table", border="1", cellpadding="4")
+    for row in (
+        ("variable", "size", "unit", "kind", "meaning"),
+        *(
+            (v.name, " x ".join(map(str, v.extents(sizes))), v.unit or "", _causality(v)["causality"], v.doc)
+            for v in variables(version)
+        ),
+    ):
+        line = ET.SubElement(table, "tr")
+        for cell in row:
+            ET.SubElement(line, "td").text = cell
+    ET.indent(html)
+    return b"<!DOCTYPE html>\n" + bytes(ET.tostring(html, encoding="utf-8", method="html")) + b"\n"

@@ -13,7 +13,7 @@ from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Phantom, Scenario
 
 from palpate_fmu.compiling import compile_library, fmi_headers, platforms
-from palpate_fmu.description import MODEL, SOURCES, build_description, description_2, description_3
+from palpate_fmu.description import MODEL, SOURCES, build_description, description_2, description_3, documentation
 from palpate_fmu.phantom_file import encode_phantom, sizes_of, start_values
 from palpate_fmu.variables import c_table
 
@@ -73,6 +73,7 @@ def build_fmu(
             (folder / "buildDescription.xml").write_bytes(build_description())
         files = {
             "modelDescription.xml": describe(token, about, starts, sizes),
+            "documentation/index.html": documentation(version, about, sizes),
             "resources/phantom.bin": encode_phantom(model, starts, token),
             **{f"sources/{path.name}": path.read_bytes() for path in sorted(folder.iterdir())},
         }
