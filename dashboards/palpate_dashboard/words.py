@@ -26,7 +26,7 @@ def status(
 ) -> str:  # fmt: skip
     """The state of the exam. `counts`: targets visited, in all, and skipped."""
     visited, total, skipped = counts
-    pace = "-" if real_time_factor is None else f"{real_time_factor:.1f} x real time"
+    pace = [] if real_time_factor is None else [f"| pace | {real_time_factor:.1f} x real time |"]
     depth = f"{depth_mm:.1f} mm" if depth_mm > -20 else "not in contact"
     return "\n".join((
         f"**{scenario}: {phase}.** {message}",
@@ -37,7 +37,7 @@ def status(
         f"| normal force | {force_n:.1f} N |",
         f"| contact | {', '.join(flags) or 'none'} |",
         f"| driver | {robot} |",
-        f"| pace | {pace} |",
+        *pace,
     ))  # fmt: skip
 
 
