@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
-from palpate_bus.messages import Clock
+from palpate_bus.messages import Clock, DiagnosticArray, DiagnosticStatus, KeyValue
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import nanoseconds, time_message
+from palpate_bus.stamps import NS, header, nanoseconds, time_message
+
+HEALTH_PERIOD = NS
+"""Simulated time between two messages on `diagnostics`."""
+
+
+class Health(NamedTuple):
+    """How a service is."""
+
+    level: int
+    """DiagnosticStatus.OK, WARN or ERROR."""
+    message: str
+    facts: Mapping[str, str]
 
 
 @dataclass
@@ -48,8 +60,11 @@ class Collector(Service):
 
     role = "conductor"
 
-    def __init__(self) -> None:
+    def __init__(self, health: Callable[[], Mapping[str, Health]] | None = None) -> None:
+        """`health` says how each service is, for `diagnostics`."""
         self.collected = Collected()
+        self.health = health
+        self._said = -HEALTH_PERIOD
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Takes everything new and publishes the clock."""
@@ -66,8 +81,17 @@ class Collector(Service):
         c.targets = inbox.latest("perception/targets")
         c.stiffness_map = inbox.latest("assessment/map")
         c.findings = inbox.latest("assessment/findings")
-        return {"clock": Clock(time_message(t))}
+        out: dict[str, Any] = {"clock": Clock(time_message(t))}
+        if self.health is not None and t - self._said >= HEALTH_PERIOD:
+            self._said = t
+            out["diagnostics"] = DiagnosticArray(header(t), [_status(role, health) for role, health in self.health().items()])
+        return out
 
     def finish(self) -> Mapping[str, Any]:
         """Nothing to close."""
         return {"exam_states": len(self.collected.exam_states), "samples": len(self.collected.samples)}
+
+
+def _status(role: str, health: Health) -> Any:
+    values = [KeyValue(key, value) for key, value in health.facts.items()]
+    return DiagnosticStatus(level=health.level, name=f"palpate/{role}", message=health.message, hardware_id="", values=values)

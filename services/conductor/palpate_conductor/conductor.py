@@ -19,11 +19,11 @@ from palpate_bus import codec
 from palpate_bus.contract import MS, Contract
 from palpate_bus.lockstep import NEVER, run_hash
 from palpate_bus.member import Member
-from palpate_bus.messages import RunControl, ServiceReport
+from palpate_bus.messages import DiagnosticStatus, RunControl, ServiceReport
 from palpate_bus.observer import ObservedService
 from palpate_bus.stamps import NS
 
-from palpate_conductor.collector import Collector
+from palpate_conductor.collector import Collector, Health
 from palpate_conductor.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
@@ -121,6 +121,7 @@ class Conductor:
         self._sequence = 0
         self.watchdog = Watchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = Outcome()
+        collector.health = self._health
         self.horizon = NEVER
         self.paused = False
         self._last = False
@@ -159,6 +160,23 @@ class Conductor:
                 self.watchdog.report(role, int(message.tick), message.waiting_for)
                 heard.append((role, message, json.loads(message.detail) if message.detail else {}))
         return heard
+
+    def _health(self) -> dict[str, Health]:
+        """How each service is, for `diagnostics`."""
+        now = monotonic()
+        health = {}
+        for role, progress in self.watchdog.progress.items():
+            silent = now - progress.reported
+            level, message = DiagnosticStatus.OK, "runs"
+            if role in self.outcome.lost:
+                level, message = DiagnosticStatus.ERROR, "lost"
+            elif silent > self._patience.soft:
+                level, message = DiagnosticStatus.WARN, f"silent for {silent:.0f} s"
+            elif progress.waiting_for:
+                message = f"waits for {progress.waiting_for}"
+            facts = {"tick_s": f"{progress.tick / NS:.3f}", "waiting_for": progress.waiting_for, "report_age_s": f"{silent:.2f}"}
+            health[role] = Health(level, message, facts)
+        return health
 
     # -- the run
 
