@@ -1,4 +1,4 @@
-"""What a step costs in process: native tissue, FMU through FMPy, FMU through ctypes; and how closely they agree."""
+"""What a step of the FMU costs in process: through FMPy, and through prepared ctypes calls."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def _by_fmpy(path: Path, position: Array, velocity: Array) -> tuple[float, float
 def measure(steps: int = 3000) -> dict[str, float]:
     """Cost of a step [us] on the default abdomen with a lesion, sliding at 10 mm depth: median and 99th percentile.
 
-    Each with setting the motion and reading the wrench: the native tissue (when installed), the FMU through FMPy's
-    interface and through prepared ctypes calls (what the bus service uses); and the surface's displacement read once.
+    Each with setting the motion and reading the wrench: through FMPy's interface and through prepared ctypes calls (what the
+    bus service uses); and the surface's displacement read once. The native tissue's cost is in its own benchmark.
     """
     phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01)),))
     model = build_phantom(phantom, seed=0)

@@ -335,6 +335,10 @@ static int parameters_agree(Component *c) {
         return 0;
     }
     assemble(c);
+    if (!isfinite(c->matrices->rate)) {
+        component_say(c, "the stiffness of this phantom is out of all bounds");
+        return 0;
+    }
     needed = matrices_substeps(c->matrices, PERIOD_S);
     if (needed > MOST_SUBSTEPS) {
         component_say(c,

@@ -166,6 +166,7 @@ static double largest_rate(Matrices *s, int32_t n) {
             v[i] = w[i] / beta;
         }
     }
+    if (!isfinite(norm) || !isfinite(gershgorin)) return HUGE_VAL;
     found = 1.01 * largest_eigenvalue(a, b, size, gershgorin);
     return found < gershgorin ? found : gershgorin;
 }
