@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PACKAGES := bus models $(patsubst %/pyproject.toml,%,$(wildcard services/*/pyproject.toml)) dashboards
-MYPY_TARGETS := $(wildcard bus/palpate_* models/palpate_* services/*/palpate_* dashboards/palpate_*)
+PACKAGES := bus models fmus/abdomen $(patsubst %/pyproject.toml,%,$(wildcard services/*/pyproject.toml)) dashboards
+MYPY_TARGETS := $(wildcard bus/palpate_* models/palpate_* fmus/abdomen/palpate_* services/*/palpate_* dashboards/palpate_*)
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export PYTHONHASHSEED := 0

@@ -79,7 +79,7 @@ class LocalProcesses:
         router = os.environ.get("PALPATE_ROUTER") or None
         bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
         self.bus = {role: replace(options, router=router) for role, options in bus.items()}
-        """How each role, and the conductor, joins the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
+        """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
         endpoints = {role: options.listen[0] for role, options in bus.items()}
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
         self._logs: list[IO[bytes]] = []
