@@ -19,21 +19,17 @@ from scipy.interpolate import PchipInterpolator
 
 from palpate_models.frames import Array
 from palpate_models.lbr import POSITION_LIMIT, TORQUE_LIMIT
-from palpate_models.placement_symbolic import arm, base_of, casadi, surface_frames
+from palpate_models.placement_batch import PROJECTION_STEPS, Batch, Mask
+from palpate_models.placement_symbolic import arm, casadi
 from palpate_models.scenario import Robot
-
-Mask = NDArray[np.bool_]
 
 KNOTS = 32
 """Targets at most that the optimisation moves; postures between them are interpolated and put back on their targets."""
 SMOOTHNESS = 2.0
 """Weight of squared joint travel [1/rad^2] between knots of mean spacing [A]."""
-TASK_TOLERANCE = 1e-5
-"""Residual of a target that counts as reached [m, rad]."""
 PRESSING_FORCE_N = 15.0
 """Normal force that postures are judged at: the working force limit."""
-_IK_STEPS, _PROJECTION_STEPS, _IPOPT_STEPS, _SAMPLES = 40, 12, 80, 16
-_LARGEST_STEP_RAD = 0.15
+_IPOPT_STEPS, _SAMPLES = 80, 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,78 +50,6 @@ class PostureSequence:
     """What is missing to the target: norm over position [m] and axis [rad], shape (n,)."""
     refined: bool
     """Whether the optimisation converged; else these are inverse kinematics with a null-space gradient."""
-
-
-class _Batch:
-    """Targets with their casadi maps: everything for all postures at once. Postures are rows."""
-
-    def __init__(self, robot: Robot, positions: Array, normals: Array, limit: Array, force: float) -> None:
-        n = len(positions)
-        self.robot, self.count, self.limit, self.force = robot, n, limit, force
-        self.base = base_of(robot)
-        self.positions = positions
-        self.frames = surface_frames(normals)
-        self.functions = arm(robot)
-        self._task, self._cost = self.functions.task.map(n), self.functions.cost.map(n)
-        self._base = np.tile(self.base[:, None], (1, n))
-        self._frames = np.hstack(list(self.frames))
-
-    def task(self, q: Array) -> tuple[Array, Array]:
-        """Residuals (n, 5) and their Jacobians (n, 5, 7)."""
-        residual, jacobian = self._task(q.T, self._base, self.positions.T, self._frames)
-        return np.array(residual).T, np.array(jacobian).reshape(5, self.count, 7).transpose(1, 0, 2)
-
-    def gradient(self, q: Array) -> Array:
-        """Gradients of the postures' costs, shape (n, 7)."""
-        return np.array(self._cost(q.T, self._base, self.force)[1]).T
-
-    def facing(self, q: Array) -> Array:
-        """Cosine between tool axis and inward normal, shape (n,)."""
-        cosine: Array = np.array(self.functions.facing.map(self.count)(q.T, self._base, self._frames))[0]
-        return cosine
-
-    def solve(self, q: Array, steps: int, descent: float) -> Array:
-        """Damped Gauss-Newton onto the targets; `descent` scales the cost's gradient in the null space. (n, 7)."""
-        damping = 1e-6 * np.eye(5)
-        for step in range(steps):
-            residual, J = self.task(q)
-            gram = J @ J.transpose(0, 2, 1) + damping
-            rhs = residual[..., None]
-            if descent:
-                push = -descent * self.gradient(q) * (1 - step / steps)
-                rhs = rhs + J @ push[..., None]
-            move = -(J.transpose(0, 2, 1) @ np.linalg.solve(gram, rhs))[..., 0]
-            if descent:
-                move += push
-            largest = np.abs(move).max(axis=1, keepdims=True)
-            q = q + move * np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(largest, 1e-12))
-            q = np.clip(q, -self.limit, self.limit)
-        return q
-
-    def part(self, indices: NDArray[np.intp]) -> _Batch:
-        """Some of the targets."""
-        return _Batch(self.robot, self.positions[indices], self.frames[indices, :, 2], self.limit, self.force)
-
-    def search(self, q: Array) -> Array:
-        """Inverse kinematics from postures `q`, cheaper ones preferred, shape (n, 7)."""
-        return self.solve(self.solve(q, _IK_STEPS, 0.05), _PROJECTION_STEPS, 0.0)
-
-    def from_one(self, start: Array) -> Array:
-        """Inverse kinematics of all targets from one posture, shape (n, 7)."""
-        return self.search(np.tile(np.clip(start, -self.limit, self.limit), (self.count, 1)))
-
-    def verdict(self, q: Array) -> tuple[int, float]:
-        """How bad postures are: targets missed, then the mean cost of the others, in steps that rounding does not turn."""
-        reached = self.reached(q)[1]
-        cost = np.array(self._cost(q.T, self._base, self.force)[0])[0]
-        return int((~reached).sum()), round(float(cost[reached].mean()), 3) if reached.any() else 0.0
-
-    def reached(self, q: Array) -> tuple[Array, Mask]:
-        """Norm of the residual (n,) and whether the target is reached, facing the right way (n,)."""
-        residual = np.linalg.norm(self.task(q)[0], axis=1)
-        facing = self.facing(q)
-        wrong = facing <= 0
-        return np.where(wrong, np.maximum(residual, 1 - facing), residual), (residual < TASK_TOLERANCE) & ~wrong
 
 
 def plan_redundancy(
@@ -165,7 +89,7 @@ def plan_redundancy(
         return PostureSequence(np.zeros((0, 7)), np.zeros(0, dtype=bool), empty, empty, empty, empty, True)
 
     limit = np.asarray(POSITION_LIMIT) - joint_margin_rad
-    batch = _Batch(robot, positions, normals, limit, force_n)
+    batch = Batch(robot, positions, normals, limit, force_n)
     q = _inverse_kinematics(batch, seed)
     refined = False
     reachable = batch.reached(q)[1]
@@ -176,7 +100,7 @@ def plan_redundancy(
     return _judge(batch, q, refined)
 
 
-def _seeds(batch: _Batch, seed: Array) -> list[Array]:
+def _seeds(batch: Batch, seed: Array) -> list[Array]:
     """Postures to start inverse kinematics from: the caller's, and elbow-up ones that face the targets' centre."""
     x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
     azimuth = np.arctan2(y, x) - batch.base[3]
@@ -185,7 +109,7 @@ def _seeds(batch: _Batch, seed: Array) -> list[Array]:
     return [seed, *fan]
 
 
-def _inverse_kinematics(batch: _Batch, seed: Array) -> Array:
+def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
     """A posture for each target, shape (n, 7), from the best seed, then from the nearest neighbour that was reached."""
     sample = batch.part(np.unique(np.linspace(0, batch.count - 1, min(_SAMPLES, batch.count)).round().astype(int)))
     best = min(_seeds(batch, seed), key=lambda start: sample.verdict(sample.from_one(start)))
@@ -206,7 +130,7 @@ def _path_length(positions: Array) -> Array:
     return np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-6))))
 
 
-def _knots(batch: _Batch, reachable: Mask) -> NDArray[np.intp]:
+def _knots(batch: Batch, reachable: Mask) -> NDArray[np.intp]:
     """Indices of the reachable targets that the optimisation moves: evenly along the path, ends included."""
     candidates = np.flatnonzero(reachable)
     s = _path_length(batch.positions)[candidates]
@@ -241,7 +165,7 @@ def _program(robot: Robot, count: int, force: float) -> Any:
     return ca.nlpsol("redundancy", "ipopt", problem, options)
 
 
-def _refine(robot: Robot, batch: _Batch, q: Array, reachable: Mask) -> tuple[Array, bool]:
+def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Array, bool]:
     """Optimal postures at the knots, interpolated, put back on the targets; and whether Ipopt converged."""
     knots = _knots(batch, reachable)
     if len(knots) < 2:
@@ -265,16 +189,16 @@ def _refine(robot: Robot, batch: _Batch, q: Array, reachable: Mask) -> tuple[Arr
     optimal = np.array(result["x"]).reshape(len(knots), 7)
     within = np.clip(s, s[knots[0]], s[knots[-1]])
     between = PchipInterpolator(s[knots], optimal)(within)
-    return batch.solve(between, _PROJECTION_STEPS, 0.0), True
+    return batch.solve(between, PROJECTION_STEPS, 0.0), True
 
 
-def _keep_best(batch: _Batch, before: Array, after: Array) -> Array:
+def _keep_best(batch: Batch, before: Array, after: Array) -> Array:
     """The refined postures, but for targets that only inverse kinematics reached."""
     lost = batch.reached(before)[1] & ~batch.reached(after)[1]
     return np.where(lost[:, None], before, after)
 
 
-def _judge(batch: _Batch, q: Array, refined: bool) -> PostureSequence:
+def _judge(batch: Batch, q: Array, refined: bool) -> PostureSequence:
     residual, reachable = batch.reached(q)
     bases = np.tile(batch.base[:, None], (1, batch.count))
     torque = np.array(batch.functions.torque.map(batch.count)(q.T, bases, batch.force)).T

@@ -13,7 +13,8 @@ import numpy as np
 from palpate_models.frames import Array, apply, matrix
 from palpate_models.lbr import HOME, POSITION_LIMIT
 from palpate_models.phantom.model import build_phantom
-from palpate_models.placement import PRESSING_FORCE_N, Mask, PostureSequence, plan_redundancy
+from palpate_models.placement import PRESSING_FORCE_N, PostureSequence, plan_redundancy
+from palpate_models.placement_batch import Mask
 from palpate_models.placement_symbolic import arm, base_of, casadi, surface_frames
 from palpate_models.scenario import Exam, Robot, Scenario
 from palpate_models.table import BASE_SIDE_M, TABLE_X_M

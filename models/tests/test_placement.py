@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from palpate_models.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
-from palpate_models.placement import TASK_TOLERANCE, PostureSequence, plan_redundancy
+from palpate_models.placement import PostureSequence, plan_redundancy
+from palpate_models.placement_batch import TASK_TOLERANCE
 from palpate_models.placement_symbolic import arm, base_of, surface_frames
 from palpate_models.scenario import Robot, Scenario
 
