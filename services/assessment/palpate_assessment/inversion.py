@@ -176,7 +176,7 @@ def invert(observations: Observations, prior: Field, mean: float, start: Array |
         step = mean + weights @ spread - z
         size = float(np.abs(step).max())
         z = z + step * min(1.0, 1.5 / max(size, 1e-9))
-        if size < 0.01 and last:
+        if size < 0.02 and last:
             break
     half = solve_triangular(factor[0], spread, lower=True)
     variance = np.maximum(prior.variance - np.einsum("ij,ij->j", half, half), 1e-8)

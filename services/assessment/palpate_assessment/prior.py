@@ -18,6 +18,10 @@ from palpate_assessment.grid import MapGrid
 Array = NDArray[np.float64]
 
 
+_NEGLIGIBLE = 1e-7
+"""Modes of a component below this part of its greatest are left out: they hold less than 1e-5 of its variance."""
+
+
 @dataclass(frozen=True)
 class Component:
     """One squared-exponential part of a field."""
@@ -49,7 +53,7 @@ class Field:
         """`envelope`: factor on the standard deviation at each node, shape (ny * nx,)."""
         scale = np.ones(grid.z.size) if envelope is None else envelope
         self._shape = grid.z.shape
-        self._parts = [(scale, c.sd**2 * _gram(grid.y, c.length), _gram(grid.x, c.length)) for c in components]
+        self._parts = [(scale, c.sd, _modes(grid.y, c.length), _modes(grid.x, c.length)) for c in components]
         self.variance: Array = sum(c.sd**2 for c in components) * scale**2
 
     def __add__(self, other: Field) -> Field:
@@ -62,11 +66,14 @@ class Field:
     def times(self, rows: Array) -> Array:
         """Rows [m, n] times the covariance: rows @ K, shape (m, n)."""
         total = np.zeros_like(rows)
-        for scale, along_y, along_x in self._parts:
-            grid_rows = (rows * scale).reshape(-1, *self._shape)
-            total += (along_y @ (grid_rows @ along_x)).reshape(rows.shape) * scale
+        for scale, sd, along_y, along_x in self._parts:
+            within = sd * (along_y.T @ ((rows * scale).reshape(-1, *self._shape) @ along_x))
+            total += (sd * along_y @ (within @ along_x.T)).reshape(rows.shape) * scale
         return total
 
 
-def _gram(x: Array, length: float) -> Array:
-    return np.asarray(np.exp(-0.5 * ((x[:, None] - x) / length) ** 2))
+def _modes(x: Array, length: float) -> Array:
+    """Factor B of the squared exponential on an axis, B B' = exp(-r^2 / (2 length^2)), shape (n, modes): the modes that count."""
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * ((x[:, None] - x) / length) ** 2))
+    keep = values > _NEGLIGIBLE * values[-1]
+    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
