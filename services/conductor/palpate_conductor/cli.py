@@ -206,6 +206,6 @@ def main() -> None:
         except ImportError as error:
             print(f"palpate: the command {point.name} of {point.value} cannot be loaded: {error}", file=sys.stderr)
     try:
-        app()
+        app(prog_name="palpate")
     except BrokenPipeError:
         sys.exit(1)

@@ -17,6 +17,8 @@ from typing import IO, Any
 import yaml
 from palpate_bus.zenoh_config import mesh
 
+from palpate_conductor.__main__ import FIXED
+
 COMPOSE = "docker-compose.yml"
 BARRIER = ("robot", "control", "tissue")
 """The roles of the 1 kHz loop: they talk over zenoh's low-latency transport (see palpate_bus.zenoh_config)."""
@@ -90,9 +92,7 @@ class LocalProcesses:
         environment = {
             **os.environ,
             **{k: v for k, v in process.environment.items() if not k.startswith("PALPATE_ROUTER")},
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-            "PYTHONHASHSEED": "0",
+            **FIXED,
             "PALPATE_SCENARIO": str(self._scenario_files[process.role]),
             "PALPATE_OUT": str(self._out),
             **self.bus[process.role].to_env(),
