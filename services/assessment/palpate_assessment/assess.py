@@ -70,9 +70,10 @@ def assess(
     observations = observe(good, grid, contact, noise or Noise())
     healthy = Field(grid, HEALTHY)
     mean = float(np.log(contact.material.k_w_n_per_m3))
-    posterior = invert(observations, healthy + Field(grid, LESION), mean)
-    background = surroundings(posterior.mean, observations, grid, healthy, mean, scanned)
+    posterior = invert(observations, healthy + Field(grid, LESION), mean, iterations=6 if refine else 3)
     found: list[StiffArea] = []
+    if refine:
+        background = surroundings(posterior.mean, observations, grid, healthy, mean, scanned)
     for round_ in range(2 if refine else 0):
         envelope = lesion_envelope(posterior.mean - background, grid, scanned)
         lesion = Field(grid, LESION, envelope)

@@ -18,8 +18,8 @@ from palpate_assessment.grid import MapGrid
 Array = NDArray[np.float64]
 
 
-_NEGLIGIBLE = 1e-7
-"""Modes of a component below this part of its greatest are left out: they hold less than 1e-5 of its variance."""
+_NEGLIGIBLE = 1e-5
+"""Modes of a component below this part of its greatest are left out: they hold less than 1e-3 of its variance."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,11 @@ class Field:
 
     def __init__(self, grid: MapGrid, components: tuple[Component, ...], envelope: Array | None = None) -> None:
         """`envelope`: factor on the standard deviation at each node, shape (ny * nx,)."""
-        scale = np.ones(grid.z.size) if envelope is None else envelope
         self._shape = grid.z.shape
-        self._parts = [(scale, c.sd, _modes(grid.y, c.length), _modes(grid.x, c.length)) for c in components]
-        self.variance: Array = sum(c.sd**2 for c in components) * scale**2
+        axes = [(c.sd, _modes(grid.y, c.length), _modes(grid.x, c.length)) for c in components]
+        self._parts: list[tuple[Array | None, list[tuple[float, Array, Array]]]] = [(envelope, axes)]
+        squared = np.ones(grid.z.size) if envelope is None else envelope**2
+        self.variance: Array = sum(c.sd**2 for c in components) * squared
 
     def __add__(self, other: Field) -> Field:
         """The sum of two independent fields on the same grid."""
@@ -65,15 +66,21 @@ class Field:
 
     def times(self, rows: Array) -> Array:
         """Rows [m, n] times the covariance: rows @ K, shape (m, n)."""
-        total = np.zeros_like(rows)
-        for scale, sd, along_y, along_x in self._parts:
-            within = sd * (along_y.T @ ((rows * scale).reshape(-1, *self._shape) @ along_x))
-            total += (sd * along_y @ (within @ along_x.T)).reshape(rows.shape) * scale
-        return total
+        total = np.zeros((len(rows), *self._shape))
+        for envelope, components in self._parts:
+            scaled = (rows if envelope is None else rows * envelope).reshape(total.shape)
+            product = total if envelope is None else np.zeros_like(total)
+            for sd, along_y, along_x in components:
+                within = sd**2 * (along_y.T @ (scaled @ along_x))
+                product += along_y @ (within @ along_x.T)
+            if envelope is not None:
+                product *= envelope.reshape(self._shape)
+                total += product
+        return total.reshape(len(rows), -1)
 
 
 def _modes(x: Array, length: float) -> Array:
     """Factor B of the squared exponential on an axis, B B' = exp(-r^2 / (2 length^2)), shape (n, modes): the modes that count."""
     values, vectors = np.linalg.eigh(np.exp(-0.5 * ((x[:, None] - x) / length) ** 2))
     keep = values > _NEGLIGIBLE * values[-1]
-    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
+    return np.ascontiguousarray(vectors[:, keep] * np.sqrt(values[keep]))

@@ -23,7 +23,7 @@ from palpate_models.frames import apply, matrix
 from palpate_models.load import exam_input
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.field import gaussian_field
-from palpate_models.scenario import Lesion, Phantom, Scenario
+from palpate_models.scenario import Lesion, Mode, Phantom, Scenario
 from palpate_tissue.tissue import Tissue
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.ndimage import gaussian_filter1d
@@ -82,6 +82,17 @@ def snake(region: tuple[float, float], spacing: float, speed: float, dt: float) 
         t += n * dt + 0.6
 
 
+def points(region: tuple[float, float], spacing: float, dt: float) -> Iterator[tuple[Array, Array]]:
+    """Strokes of a point-wise examination of a region about the umbilicus: 0.8 s at each point."""
+    width, height = region
+    xs, ys = (np.linspace(-0.5 * a, 0.5 * a, round(a / spacing) + 1) for a in (width, height))
+    t, n = 0.0, round(0.8 / dt)
+    for i, y in enumerate(ys):
+        for x in xs if i % 2 == 0 else xs[::-1]:
+            yield t + dt * np.arange(n), np.tile((float(x), float(y)), (n, 1))
+            t += n * dt + 0.6
+
+
 def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | None = None) -> Scan:
     """Slides the indenter over a scenario's phantom at the examination's depth; `errors` scales all that is wrong."""
     exam, robot = scenario.exam, scenario.robot
@@ -113,7 +124,13 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
     )
     states: list[Any] = []
     zero = np.zeros(3)
-    for times, path in snake(region or exam.region_m, exam.spacing_m, exam.speed_mps, tissue.dt):
+    extent = region or exam.region_m
+    strokes = (
+        points(extent, exam.spacing_m, tissue.dt)
+        if exam.mode is Mode.POINT
+        else snake(extent, exam.spacing_m, exam.speed_mps, tissue.dt)
+    )
+    for times, path in strokes:
         p, n = shape(path)
         off = wrong(p)
         drift = gaussian_filter1d(rng.standard_normal(len(times)), CONTROL_S / np.sqrt(2) / tissue.dt)

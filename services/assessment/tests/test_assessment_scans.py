@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from bench_assessment_scans import random_lesion, scan, scenario_with, scored
-from palpate_models.scenario import Lesion
+from palpate_models.scenario import Exam, Lesion, Mode, Phantom, Scenario
 
 RLQ = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.035, 0.030), contrast=4.0)
 SMALL_RLQ = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.030, 0.030), contrast=4.0)
@@ -47,3 +47,15 @@ def test_a_lesion_anywhere_is_found(seed: int) -> None:
     assert s.dice > 0.7
     assert s.localisation_error_m is not None
     assert s.localisation_error_m < 0.010
+
+
+@pytest.mark.slow
+def test_point_by_point_says_the_same() -> None:
+    lesion = Lesion(centre_m=(-0.012, -0.01), radii_m=(0.024, 0.020), contrast=4.0)
+    exam = Exam(mode=Mode.POINT, region_m=(0.11, 0.10), spacing_m=0.010)
+    s = scored(scan(Scenario(seed=4, phantom=Phantom(lesions=(lesion,)), exam=exam)))
+    assert (s.matched, s.missed, s.false_positives) == (1, 0, 0)
+    assert s.dice is not None
+    assert s.dice > 0.8
+    assert s.localisation_error_m is not None
+    assert s.localisation_error_m < 0.005

@@ -230,7 +230,7 @@ def print_findings(console: Console, report: Report) -> None:
                 f"{f.area_m2 * 1e4:.1f} cm²",
                 f"{f.stiffness_ratio:.1f} x",
                 f"{f.stiffness_ratio_90[0]:.1f} to {f.stiffness_ratio_90[1]:.1f}",
-                f"{100 * f.confidence:.1f} %",
+                "over 99 %" if f.confidence > 0.99 else f"{100 * f.confidence:.0f} %",
             )
         console.print(table)
     elif report.scores is not None:
