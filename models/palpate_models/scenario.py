@@ -215,6 +215,21 @@ class Limits(_Section):
         return self
 
 
+class TissueChoice(_Section):
+    """Which tissue plays the role."""
+
+    implementation: str = "default"
+    """`default`, or the name of another that an installed package registers (`fmu`)."""
+    fmu: str | None = None
+    """Co-simulation FMU for `implementation: fmu`; built from the phantom when empty."""
+
+    @model_validator(mode="after")
+    def _fmu(self) -> TissueChoice:
+        if self.fmu is not None and self.implementation != "fmu":
+            raise ValueError("tissue.fmu needs tissue.implementation: fmu")
+        return self
+
+
 class Scenario(_Section):
     """All of a run. `for_role` gives the part that a role may know."""
 
@@ -226,6 +241,7 @@ class Scenario(_Section):
     robot: Robot = Robot()
     camera: Camera = Camera()
     limits: Limits = Limits()
+    tissue: TissueChoice = TissueChoice()
 
 
 class ExamInput(_Section):

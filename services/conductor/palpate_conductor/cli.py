@@ -19,6 +19,7 @@ from rich.table import Table
 
 from palpate_conductor.bench import bench as run_bench
 from palpate_conductor.conductor import RunFailed
+from palpate_conductor.implementations import chosen_services
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
 from palpate_conductor.report import print_findings, write_results
@@ -77,6 +78,7 @@ def run(
     console = Console(stderr=True)
     try:
         chosen = load_scenario(scenario, settings or (), seed)
+        chosen_services(chosen)
     except ScenarioError as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     if composed and (realtime or wallclock):

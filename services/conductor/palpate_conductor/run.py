@@ -22,6 +22,7 @@ from palpate_models.scenario import Scenario
 
 from palpate_conductor.collector import Collected, Collector
 from palpate_conductor.conductor import Conductor, Patience, RunFailed
+from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
 
 WORKERS = ("robot", "tissue", "control", "planning", "assessment", "camera", "perception")
@@ -91,10 +92,11 @@ def run_distributed(
     begin = perf_counter()
     roles = (*WORKERS, *observers)
     files = write_scenario_files(scenario, out)
-    processes = read_processes(compose_file(), roles)
+    processes = chosen_processes(scenario, read_processes(compose_file(), roles))
     extra = {
         "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         "PALPATE_RECORD": str(int("recorder" in observers)),
+        **chosen_environment(scenario),
     }
     local = LocalProcesses(roles, out, files, extra)
     try:
@@ -171,6 +173,7 @@ def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
     Raises RunFailed naming a role that no installed package provides.
     """
     found = {point.name: point for point in entry_points(group="palpate.services")}
+    found.update(chosen_services(scenario))
     exam = redacted(scenario)
     services = []
     for role in roles:
@@ -186,6 +189,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     begin = perf_counter()
     write_scenario_files(scenario, out)
     os.environ["PALPATE_OUT"] = str(out)
+    os.environ.update(chosen_environment(scenario))
     collector = Collector()
     observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]

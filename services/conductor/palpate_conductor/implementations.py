@@ -1,0 +1,54 @@
+"""Other implementations of a role, chosen by `--set <role>.implementation=NAME`.
+
+A package registers one as an entry point `<role>.<name>` in the group `palpate.implementations`; its value is the factory of the
+service, and `python -m <its package>` is its process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib.metadata import EntryPoint, entry_points
+
+from palpate_models.load import ScenarioError
+from palpate_models.scenario import Scenario
+
+from palpate_conductor.processes import ServiceProcess
+
+DEFAULT = "default"
+
+
+def _choices(scenario: Scenario) -> dict[str, str]:
+    return {"tissue": scenario.tissue.implementation}
+
+
+def chosen_services(scenario: Scenario) -> dict[str, EntryPoint]:
+    """The factories of the roles for which the scenario does not take the default.
+
+    Raises ScenarioError that names the field, its value and what is allowed.
+    """
+    found = {point.name: point for point in entry_points(group="palpate.implementations")}
+    chosen = {}
+    for role, name in _choices(scenario).items():
+        if name == DEFAULT:
+            continue
+        point = found.get(f"{role}.{name}")
+        if point is None:
+            known = sorted(key.partition(".")[2] for key in found if key.startswith(f"{role}."))
+            raise ScenarioError(f"{scenario.name}: {role}.implementation = {name!r}: allowed are {', '.join([DEFAULT, *known])}")
+        chosen[role] = point
+    return chosen
+
+
+def chosen_processes(scenario: Scenario, processes: Mapping[str, ServiceProcess]) -> dict[str, ServiceProcess]:
+    """The process list with the scenario's choices in place of the compose file's commands."""
+    chosen = dict(processes)
+    for role, point in chosen_services(scenario).items():
+        package = point.module.partition(".")[0]
+        chosen[role] = replace(chosen[role], command=("python", "-m", package))
+    return chosen
+
+
+def chosen_environment(scenario: Scenario) -> dict[str, str]:
+    """What the chosen implementations read from the environment."""
+    return {"PALPATE_FMU": scenario.tissue.fmu} if scenario.tissue.fmu is not None else {}
