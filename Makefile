@@ -8,7 +8,7 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export PYTHONHASHSEED := 0
 
-.PHONY: run test test-slow test-all lint format bench docs install clean
+.PHONY: run test test-slow test-docker test-all lint format bench docs install clean
 
 run: install  ## the default examination, as processes on this machine
 	$(BIN)/palpate run $(ARGS)
@@ -18,6 +18,9 @@ test: install  ## everything but the slow, Docker and browser tests
 
 test-slow: install  ## long cases: seeds, scenarios, faults
 	$(BIN)/python -m pytest -q -m "slow"
+
+test-docker: install  ## builds the images and runs a short examination on a Docker engine
+	$(BIN)/python -m pytest -q -m "docker"
 
 bench: install  ## figures with ratios, as a table and as bench.json
 	$(BIN)/palpate bench

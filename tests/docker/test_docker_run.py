@@ -1,0 +1,168 @@
+"""`docker compose up` on a real engine: the images are built, the examination runs, and it found what a local run finds."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import pytest
+from examination import SHORT, Finished, palpate_run
+
+ROOT = Path(__file__).parents[2]
+PROJECT = "palpate-test"
+USER = str(os.getuid() or 1000)
+SHARED_MEMORY = ("-f", "docker-compose.yml", "-f", "compose.ipc.yml")
+LINK = """
+from palpate_bus.zenoh_config import session
+with session() as opened:
+    while not opened.info.transports():
+        pass
+    print("shared memory:", all(transport.is_shm for transport in opened.info.transports()))
+"""
+"""Whether a container's link to the router can carry messages through shared memory."""
+
+
+def missing() -> str | None:
+    """Why nothing here can run; None when it can."""
+    for words in (["docker", "info"], ["docker", "compose", "version"]):
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+        except OSError as error:
+            return f"`{' '.join(words)}`: {error}"
+        if done.returncode:
+            return f"`{' '.join(words)}`: {done.stderr.strip() or done.stdout.strip()}"
+    return None
+
+
+@pytest.fixture(scope="module", autouse=True)
+def engine() -> Iterator[None]:
+    if why := missing():
+        pytest.skip(f"needs a Docker engine with compose: {why}")
+    yield
+    compose("down", "--timeout", "2")
+
+
+def compose(*words: str, results: Path | None = None, settings: tuple[str, ...] = SHORT, timeout: float = 1500) -> Finished:
+    """Runs `docker compose` on the repository's files; the folder is the run's."""
+    environment = {
+        **os.environ,
+        "PALPATE_RESULTS": str(results or ROOT / "out"),
+        "PALPATE_SETTINGS": " ".join(setting.replace(", ", ",") for setting in settings),
+        "PALPATE_UID": USER,
+        "PALPATE_GID": USER,
+    }
+    command = ["docker", "compose", "--ansi", "never", "-p", PROJECT, *words]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout, check=False)
+    return Finished(done.returncode, done.stdout + done.stderr, results or ROOT)
+
+
+@pytest.fixture(scope="module")
+def images(engine: None) -> None:
+    built = compose("build")
+    assert built.status == 0, built.output
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    finished = palpate_run("rlq_guarding", tmp_path_factory.mktemp("local"), "--composed", "--no-record", settings=SHORT)
+    assert finished.status == 0, finished.output
+    return finished
+
+
+@pytest.fixture(scope="module")
+def attached(images: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
+    folder = tmp_path_factory.mktemp("attached")
+    finished = compose("up", "--exit-code-from", "conductor", results=folder)
+    yield finished
+    compose("down", "--timeout", "2", results=folder)
+
+
+def same_platform(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    """Whether two reports promise equal hashes: the same C library, processor and versions of what both have installed."""
+    one, other = a["platform"], b["platform"]
+    common = one["packages"].keys() & other["packages"].keys()
+    return all(one[key] == other[key] for key in ("libc", "cpu")) and all(
+        one["packages"][name] == other["packages"][name] for name in common
+    )
+
+
+def assert_same_findings(run: dict[str, Any], local: dict[str, Any]) -> None:
+    if same_platform(run, local):
+        differing = [topic for topic, digest in local["digests"].items() if run["digests"].get(topic) != digest]
+        assert not differing
+        assert run["run_hash"] == local["run_hash"]
+        assert run["findings"] == local["findings"]
+        return
+    assert len(run["findings"]) == len(local["findings"])
+    for found, expected in zip(run["findings"], local["findings"], strict=True):
+        assert found["quadrant"] == expected["quadrant"]
+        assert found["centroid_m"] == pytest.approx(expected["centroid_m"], abs=2e-3)
+        assert found["stiffness_ratio"] == pytest.approx(expected["stiffness_ratio"], rel=0.1)
+
+
+@pytest.mark.docker
+@pytest.mark.timeout(3000)
+def test_up_ends_with_the_runs_status_and_finds_what_a_local_run_finds(attached: Finished, local: Finished) -> None:
+    assert attached.status == 0, attached.output
+    assert "localhost:9877" in attached.output
+    assert_same_findings(attached.report, local.report)
+
+
+@pytest.mark.docker
+@pytest.mark.timeout(3000)
+def test_the_mounted_folder_holds_the_results(attached: Finished) -> None:
+    for name in ("report.json", "map.png", "samples.csv", "recording.rrd", "recording_mcap/recording_mcap_0.mcap"):
+        file = attached.folder / name
+        assert file.stat().st_size > 100, name
+        assert str(file.stat().st_uid) == USER, name
+
+
+@pytest.mark.docker
+@pytest.mark.timeout(3000)
+def test_detached_with_shared_memory_it_finds_the_same_and_the_dashboard_stays(
+    images: None, local: Finished, tmp_path: Path
+) -> None:
+    started = compose(*SHARED_MEMORY, "up", "--detach", results=tmp_path)
+    assert started.status == 0, started.output
+    try:
+        done = compose(*SHARED_MEMORY, "wait", "conductor", results=tmp_path)
+        assert done.status == 0, compose("logs", "conductor", results=tmp_path).output
+        assert_same_findings(Finished(0, "", tmp_path).report, local.report)
+        assert b"<html" in page("http://127.0.0.1:9877/").lower()
+        asked = compose(*SHARED_MEMORY, "run", "--rm", "--no-deps", "-T", "assessment", "python", "-c", LINK, results=tmp_path)
+        assert "shared memory: True" in asked.output
+        without = compose("run", "--rm", "--no-deps", "-T", "assessment", "python", "-c", LINK, results=tmp_path)
+        assert "shared memory: False" in without.output
+    finally:
+        compose(*SHARED_MEMORY, "down", "--timeout", "2", results=tmp_path)
+
+
+def page(address: str, patience_s: float = 60.0) -> bytes:
+    """What a browser gets there, once it is served."""
+    end = monotonic() + patience_s
+    while True:
+        try:
+            with urllib.request.urlopen(address, timeout=5) as answer:
+                body: bytes = answer.read()
+                return body
+        except OSError:
+            if monotonic() > end:
+                raise
+            sleep(0.5)
+
+
+@pytest.mark.docker
+@pytest.mark.timeout(3000)
+def test_a_bad_setting_ends_it_before_any_service_starts(images: None, tmp_path: Path) -> None:
+    finished = compose("up", "--exit-code-from", "conductor", results=tmp_path, settings=("exam.depth_m=0.5",))
+    assert finished.status != 0
+    assert "prepare" in finished.output
+    logs = compose("logs", "prepare", results=tmp_path).output
+    assert "exam.depth_m" in logs
+    assert "0.5" in logs
+    compose("down", "--timeout", "2", results=tmp_path)
