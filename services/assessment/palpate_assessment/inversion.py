@@ -45,7 +45,7 @@ class Noise:
     """[m]"""
     depth_common: float = 0.0001
     """Error of the perceived surface that is common to all samples [m]. A scan cannot tell it from a stiffer patient."""
-    model_common: float = 0.02
+    model_common: float = 0.015
     """Relative error of the contact model that is common to all samples [1]: the wall's discretisation and constants."""
     model_white: float = 0.01
     """That of a sample by itself [1]."""
