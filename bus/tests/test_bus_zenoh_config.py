@@ -77,8 +77,14 @@ def test_an_endpoint_in_use_is_an_error(tmp_path: Path) -> None:
         open_session(options)
 
 
-@pytest.mark.parametrize("lowlatency", [(), ("a", "b"), ("a",)], ids=["usual", "low-latency", "one-sided"])
-@pytest.mark.parametrize("size", [1, 300, 60_000, 200_000, 1_300_000])
+@pytest.mark.parametrize(
+    ("lowlatency", "size"),
+    [
+        *((ends, size) for ends in ((), ("a",)) for size in (1, 300, 60_000, 200_000, 1_300_000)),
+        # The low-latency transport has no fragments: only what fits into one message is sure to arrive.
+        *((("a", "b"), size) for size in (1, 300, 60_000)),
+    ],
+)
 def test_a_mesh_carries_messages_of_every_size(tmp_path: Path, lowlatency: tuple[str, ...], size: int) -> None:
     options = mesh(["a", "b"], tmp_path, lowlatency=lowlatency)
     payload = bytes(range(256)) * (size // 256) + bytes(size % 256)

@@ -58,6 +58,7 @@ def main():
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
     config.insert_json5("connect/endpoints", json.dumps(options.endpoints))
+    config.insert_json5("connect/retry", '{"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}')
     queue = SimpleQueue()
     counts = dict.fromkeys(options.topics, 0)
     with zenoh.open(config) as session:
