@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from examination import SHORT, Finished, palpate_run
 
-
 LISTENER = Path(__file__).parent / "contract" / "foreign_listener.py"
 
 

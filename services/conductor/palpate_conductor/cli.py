@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from datetime import datetime
 from importlib.metadata import entry_points
@@ -19,6 +20,9 @@ from rich.table import Table
 
 from palpate_conductor.bench import bench as run_bench
 from palpate_conductor.conductor import RunFailed
+from palpate_conductor.evaluate import DEFAULT_CASES
+from palpate_conductor.evaluate import evaluate as run_evaluation
+from palpate_conductor.evaluate import table as evaluation_table
 from palpate_conductor.implementations import chosen_services
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
@@ -186,6 +190,20 @@ def bench(
 ) -> None:
     """Measure the bus, the parts of a tick and whole runs; print tables and write bench.json."""
     run_bench(scenario, out, Console())
+
+
+@app.command()
+def evaluate(
+    names: Annotated[list[str] | None, typer.Argument(help="Scenarios; `elsewhere` draws a lesion from each seed.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds 0 to N-1.")] = 5,
+    workers: Annotated[int, typer.Option(min=1, help="Examinations at a time.")] = 2,
+    out: Annotated[Path, typer.Option(help="File for the reports.")] = Path("evaluation.json"),
+) -> None:
+    """Examine many abdomens and print how well what is there was found; write the reports."""
+    reports = run_evaluation(names or DEFAULT_CASES, range(seeds), workers)
+    out.write_text(json.dumps(reports), encoding="utf-8")
+    console = Console()
+    console.print(evaluation_table(reports))
 
 
 @app.command()
