@@ -32,6 +32,8 @@ from palpate_conductor.run import conduct as run_conduct
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
+WIDE = 160
+"""Columns of the wide tables, where the terminal has fewer or there is none."""
 
 Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")]
 
@@ -180,7 +182,7 @@ def topics() -> None:
             "yes" if topic.hashed else "",
             readers,
         )
-    Console(width=max(160, Console().width)).print(table)
+    Console(width=max(WIDE, Console().width)).print(table)
 
 
 @app.command()
@@ -189,7 +191,7 @@ def bench(
     out: Annotated[Path, typer.Option(help="File for the figures.")] = Path("bench.json"),
 ) -> None:
     """Measure the bus, the parts of a tick and whole runs; print tables and write bench.json."""
-    run_bench(scenario, out, Console())
+    run_bench(scenario, out, Console(width=max(WIDE, Console().width)))
 
 
 @app.command()
@@ -202,8 +204,7 @@ def evaluate(
     """Examine many abdomens and print how well what is there was found; write the reports."""
     reports = run_evaluation(names or DEFAULT_CASES, range(seeds), workers)
     out.write_text(json.dumps(reports), encoding="utf-8")
-    console = Console()
-    console.print(evaluation_table(reports))
+    Console(width=max(WIDE, Console().width)).print(evaluation_table(reports))
 
 
 @app.command()
