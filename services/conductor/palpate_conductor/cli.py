@@ -93,6 +93,8 @@ def run(
     observers = OBSERVERS if record else ()
     if not quiet:
         console.print(f"[bold]{chosen.name}[/] seed {chosen.seed}, results in {folder}", highlight=False)
+        if not composed:
+            console.print("[dim]look at it from another terminal: palpate doctor, palpate topic list[/]", highlight=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with RunDisplay(console, quiet) as display:
@@ -220,10 +222,14 @@ def router(
 
 
 def main() -> None:
-    """Entry point: our commands, and those that other packages register under `palpate.commands`."""
+    """Entry point: our commands, and those that other packages register under `palpate.commands`: a Typer app or a function."""
     for point in sorted(entry_points(group="palpate.commands"), key=lambda point: point.name):
         try:
-            app.add_typer(point.load(), name=point.name)
+            command = point.load()
+            if isinstance(command, typer.Typer):
+                app.add_typer(command, name=point.name)
+            else:
+                app.command(point.name)(command)
         except ImportError as error:
             print(f"palpate: the command {point.name} of {point.value} cannot be loaded: {error}", file=sys.stderr)
     try:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import yaml
+from palpate_bus.runs import Announcement, Run
 from palpate_bus.zenoh_config import mesh
 
 from palpate_conductor.__main__ import FIXED
@@ -84,6 +85,16 @@ class LocalProcesses:
         """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
         endpoints = {role: options.listen[0] for role, options in bus.items()}
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
+        self._announcement = Announcement(
+            Run(
+                name=out.name,
+                endpoints=endpoints,
+                domain=int(os.environ.get("ROS_DOMAIN_ID", "0")),
+                runtime=self._extra.get("PALPATE_RUNTIME", "lockstep"),
+                router=router,
+                out=str(out),
+            )
+        )
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -125,4 +136,5 @@ class LocalProcesses:
                     continue
         for log in self._logs:
             log.close()
+        self._announcement.withdraw()
         shutil.rmtree(self._folder, ignore_errors=True)
