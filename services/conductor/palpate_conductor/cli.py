@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import nullcontext
 from datetime import datetime
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -19,11 +20,13 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate_conductor.bench import bench as run_bench
+from palpate_conductor.case_display import CaseDisplay
 from palpate_conductor.conductor import RunFailed
 from palpate_conductor.evaluate import DEFAULT_CASES
 from palpate_conductor.evaluate import evaluate as run_evaluation
 from palpate_conductor.evaluate import table as evaluation_table
 from palpate_conductor.implementations import chosen_services
+from palpate_conductor.page import write_page
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
 from palpate_conductor.report import print_findings, write_results
@@ -79,9 +82,11 @@ def run(
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON, and nothing else.")] = False,
 ) -> None:
     """Run an examination and write report, map and recordings."""
     console = Console(stderr=True)
+    quiet = quiet or as_json
     try:
         chosen = load_scenario(scenario, settings or (), seed)
         chosen_services(chosen)
@@ -107,12 +112,22 @@ def run(
         _fail(console, EXIT_BAD_INPUT, str(error))
     except RunFailed as error:
         _fail(console, EXIT_FAILED, str(error))
-    _conclude(console, folder, chosen, result)
+    _conclude(console, folder, chosen, result, quiet, as_json)
 
 
-def _conclude(console: Console, folder: Path, scenario: Scenario, result: RunResult) -> None:
+def _conclude(
+    console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
+) -> None:
     """Writes the results, prints the findings, and leaves with status 3 when the run failed."""
-    print_findings(Console(), write_results(folder, scenario, result))
+    with nullcontext() if quiet else console.status("writing report and maps"):
+        report = write_results(folder, scenario, result)
+        page = write_page(folder)
+    if as_json:
+        print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
+    else:
+        print_findings(Console(), report)
+    if not quiet:
+        console.print(f"to read: {page}", highlight=False, soft_wrap=True)
     if result.failure:
         _fail(console, EXIT_FAILED, f"the run failed: {result.failure} (logs in {folder / 'logs'})")
 
@@ -154,12 +169,15 @@ def conduct(
     with RunDisplay(console, quiet) as display:
         result = run_conduct(session, roles, display.tell, realtime=1.0 if realtime else None, wallclock=wallclock)
     close_session(session)
-    _conclude(console, out, chosen, result)
+    _conclude(console, out, chosen, result, quiet)
 
 
 @app.command()
-def scenarios() -> None:
+def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False) -> None:
     """List the scenarios that come with Palpate."""
+    if as_json:
+        print(json.dumps([load_scenario(name).model_dump(mode="json") for name in scenario_names()]))
+        return
     table = Table("scenario", "lesions", "description", box=None)
     for name in scenario_names():
         scenario = load_scenario(name)
@@ -202,10 +220,20 @@ def evaluate(
     seeds: Annotated[int, typer.Option(min=1, help="Seeds 0 to N-1.")] = 5,
     workers: Annotated[int, typer.Option(min=1, help="Examinations at a time.")] = 2,
     out: Annotated[Path, typer.Option(help="File for the reports.")] = Path("evaluation.json"),
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the table only.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the reports as JSON, and nothing else.")] = False,
 ) -> None:
     """Examine many abdomens and print how well what is there was found; write the reports."""
-    reports = run_evaluation(names or DEFAULT_CASES, range(seeds), workers)
+    console = Console(stderr=True)
+    try:
+        with CaseDisplay(console, quiet or as_json) as display:
+            reports = run_evaluation(names or DEFAULT_CASES, range(seeds), workers, display.tell)
+    except RuntimeError as error:
+        _fail(console, EXIT_FAILED, str(error))
     out.write_text(json.dumps(reports), encoding="utf-8")
+    if as_json:
+        print(json.dumps(reports))
+        return
     Console(width=max(WIDE, Console().width)).print(evaluation_table(reports))
 
 

@@ -9,8 +9,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,10 +55,22 @@ def run_case(case: Case) -> dict[str, Any]:
         return report
 
 
-def evaluate(names: Sequence[str], seeds: Sequence[int], workers: int) -> list[dict[str, Any]]:
-    """The reports of all cases, `workers` at a time."""
+def evaluate(
+    names: Sequence[str], seeds: Sequence[int], workers: int, tell: Callable[[int, int, str], None] = lambda *_: None
+) -> list[dict[str, Any]]:
+    """The reports of all cases, `workers` at a time. `tell` hears how many of how many are done, and which was the last."""
+    cases = [Case(name, seed) for name in names for seed in seeds]
+    tell(0, len(cases), "")
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(run_case, [Case(name, seed) for name in names for seed in seeds]))
+        running = {pool.submit(run_case, case): case for case in cases}
+        try:
+            for done, future in enumerate(as_completed(running), 1):
+                future.result()
+                tell(done, len(cases), f"{running[future].name}, seed {running[future].seed}")
+        except RuntimeError:
+            pool.shutdown(cancel_futures=True)
+            raise
+        return [future.result() for future in running]
 
 
 def table(reports: Sequence[dict[str, Any]]) -> Table:

@@ -24,15 +24,15 @@ from palpate_conductor.scoring import Map, TrueSurface, Truth
 
 Array = NDArray[np.float64]
 
-_INK = "#1b2a33"
-_QUIET = "#6b7a83"
-_FORCE, _STIFFNESS, _UNCERTAINTY = "viridis", "inferno", "cividis"
+INK = "#1b2a33"
+QUIET = "#6b7a83"
+FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS = "viridis", "inferno", "cividis"
 _FINDING, _TRUE = "#18e0d0", "#ffffff"
 _SMALL = 8.5
 _LOG_TICKS = [m * 10.0**e for e in range(4) for m in (1, 1.5, 2, 3, 4, 5, 7)]
 
 
-class _Drawing:
+class Drawing:
     """One map on its axes: triangulations of the scanned part, in millimetres."""
 
     def __init__(self, message: Any, findings: Any | None, truth: Truth | None) -> None:
@@ -76,13 +76,13 @@ class _Drawing:
             )
             text.set_horizontalalignment("right" if x else "left")
             text.set_verticalalignment("top" if y else "bottom")
-            text.set_path_effects([withStroke(linewidth=2, foreground=_INK)])
+            text.set_path_effects([withStroke(linewidth=2, foreground=INK)])
         axes.set_aspect("equal")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
-        axes.set_xlabel("x, to the patient's left [mm]", fontsize=_SMALL, color=_INK)
-        axes.set_ylabel("y, to the head [mm]", fontsize=_SMALL, color=_INK)
-        axes.tick_params(labelsize=_SMALL, colors=_INK)
+        axes.set_xlabel("x, to the patient's left [mm]", fontsize=_SMALL, color=INK)
+        axes.set_ylabel("y, to the head [mm]", fontsize=_SMALL, color=INK)
+        axes.tick_params(labelsize=_SMALL, colors=INK)
         return image
 
     def rounded(self, member: Array) -> Array:
@@ -103,9 +103,9 @@ class _Drawing:
             if not member.any():
                 continue
             contour = axes.tricontour(self.tri, self.rounded(member), levels=[0.5], colors=[_FINDING], linewidths=2.0)
-            contour.set_path_effects([withStroke(linewidth=3.6, foreground=_INK)])
+            contour.set_path_effects([withStroke(linewidth=3.6, foreground=INK)])
             x, y = f.centroid.x * 1e3, f.centroid.y * 1e3
-            axes.plot(x, y, "+", color=_FINDING, ms=9, mew=2, path_effects=[withStroke(linewidth=3.6, foreground=_INK)])
+            axes.plot(x, y, "+", color=_FINDING, ms=9, mew=2, path_effects=[withStroke(linewidth=3.6, foreground=INK)])
             if labels:
                 words = f"{f.stiffness_ratio:.1f} ×\n{f.area * 1e4:.0f} cm²"
                 axes.annotate(
@@ -117,13 +117,13 @@ class _Drawing:
                     fontsize=9,
                     weight="bold",
                     color="white",
-                    path_effects=[withStroke(linewidth=2.5, foreground=_INK)],
+                    path_effects=[withStroke(linewidth=2.5, foreground=INK)],
                 )
         if truth and self.lesion is not None and self.lesion.max() > 0.5:
             contour = axes.tricontour(
                 self.tri, self.rounded(self.lesion), levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--"
             )
-            contour.set_path_effects([withStroke(linewidth=2.8, foreground=_INK)])
+            contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
 
     def space(self, axes: Any, height: Array, values: Array, cmap: str, norm: Normalize, label: str) -> None:
         """The map as a surface in space: `height` above the xy plane, coloured by `values`."""
@@ -153,71 +153,73 @@ def draw_map(path: Path, message: Any, findings: Any | None, samples: Samples, t
     """
     if not np.asarray(message.scanned).any():
         return
-    drawing = _Drawing(message, findings, truth)
+    drawing = Drawing(message, findings, truth)
     figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
     FigureCanvasAgg(figure)
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)
     grid = figure.add_gridspec(2, 3)
     _draw_force(figure, grid, drawing, samples)
     _draw_stiffness(figure, grid, drawing)
-    figure.suptitle(f"{title}: {_summary(drawing)}", fontsize=15, weight="bold", color=_INK)
+    figure.suptitle(f"{title}: {_summary(drawing)}", fontsize=15, weight="bold", color=INK)
     figure.savefig(path)
 
 
-def _draw_force(figure: Figure, grid: Any, drawing: _Drawing, samples: Samples) -> None:
+def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -> None:
     scanned = drawing.map.scanned
     norm = Normalize(0.0, float(drawing.force[scanned].max()))
     flat = figure.add_subplot(grid[0, 0])
-    image = drawing.plane(flat, drawing.force, _FORCE, norm)
+    image = drawing.plane(flat, drawing.force, FORCE_COLOURS, norm)
     flat.plot(samples.position[:, 0] * 1e3, samples.position[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
     drawing.outlines(flat, truth=False)
-    _title(flat, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm depth", f"{len(samples.time)} samples (dots)")
-    _bar(figure, image, flat, "force [N]")
+    panel_title(flat, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm depth", f"{len(samples.time)} samples (dots)")
+    colour_bar(figure, image, flat, "force [N]")
     solid = figure.add_subplot(grid[0, 1], projection="3d")
-    drawing.space(solid, drawing.force, drawing.force, _FORCE, norm, "force [N]")
+    drawing.space(solid, drawing.force, drawing.force, FORCE_COLOURS, norm, "force [N]")
     solid.set_box_aspect((1, 1, 0.72), zoom=1.14)
-    _title(solid, "b", "Normal force in 3-D", "height and colour are force")
+    panel_title(solid, "b", "Normal force in 3-D", "height and colour are force")
     spread = figure.add_subplot(grid[0, 2])
     half = 100 * (np.sqrt(drawing.map.upper / drawing.map.lower) - 1)
-    image = drawing.plane(spread, half, _UNCERTAINTY, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
+    image = drawing.plane(spread, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
     drawing.outlines(spread, truth=False)
-    _title(spread, "c", "Uncertainty of the stiffness", "half width of the 90 % band")
-    _bar(figure, image, spread, "± [%]")
+    panel_title(spread, "c", "Uncertainty of the stiffness", "half width of the 90 % band")
+    colour_bar(figure, image, spread, "± [%]")
 
 
-def _draw_stiffness(figure: Figure, grid: Any, drawing: _Drawing) -> None:
+def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
     norm = drawing.stiffness_norm
     estimate = drawing.map.stiffness * 1e-3
     flat = figure.add_subplot(grid[1, 0])
-    image = drawing.plane(flat, estimate, _STIFFNESS, norm)
+    image = drawing.plane(flat, estimate, STIFFNESS_COLOURS, norm)
     drawing.outlines(flat, truth=False, labels=True)
     level = drawing.background * 1e-3
-    _title(flat, "d", "Estimated stiffness $k_w$", f"background {level:.0f} kN/m³; finding outlined")
-    _bar(figure, image, flat, "$k_w$ [kN/m³]")
+    panel_title(flat, "d", "Estimated stiffness $k_w$", f"background {level:.0f} kN/m³; finding outlined")
+    colour_bar(figure, image, flat, "$k_w$ [kN/m³]")
     solid = figure.add_subplot(grid[1, 1], projection="3d")
-    drawing.space(solid, drawing.xyz[:, 2], estimate, _STIFFNESS, norm, "z [mm]")
+    drawing.space(solid, drawing.xyz[:, 2], estimate, STIFFNESS_COLOURS, norm, "z [mm]")
     solid.set_box_aspect((1, 1, 0.45), zoom=1.14)
-    _title(solid, "e", "Estimated stiffness on the abdomen", "perceived surface")
+    panel_title(solid, "e", "Estimated stiffness on the abdomen", "perceived surface")
     true = figure.add_subplot(grid[1, 2])
     if drawing.true is None:
         true.set_axis_off()
-        true.text(0.5, 0.5, "truth not known", ha="center", va="center", color=_QUIET, fontsize=13)
+        true.text(0.5, 0.5, "truth not known", ha="center", va="center", color=QUIET, fontsize=13)
         return
-    image = drawing.plane(true, drawing.true * 1e-3, _STIFFNESS, norm)
+    image = drawing.plane(true, drawing.true * 1e-3, STIFFNESS_COLOURS, norm)
     drawing.outlines(true, truth=True)
-    _title(true, "f", "True stiffness $k_w$", "dashed: true half contrast; solid: finding")
-    _bar(figure, image, true, "$k_w$ [kN/m³]")
+    panel_title(true, "f", "True stiffness $k_w$", "dashed: true half contrast; solid: finding")
+    colour_bar(figure, image, true, "$k_w$ [kN/m³]")
 
 
-def _title(axes: Any, letter: str, words: str, small: str) -> None:
-    axes.set_title(f"({letter}) {words}\n", fontsize=12, weight="bold", color=_INK, loc="left")
+def panel_title(axes: Any, letter: str, words: str, small: str) -> None:
+    """The heading of a panel: what it shows, and under it in small what to know of it."""
+    axes.set_title(f"({letter}) {words}\n", fontsize=12, weight="bold", color=INK, loc="left")
     place = axes.text2D if hasattr(axes, "text2D") else axes.text
-    place(0.0, 1.02, small, transform=axes.transAxes, fontsize=9, color=_QUIET)
+    place(0.0, 1.02, small, transform=axes.transAxes, fontsize=9, color=QUIET)
 
 
-def _bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
+def colour_bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
+    """A colour bar beside `axes`; on a logarithmic scale with round numbers."""
     bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02)
-    bar.set_label(label, fontsize=_SMALL, color=_INK)
+    bar.set_label(label, fontsize=_SMALL, color=INK)
     if isinstance(image.norm, LogNorm):
         low, high = image.get_clim()
         ticks = [t for t in _LOG_TICKS if (low or 0.0) <= t <= (high or 0.0)]
@@ -225,7 +227,7 @@ def _bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
         bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         bar.ax.yaxis.set_minor_locator(NullLocator())
         bar.ax.yaxis.set_minor_formatter(NullFormatter())
-    bar.ax.tick_params(labelsize=_SMALL, colors=_INK)
+    bar.ax.tick_params(labelsize=_SMALL, colors=INK)
     bar.outline.set_visible(False)
 
 
@@ -233,7 +235,7 @@ def _percent(confidence: float) -> str:
     return f"{100 * confidence:.0f} %" if confidence < 0.99 else "over 99 %"
 
 
-def _summary(drawing: _Drawing) -> str:
+def _summary(drawing: Drawing) -> str:
     if not drawing.findings:
         return "no finding"
     return "; ".join(

@@ -1,4 +1,4 @@
-"""What a run leaves in its folder for people and programs: report.json, samples.csv, map.png."""
+"""What a run leaves in its folder for people and programs: report.json, samples.csv, map.png, evidence.npz."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 from rich.table import Table
 
-from palpate_conductor import scoring
+from palpate_conductor import archive, scoring
 from palpate_conductor.evidence import (
     Contact,
     Samples,
@@ -186,12 +186,13 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
 
 
 def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:
-    """Writes report.json, samples.csv and, when there is a map, map.png into a run's folder; returns the report."""
+    """Writes report.json, samples.csv, evidence.npz and, when there is a map, map.png into a run's folder; returns the report."""
     c = result.collected
     report = assemble(scenario, result)
     samples = samples_of(c.samples)
     (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
     write_samples(folder / "samples.csv", samples)
+    archive.write_evidence(folder / archive.FILE, c)
     if c.stiffness_map is not None:
         truth = None if c.phantom is None else truth_of(c.phantom)
         draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, truth, f"{scenario.name}, seed {scenario.seed}")
@@ -246,7 +247,7 @@ def print_findings(console: Console, report: Report) -> None:
             line += f", Dice {s.dice:.2f}"
         if s.coverage_90 is not None:
             line += f", 90 % band holds on {100 * s.coverage_90:.0f} %"
-        console.print(line, highlight=False)
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def _finding(f: Any) -> FindingRow:
