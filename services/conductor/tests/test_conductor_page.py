@@ -70,7 +70,8 @@ def test_the_surface_in_space_is_the_map(page: str) -> None:
     soft = np.hypot(positions[:, 0] - 0.05, positions[:, 1] - 0.05) < 0.02
     assert colors[stiff].sum(axis=1).min() > colors[soft].sum(axis=1).max() + 100
     outline = np.frombuffer(base64.b64decode(data["outline"]), "<f4").reshape(-1, 3)
-    assert np.hypot(outline[:, 0] + 0.046, outline[:, 1] + 0.05) == pytest.approx(0.028, abs=0.006)  # between vertices 5 mm apart
+    beyond = np.hypot(outline[:, 0] + 0.046, outline[:, 1] + 0.05) - 0.03
+    assert np.abs(beyond).max() < 0.0075  # it runs between vertices 5 mm apart
 
 
 def test_a_run_that_failed_says_so_first(tmp_path: Path) -> None:
