@@ -40,6 +40,9 @@ class Lesion(_Section):
     """Stiffness at its centre over the stiffness without it."""
     edge_m: Positive = 0.008
     """Width of the smooth edge."""
+    depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
+    """How far below the skin it begins (tissue.implementation: elastic): an ellipsoid whose vertical half axis is the smaller of
+    `radii_m`. None: it reaches from the skin inward. The surface tier knows no depth: there every lesion lies in the skin."""
 
 
 class Background(_Section):
