@@ -91,6 +91,8 @@ class Topic(_Row):
     ranges: dict[str, tuple[float, float]] = {}
     max_age_ms: int | None = None
     expiry_ms: int | None = None
+    open: bool = False
+    """Whether others than the producer may send on it too."""
     doc: str
 
     @property

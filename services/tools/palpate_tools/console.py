@@ -1,0 +1,70 @@
+"""Output of the tools: tables for people, JSON for programs, and a clean end on Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from palpate_bus.zenoh_config import BusConfigError
+from rich.console import Console
+from rich.table import Table
+
+from palpate_tools.joining import NoBus
+
+EXIT_TROUBLE = 1
+EXIT_BAD_INPUT = 2
+WIDE = 140
+
+
+def console() -> Console:
+    """Standard output, wide where there is no terminal, so that tables stay whole in a pipe."""
+    plain = Console(highlight=False)
+    return plain if plain.is_terminal else Console(highlight=False, width=max(WIDE, plain.width))
+
+
+def print_json(value: Any) -> None:
+    """One JSON document on standard output."""
+    print(json.dumps(value, indent=2), flush=True)
+
+
+def print_line(value: Any) -> None:
+    """One line of JSON, for streams."""
+    print(json.dumps(value), flush=True)
+
+
+def table(*columns: str) -> Table:
+    """An empty table; a column that starts with `>` is for numbers."""
+    made = Table(box=None, pad_edge=False, header_style="bold")
+    for name in columns:
+        made.add_column(name.lstrip(">"), justify="right" if name.startswith(">") else "left", overflow="fold")
+    return made
+
+
+@contextmanager
+def command() -> Iterator[None]:
+    """Wraps a command: no bus and bad input end it with a sentence and status 2, Ctrl-C with status 0."""
+    try:
+        yield
+    except (NoBus, BusConfigError) as error:
+        Console(stderr=True, highlight=False).print(f"[bold red]palpate:[/] {error}", soft_wrap=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except KeyboardInterrupt:
+        sys.stdout.flush()
+        raise typer.Exit(0) from None
+
+
+def number(value: float | None, unit: str = "", digits: int = 4) -> str:
+    """A figure with its unit; a dash for None."""
+    return "-" if value is None else f"{value:.{digits}g}{' ' if unit else ''}{unit}"
+
+
+def bandwidth(bytes_per_s: float) -> str:
+    """Bytes a second in a unit that reads well."""
+    for factor, unit in ((1e6, "MB/s"), (1e3, "kB/s")):
+        if bytes_per_s >= factor:
+            return f"{bytes_per_s / factor:.4g} {unit}"
+    return f"{bytes_per_s:.0f} B/s"

@@ -1,0 +1,103 @@
+"""How a tool finds and joins the bus of a run that somebody else started.
+
+In this order: `--connect`; what the environment says (PALPATE_CONNECT, PALPATE_ROUTER, PALPATE_ZENOH_CONFIG); `--run`; the one
+run that is announced on this machine (`palpate_bus.runs`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import monotonic, sleep
+from typing import Annotated
+
+import typer
+import zenoh
+from palpate_bus.runs import Run, folder, live
+from palpate_bus.zenoh_config import BusConfigError, BusOptions, session
+
+FIND_S = 1.0
+"""How long a tool waits for its links before it goes on with those that it has."""
+
+Connect = Annotated[
+    list[str] | None,
+    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Join here, e.g. tcp/10.0.0.5:7447; may be repeated."),
+]
+ChosenRun = Annotated[str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")]
+Domain = Annotated[int | None, typer.Option(help="ROS domain; by default the run's, else ROS_DOMAIN_ID.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+class NoBus(RuntimeError):
+    """No bus to join. Says what was looked for and what to do."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """The bus to join."""
+
+    options: BusOptions
+    domain: int
+    run: Run | None = None
+    """The run, when it is announced on this machine."""
+
+
+@dataclass(frozen=True)
+class Joined:
+    """A bus that was joined."""
+
+    session: zenoh.Session
+    target: Target
+
+    @property
+    def domain(self) -> int:
+        """ROS domain."""
+        return self.target.domain
+
+
+def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> Target:
+    """The bus that the user means. Raises NoBus when there is none or more than one."""
+    fallback = int(os.environ.get("ROS_DOMAIN_ID", "0")) if domain is None else domain
+    if connect:
+        return Target(BusOptions(connect=tuple(connect)), fallback)
+    if chosen is None and any(os.environ.get(name) for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG")):
+        return Target(BusOptions.from_env(), fallback)
+    runs = live()
+    found = [run for run in runs if chosen is None or chosen == str(run.pid) or chosen in run.name]
+    if len(found) == 1:
+        return Target(found[0].options(), found[0].domain if domain is None else domain, found[0])
+    if found:
+        names = ", ".join(f"{run.name} (process {run.pid})" for run in found)
+        raise NoBus(f"{len(found)} runs are on: {names}; choose one with --run NAME or --run PROCESS")
+    if chosen is not None:
+        names = ", ".join(f"{run.name} (process {run.pid})" for run in runs) or "none"
+        raise NoBus(f"no run {chosen!r} is on; on are: {names}")
+    raise NoBus(
+        f"no run is on (looked in {folder()}); start one with `palpate run`, or name a bus: --connect ENDPOINT, or "
+        "PALPATE_ROUTER=tcp/HOST:7447"
+    )
+
+
+@contextmanager
+def joined(connect: Sequence[str] | None, chosen: str | None, domain: int | None) -> Iterator[Joined]:
+    """Joins the bus that the user means, for a `with` block. Raises NoBus."""
+    target = find(connect, chosen, domain)
+    try:
+        with session(target.options) as bus:
+            settle(bus, target.options)
+            yield Joined(bus, target)
+    except BusConfigError as error:
+        raise NoBus(str(error)) from error
+
+
+def settle(bus: zenoh.Session, options: BusOptions) -> None:
+    """Waits until every endpoint has answered, at most `FIND_S`. Raises NoBus when nobody has."""
+    wanted = len(options.connect) + bool(options.router)
+    end = monotonic() + FIND_S
+    while (links := len(bus.info.peers_zid()) + len(bus.info.routers_zid())) < wanted and monotonic() < end:
+        sleep(0.02)
+    if wanted and not links:
+        tried = ", ".join((*options.connect, *([options.router] if options.router else [])))
+        raise NoBus(f"nobody answers at {tried}")
