@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Breathing, Stiffness
-from scipy.linalg.blas import daxpy, dscal
-from scipy.sparse import _sparsetools
 from scipy.spatial import cKDTree
 
+from palpate_tissue import kernel
 from palpate_tissue.friction import Friction, shear_stiffness
 from palpate_tissue.mechanics import assemble
 
@@ -35,22 +34,17 @@ _RIM = 0.2
 
 @dataclass
 class _Candidates:
-    """Vertices that the sphere might hold while its centre stays near `origin`; m of them.
-
-    `project @ (q, 1, R^2 - q^2)` for q = p - origin gives how far the centre is below each vertex, along its inward
-    normal [m], and then R^2 - |p - X|^2 [m^2]. `collect` holds what is summed over them: outward normal, position from
-    origin [m], and one.
-    """
+    """Vertices that the sphere might hold while its centre stays near `origin`; m of them."""
 
     origin: list[float]  # [m], in A
     reach: float  # [m] how far the centre may go from origin
     radius: float  # [m] of the sphere
-    index: NDArray[np.intp]  # vertices, shape (m,)
-    project: Array  # shape (2 m, 5)
-    collect: Array  # shape (m, 7)
+    index: NDArray[np.uint32]  # vertices, shape (m,)
+    normals: Array  # outward, shape (m, 3)
+    positions: Array  # from origin [m], shape (m, 3)
     breathing: Array  # share of the breathing excursion, shape (m,)
     gain: Array  # C / h [N/m], shape (m,)
-    weights: Array  # working memory, shape (4, m)
+    force: Array  # of each in the last step [N], shape (m,)
 
 
 class Tissue:
@@ -80,25 +74,35 @@ class Tissue:
         self._excursion = 0.0
         self.displacement: Array = np.zeros(n)
         """u [m] along the inward rest normal, shape (n,)."""
-        self.branches: list[Array] = [np.zeros(n) for _ in stiffness.prony_g]
-        """y_k = g_k z_k [m]: what has relaxed, an array (n,) a Prony branch."""
-        self._decay = [math.exp(-self._h / tau) for tau in stiffness.prony_tau_s]
-        self._feed = [g * (1 - decay) for g, decay in zip(stiffness.prony_g, self._decay, strict=True)]
+        self.branches: Array = np.zeros((len(stiffness.prony_g), n))
+        """y_k = g_k z_k [m]: what has relaxed, a row (n,) for each Prony branch."""
+        self._decay: Array = np.exp(-self._h / np.array(stiffness.prony_tau_s))
+        self._feed: Array = np.array(stiffness.prony_g) * (1 - self._decay)
         self._prony_g = stiffness.prony_g
         self._strain = np.zeros(n)
         advance = -self._h * self.mechanics.stiffness
         advance.data /= np.repeat(self.mechanics.damping, np.diff(advance.indptr))
-        self._advance = (n, n, advance.indptr, advance.indices, advance.data)
+        self._advance = (advance.indptr.astype(np.uint32), advance.indices.astype(np.uint32), advance.data)
         self._gain = self.mechanics.damping / self._h
         free = np.flatnonzero(~model.fixed)
         self._free = free
         self._tree = cKDTree(model.vertices[free])
         self._candidates: _Candidates | None = None
+        self._q: Array = np.zeros(3)
+        self._sums: Array = np.zeros(9)
         self._at: list[float] | None = None
         self.disturbed = False
         """Whether anything has ever moved; until then the field is left at its exact rest."""
         self.touching = False
         """Whether the sphere holds a vertex after the step."""
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Compiles what steps call, on a field at rest, so that the first contact need not wait for it."""
+        kernel.relax(*self._advance, self.branches, self._strain, self.displacement)
+        kernel.remember(self.branches, self._decay, self._feed, self.displacement)
+        none, points, index = np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.uint32)
+        kernel.hold(index, points, points, none, none, self._q, 0.0, _RIM, 0.0, self.displacement, none, self._sums)
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
@@ -151,65 +155,39 @@ class Tissue:
 
     def _relax(self) -> None:
         """The field as it moves by itself: u += -h C^-1 K (u - sum y). A surface never touched is at rest exactly."""
-        if not self.disturbed:
-            return
-        u, strain = self.displacement, self._strain
-        if self.branches:
-            np.subtract(u, self.branches[0], out=strain)
-            for branch in self.branches[1:]:
-                strain -= branch
-        else:
-            strain[:] = u
-        _sparsetools.csr_matvec(*self._advance, strain, u)
+        if self.disturbed:
+            kernel.relax(*self._advance, self.branches, self._strain, self.displacement)
 
     def _remember(self) -> None:
         """The Prony branches: exact for a displacement that is held over the step."""
-        if not self.disturbed:
-            return
-        for branch, decay, feed in zip(self.branches, self._decay, self._feed, strict=True):
-            dscal(decay, branch)
-            daxpy(self.displacement, branch, a=feed)
+        if self.disturbed:
+            kernel.remember(self.branches, self._decay, self._feed, self.displacement)
 
     def _contact(
         self, near: _Candidates, p: list[float], velocity: list[float], spin: list[float] | None
     ) -> tuple[float, float, float, float, float, float]:
         """Holds the vertices under the sphere on it, and returns what that takes."""
-        m = len(near.index)
-        qx, qy, qz = p[0] - near.origin[0], p[1] - near.origin[1], p[2] - near.origin[2]
-        free = near.radius * near.radius - (qx * qx + qy * qy + qz * qz)
-        projected = near.project.dot((qx, qy, qz, 1.0, free))
-        below, square = projected[:m], projected[m:]
-        weights = near.weights
-        f, steep, f_below, f_hold = weights
-        square += np.multiply(below, below, out=steep)  # R^2 - lateral distance^2
-        rim = (_RIM * near.radius) ** 2
-        under = square > rim
-        half = np.sqrt(np.maximum(square, rim, out=square), out=square)
-        rest_hold = below + half
-        u = self.displacement.take(near.index)
-        hold = rest_hold + self._excursion * near.breathing if self._excursion else rest_hold
-        gap = np.subtract(hold, u, out=f)
-        gap *= under
-        np.maximum(gap, 0.0, out=gap)
-        u += gap
-        gap *= near.gain  # which makes it f
-        # Force on the sphere, f (n + lateral / half), and f-weighted point and normal, as weighted sums of n, x and 1.
-        np.divide(f, half, out=steep)
-        np.multiply(steep, below, out=f_below)
-        np.multiply(f, rest_hold, out=f_hold)
-        on_f, on_steep, on_below, on_hold = weights.dot(near.collect).tolist()
-        load, g = on_f[6], on_steep[6]
+        q, sums = self._q, self._sums
+        for axis in range(3):
+            q[axis] = p[axis] - near.origin[axis]
+        load = kernel.hold(
+            near.index,
+            near.normals,
+            near.positions,
+            near.breathing,
+            near.gain,
+            q,
+            near.radius,
+            _RIM,
+            self._excursion,
+            self.displacement,
+            near.force,
+            sums,
+        )
         if load <= 0:
             return self._no_contact()
-        self.displacement[near.index] = u
         self.touching = self.disturbed = True
-        nx, ny, nz = on_f[:3]
-        fx = nx + on_below[0] + g * qx - on_steep[3]
-        fy = ny + on_below[1] + g * qy - on_steep[4]
-        fz = nz + on_below[2] + g * qz - on_steep[5]
-        rx = (on_f[3] - on_hold[0]) / load - qx
-        ry = (on_f[4] - on_hold[1]) / load - qy
-        rz = (on_f[5] - on_hold[2]) / load - qz
+        fx, fy, fz, nx, ny, nz, rx, ry, rz = sums.tolist()
         vx, vy, vz = velocity
         if spin is not None:
             wx, wy, wz = spin
@@ -239,19 +217,17 @@ class Tissue:
         lateral = np.linalg.norm(positions - height[:, None] * normals, axis=1)
         facing = normals @ model.normals[self._free[nearest]] > 0  # not the far side of something thin
         keep = (lateral < radius + _SKIN_M) & facing
-        index, normals, positions, height = index[keep], normals[keep], positions[keep], height[keep]
-        zero, one = np.zeros(len(index)), np.ones(len(index))
-        square = (positions * positions).sum(axis=1)
+        index, normals, positions = index[keep], normals[keep], positions[keep]
         self._candidates = _Candidates(
             origin=list(p),
             reach=reach,
             radius=radius,
-            index=index,
-            project=np.vstack((np.column_stack((-normals, height, zero)), np.column_stack((2 * positions, -square, one)))),
-            collect=np.column_stack((normals, positions, one)),
+            index=index.astype(np.uint32),
+            normals=np.ascontiguousarray(normals),
+            positions=np.ascontiguousarray(positions),
             breathing=model.breathing[index],
             gain=self._gain[index],
-            weights=np.zeros((4, len(index))),
+            force=np.zeros(len(index)),
         )
         return self._candidates
 
@@ -261,7 +237,7 @@ class Tissue:
         near = self._candidates
         if near is None or not self.touching:
             return np.empty(0, dtype=np.intp)
-        return np.asarray(near.index[near.weights[0] > 0])
+        return np.asarray(near.index[near.force > 0])
 
     @property
     def contact_forces(self) -> Array:
@@ -269,7 +245,7 @@ class Tissue:
         near = self._candidates
         if near is None or not self.touching:
             return np.empty(0)
-        return np.asarray(near.weights[0][near.weights[0] > 0])
+        return np.asarray(near.force[near.force > 0])
 
     @property
     def inward(self) -> Array:
