@@ -2,7 +2,8 @@
 
     S = D K D + P M (S_het - D S_hom D) M' P'
 
-K is the Green's function of the uniform layer, exact at any distance; D scales it by the modulus at the skin. The second term is what finite elements on a coarse grid say of everything else: modulus that varies along the skin and below it.
+K is the Green's function of the uniform layer, exact at any distance; D scales it by the modulus at the skin. The second term
+is what finite elements on a coarse grid say of everything else: modulus that varies along the skin and below it.
 Both S_het and S_hom are finite-element solutions on the same grid, so that their local errors cancel in the difference.
 """
 

@@ -96,7 +96,8 @@ class Near:
         """On the sphere: the sum of the forces' normal parts [N], the whole of them [N], and their centre from `p` [m].
 
         The frictionless sphere pushes along its own normals, f (n + lateral / half): f is the part along the skin's normal,
-        and the tissue's guidance bears the rest. As f holds the vertex exactly on the sphere, tool and field exchange the same work.
+        and the tissue's guidance bears the rest. As f holds the vertex exactly on the sphere, tool and field exchange the
+        same work.
         """
         f = self.force
         steep = f / self._half

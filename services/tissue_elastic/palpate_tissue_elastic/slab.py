@@ -29,8 +29,11 @@ Profile = Literal["sphere", "paraboloid"]
 
 
 def hertz_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:
-    """Force [N] on a paraboloid of curvature radius R at depth d in a half-space: 4/3 E / (1 - nu^2) sqrt(R) d^(3/2) (Hertz 1882)."""
-    return 4 / 3 * young_pa / (1 - poisson**2) * math.sqrt(radius_m) * depth_m**1.5
+    """Force [N] on a paraboloid of curvature radius R at depth d in a half-space (Hertz 1882).
+
+    4/3 E / (1 - nu^2) sqrt(R) d^(3/2).
+    """
+    return float(4 / 3 * young_pa / (1 - poisson**2) * math.sqrt(radius_m) * depth_m**1.5)
 
 
 def sphere_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:

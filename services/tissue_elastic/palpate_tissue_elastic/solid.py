@@ -31,7 +31,7 @@ class Grid:
 
     @property
     def skin(self) -> tuple[Array, Array]:
-        """x and y of the skin's nodes that may be loaded [m]; the compliance is ordered with y fastest."""
+        """Places (x, y) of the skin's nodes that may be loaded [m]; the compliance is ordered with y fastest."""
         return self.x[self.loaded_x], self.y[self.loaded_y]
 
 
@@ -73,15 +73,15 @@ def brick_stiffness(size: Array, poisson: float) -> Array:
         one = 1 + corners * point  # (8, 3)
         slope = np.stack([corners[:, k] * one[:, (k + 1) % 3] * one[:, (k + 2) % 3] for k in range(3)], axis=1) / 8
         slope = slope[None] * (2 / size)[:, None, :]  # d N / d x, (e, 8, 3)
-        strain = np.zeros((len(size), 6, 8, 3))
+        by_node = np.zeros((len(size), 6, 8, 3))
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
-            strain[:, k, :, k] = slope[:, :, k]
-            strain[:, 3 + k, :, i], strain[:, 3 + k, :, j] = slope[:, :, j], slope[:, :, i]
-        strain = strain.reshape(len(size), 6, 24)
+            by_node[:, k, :, k] = slope[:, :, k]
+            by_node[:, 3 + k, :, i], by_node[:, 3 + k, :, j] = slope[:, :, j], slope[:, :, i]
+        strain = by_node.reshape(len(size), 6, 24)
         total += (volume / 8)[:, None, None] * (strain.transpose(0, 2, 1) @ (deviatoric @ strain))
         mean += slope.reshape(len(size), 24) / 8
-    return total + bulk * volume[:, None, None] * mean[:, :, None] * mean[:, None, :]
+    return np.asarray(total + bulk * volume[:, None, None] * mean[:, :, None] * mean[:, None, :])
 
 
 def skin_compliance(grid: Grid, young: Callable[[Array], Array], poisson: float) -> Array:
@@ -145,6 +145,6 @@ def _slab(grid: Grid, young: Callable[[Array], Array], poisson: float, column: i
     flat = rows * n + np.broadcast_to(unknown[:, None, :], pair.shape)[pair]
 
     def gather(block: Array) -> Array:
-        return np.bincount(flat, block[pair], minlength=n * n).reshape(n, n)
+        return np.asarray(np.bincount(flat, block[pair], minlength=n * n), dtype=np.float64).reshape(n, n)
 
     return gather(stiffness[:, :12, :12]), gather(stiffness[:, 12:, 12:]), gather(stiffness[:, :12, 12:])

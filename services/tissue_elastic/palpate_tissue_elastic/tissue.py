@@ -182,7 +182,7 @@ class ElasticTissue:
 
     @property
     def displacement(self) -> Array:
-        """u [m] along the inward rest normal of every vertex, shape (n,)."""
+        """Displacement [m] along the inward rest normal of every vertex, shape (n,)."""
         self._catch_up()
         u = np.zeros(len(self.model.vertices))
         u[self.compliance.free] = self._state[0]
