@@ -1,0 +1,97 @@
+"""The results of a validation as a table, as JSON, as figures and as a Markdown page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from palpate_validation.check import Check, Section
+from palpate_validation.plots import write_figure
+
+WORDS = {True: "[green]pass[/]", False: "[bold red]FAIL[/]", None: ""}
+
+
+def number(value: float) -> str:
+    """A figure with three or four digits that mean something."""
+    if value == 0:
+        return "0"
+    if abs(value) < 1e-3 or abs(value) >= 1e5:
+        return f"{value:.1e}"
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def table(sections: Sequence[Section]) -> Table:
+    """All checks, section by section."""
+    out = Table("what", "measured", "bound", "against", "", box=None, pad_edge=False)
+    out.columns[1].justify = "right"
+    for section in sections:
+        out.add_row(f"[bold]{section.title}[/]")
+        for check in section.checks:
+            value = f"{number(check.measured)} {check.unit}".strip()
+            out.add_row(f"  {check.name}", value, check.bound, check.against, WORDS[check.passed])
+    return out
+
+
+def failures(sections: Sequence[Section]) -> list[Check]:
+    """The checks outside their bounds."""
+    return [check for section in sections for check in section.checks if check.passed is False]
+
+
+def write(sections: Sequence[Section], out: Path) -> None:
+    """Writes validate.json and a PNG for each section that draws into the folder `out`, which is made if need be."""
+    out.mkdir(parents=True, exist_ok=True)
+    facts = {
+        section.name: {
+            "title": section.title,
+            "text": section.text,
+            "checks": [
+                {"name": c.name, "measured": c.measured, "unit": c.unit, "low": c.low, "high": c.high, "against": c.against,
+                 "passed": c.passed}
+                for c in section.checks
+            ],
+            "data": section.data,
+        }
+        for section in sections
+    }  # fmt: skip
+    (out / "validate.json").write_text(json.dumps(_plain(facts), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    for section in sections:
+        if section.draw is not None:
+            write_figure(section.draw, out / f"{section.name}.png", section.size_in)
+
+
+def write_page(sections: Sequence[Section], page: Path, images: Path) -> None:
+    """Writes the Markdown page and its small PNGs into the folder `images`, which is made if need be."""
+    images.mkdir(parents=True, exist_ok=True)
+    where = images.relative_to(page.parent).as_posix()
+    lines = [
+        "# Validation",
+        "",
+        "The physics against independent references, as `palpate validate --docs docs/validation.md` measured it.",
+        "Every bound is a test in `services/validation/tests`. Costs are of a busy two-core machine: read them as ratios.",
+    ]
+    for section in sections:
+        lines += ["", f"## {section.title}", "", section.text, "", "| | measured | bound | against |", "|---|---|---|---|"]
+        for c in section.checks:
+            verdict = {True: "", False: " **missed**", None: ""}[c.passed]
+            lines.append(f"| {c.name} | {number(c.measured)} {c.unit}{verdict} | {c.bound} | {c.against} |".replace("  ", " "))
+        if section.draw is not None:
+            write_figure(section.draw, images / f"{section.name}.png", section.size_in, dpi=90)
+            lines += ["", f"![{section.title}]({where}/{section.name}.png)"]
+    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON takes it, floats to seven digits, what is not finite as null."""
+    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    if isinstance(plain, Mapping):
+        return {str(key): _plain(item) for key, item in plain.items()}
+    if isinstance(plain, (list, tuple)):
+        return [_plain(item) for item in plain]
+    if isinstance(plain, float):
+        return float(f"{plain:.7g}") if np.isfinite(plain) else None
+    return plain
