@@ -18,10 +18,9 @@ from __future__ import annotations
 from math import isfinite
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
+from palpate_control import kernel
 from palpate_control.model import DOF, SLOW_S, ArmModel
 from palpate_control.reference import Mode, Reference
 from palpate_control.safety import LimitRepulsion, TorqueShaper
@@ -49,7 +48,6 @@ REGULARISATION = 1e-3
 """Added to a matrix of the task [1/kg, 1/(kg m^2)] where it has lost rank."""
 DESIGN_TICKS = 10
 """Gains are designed for each set-point, and again after so many ticks: meanwhile the arm moves by milliradians."""
-_EYE = np.eye(6)
 
 
 class ImpedanceController:
@@ -61,8 +59,7 @@ class ImpedanceController:
         self._repulsion = LimitRepulsion(model.position_lower, model.position_upper, model.torque_limit, limit_zone)
         self._shaper = TorqueShaper(model.torque_limit)
         self._clip = np.array([POSITION_CLIP_M] * 3 + [ROTATION_CLIP_RAD] * 3)
-        self._rotate = np.zeros((6, 6))  # world axes to D's, for linear and angular parts
-        self._error = np.zeros(6)
+        self._J, self._JW, self._slow_inertia = np.zeros((6, DOF)), np.zeros((6, DOF)), np.zeros((6, 6))  # in D's axes
         self._designed_for: Array | None = None
         self._design_age = 0
         self._stiffness = self._damping = np.zeros(6)
@@ -99,34 +96,48 @@ class ImpedanceController:
         return torque + model.inverse_dynamics(q, qd, reference.qdd)
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
-        model, rotate = self.model, self._rotate
-        R_DW = reference.R_WD.T
-        rotate[:3, :3] = R_DW
-        rotate[3:, 3:] = R_DW
-        J = rotate.dot(model.J_W)
-        JW = J.dot(model.slow_mobility)
-        slow_inertia = _inverse(JW.dot(J.T))
-        V_desired = rotate.dot(reference.V_WD)
-
+        model = self.model
+        R_WD = np.ascontiguousarray(reference.R_WD)
+        kernel.task_space(R_WD, model.J_W, model.slow_mobility, REGULARISATION, self._J, self._JW, self._slow_inertia)
         if reference.stiffness is not self._designed_for or self._design_age >= DESIGN_TICKS:
-            self._design(reference, J, slow_inertia)
+            self._design(reference)
         self._design_age += 1
-        F = self._spring(reference) + self._damping * (V_desired - J.dot(qd)) + rotate.dot(reference.F_W)
-
-        posture = reference.joint_stiffness * (reference.q - q) + self._posture_damping * (reference.qd - qd)
-        null = posture - J.T.dot(slow_inertia.dot(JW.dot(posture)))
-        if null.dot(null) > NULL_TORQUE_NM**2:
-            null *= NULL_TORQUE_NM / max(np.abs(null).max(), NULL_TORQUE_NM)  # as a whole: it stays in the null space
-        qd_desired = reference.qd + JW.T.dot(slow_inertia.dot(V_desired - J.dot(reference.qd)))
-        qd_desired = np.minimum(np.maximum(qd_desired, -model.velocity_limit), model.velocity_limit)
-        torque: Array = J.T.dot(F) + null + model.coriolis + self._friction(qd_desired)
+        torque = np.empty(DOF)
+        kernel.cartesian_torque(
+            q,
+            qd,
+            model.R_WI,
+            model.p_WI,
+            self._J,
+            self._JW,
+            self._slow_inertia,
+            model.coriolis,
+            R_WD,
+            reference.p_WD,
+            reference.V_WD,
+            reference.F_W,
+            reference.q,
+            reference.qd,
+            reference.joint_stiffness,
+            self._stiffness,
+            self._damping,
+            self._posture_damping,
+            self._clip,
+            model.velocity_limit,
+            model.viscous_friction,
+            model.coulomb_friction,
+            STICTION_SPEED,
+            NULL_TORQUE_NM,
+            torque,
+        )
         return torque
 
-    def _design(self, reference: Reference, J: Array, slow_inertia: Array) -> None:
+    def _design(self, reference: Reference) -> None:
         """Gains for this set-point and posture: stiffness that sampling can bear and the damping that goes with it."""
+        J = self._J
         mobility = J.dot(self.model.mobility).dot(J.T)
         inertia = _inverse(mobility).diagonal()
-        friction = (slow_inertia.diagonal() - inertia) / SLOW_S
+        friction = (self._slow_inertia.diagonal() - inertia) / SLOW_S
         # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
         mass = np.minimum(inertia, 4 / mobility.diagonal())
         self._stiffness = np.minimum(reference.stiffness, np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S)))
@@ -136,21 +147,10 @@ class ImpedanceController:
         self._posture_damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(reference.joint_stiffness / free)
         self._designed_for, self._design_age = reference.stiffness, 0
 
-    def _spring(self, reference: Reference) -> Array:
-        """Force and torque of the Cartesian springs on the indenter, in D's axes, shape (6,)."""
-        model, error, R_WD = self.model, self._error, reference.R_WD
-        R_DI = R_WD.T.dot(model.R_WI)
-        error[:3] = (reference.p_WD - model.p_WI).dot(R_WD)
-        error[3:] = -pin.log3(R_DI)
-        spring: Array = self._stiffness * np.minimum(np.maximum(error, -self._clip), self._clip)
-        spring[3:] = pin.Jlog3(R_DI).dot(spring[3:])  # d phi = J_l^-1 w with w in D's axes, and J_l^-T = Jlog3
-        return spring
-
 
 def _inverse(matrix: Array) -> Array:
     """Inverse of a symmetric positive definite matrix by Cholesky, shape (6, 6); regularised where the arm is singular."""
-    _, inverse, info = dposv(matrix, _EYE)
-    if info != 0:
-        _, inverse, info = dposv(matrix + REGULARISATION * _EYE, _EYE)
-    result: Array = inverse
-    return result
+    inverse = np.empty_like(matrix)
+    if not kernel.spd_inverse(matrix, inverse, 0.0):
+        kernel.spd_inverse(matrix, inverse, REGULARISATION)
+    return inverse

@@ -59,11 +59,11 @@ class ArmModel:
         model, data = self._model, self._data
         pin.computeMinverse(model, data, q)  # also places the joints and fills data.J
         pose = pin.updateFramePlacement(model, data, self._frame)
-        self.R_WI = pose.rotation
+        self.R_WI = np.ascontiguousarray(pose.rotation)
         self.p_WI = pose.translation
-        self.J_W = pin.getFrameJacobian(model, data, self._frame, _AXES)
+        self.J_W = np.ascontiguousarray(pin.getFrameJacobian(model, data, self._frame, _AXES))
         self.mobility = data.Minv
-        self.slow_mobility = pin.computeMinverse(self._slow_model, self._slow_data, q)
+        self.slow_mobility = np.ascontiguousarray(pin.computeMinverse(self._slow_model, self._slow_data, q))
         self.gravity = pin.computeGeneralizedGravity(model, data, q)
         self.coriolis = pin.nonLinearEffects(model, data, q, qd) - self.gravity
 

@@ -10,6 +10,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from palpate_control.extrapolation import bridge, carry
+
 Array = NDArray[np.float64]
 
 MAX_EXTRAPOLATION_NS = 30_000_000
@@ -86,11 +88,27 @@ class Reference:
     F_W: Array
     stiffness: Array
     damping_ratio: Array
-    q: Array
-    qd: Array
-    qdd: Array
-    """Acceleration of `q` [rad/s^2], shape (7,); zero in mode CARTESIAN."""
+    joint: Array
+    """Joint position [rad], velocity and acceleration, shape (3, 7); the acceleration is zero in mode CARTESIAN."""
     joint_stiffness: Array
+
+    @property
+    def q(self) -> Array:
+        """Joint position [rad], shape (7,)."""
+        row: Array = self.joint[0]
+        return row
+
+    @property
+    def qd(self) -> Array:
+        """Joint velocity [rad/s], shape (7,)."""
+        row: Array = self.joint[1]
+        return row
+
+    @property
+    def qdd(self) -> Array:
+        """Joint acceleration [rad/s^2], shape (7,)."""
+        row: Array = self.joint[2]
+        return row
 
 
 class Extrapolator:
@@ -103,15 +121,9 @@ class Extrapolator:
     def __init__(self) -> None:
         self._current: Setpoint | None = None
         self._acceleration = np.zeros(7)
-        self._reset_gaps()
+        self._gap = np.zeros(32)  # as `extrapolation.bridge` has it
         self._time = 0
         self._standing = False
-
-    def _reset_gaps(self) -> None:
-        self._gap_p = np.zeros(3)
-        self._gap_R = np.zeros(3)  # rotation vector in world axes
-        self._gap_VF = np.zeros(12)
-        self._gap_joint = np.zeros(14)
 
     @property
     def current(self) -> Setpoint | None:
@@ -122,7 +134,7 @@ class Extrapolator:
         """Forgets the set-point, so that the next one starts afresh."""
         self._current = None
         self._acceleration = np.zeros(7)
-        self._reset_gaps()
+        self._gap[:] = 0.0
         self._standing = False
 
     def accept(self, setpoint: Setpoint, t: int) -> None:
@@ -140,31 +152,43 @@ class Extrapolator:
         self._current = setpoint
         after = self._raw(setpoint, t)
         self._standing = False
-        self._gap_p += before.p_WD - after.p_WD
-        self._gap_R += pin.log3(before.R_WD @ after.R_WD.T)
-        self._gap_VF[:6] += before.V_WD - after.V_WD
-        self._gap_VF[6:] += before.F_W - after.F_W
-        self._gap_joint[:7] += before.q - after.q
-        self._gap_joint[7:] += before.qd - after.qd
+        gap = self._gap
+        gap[:3] += before.p_WD - after.p_WD
+        gap[3:6] += pin.log3(before.R_WD @ after.R_WD.T)
+        gap[6:12] += before.V_WD - after.V_WD
+        gap[12:18] += before.F_W - after.F_W
+        gap[18:25] += before.q - after.q
+        gap[25:] += before.qd - after.qd
 
     def _raw(self, setpoint: Setpoint, t: int) -> Reference:
-        """The set-point extrapolated to `t` alone."""
+        """The set-point extrapolated to `t` alone, in arrays of its own."""
         age_ns = t - setpoint.stamp
         standing = age_ns > MAX_EXTRAPOLATION_NS
         age = min(max(age_ns, -MAX_EXTRAPOLATION_NS), MAX_EXTRAPOLATION_NS) * 1e-9
-        V = setpoint.V_WD
-        acceleration = self._acceleration
+        R, p, V, joint = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty((3, 7))
+        carry(
+            np.ascontiguousarray(setpoint.R_WD),
+            setpoint.p_WD,
+            setpoint.V_WD,
+            setpoint.q,
+            setpoint.qd,
+            self._acceleration,
+            age,
+            standing,
+            R,
+            p,
+            V,
+            joint,
+        )
         return Reference(
             setpoint.mode,
-            pin.exp3(V[3:] * age).dot(setpoint.R_WD),
-            setpoint.p_WD + V[:3] * age,
-            np.zeros(6) if standing else V,
-            setpoint.F_W,
+            R,
+            p,
+            V,
+            setpoint.F_W.copy(),
             setpoint.stiffness,
             setpoint.damping_ratio,
-            setpoint.q + (setpoint.qd + acceleration * (0.5 * age)) * age,
-            np.zeros(7) if standing else setpoint.qd + acceleration * age,
-            np.zeros(7) if standing else acceleration,
+            joint,
             setpoint.joint_stiffness,
         )
 
@@ -176,23 +200,11 @@ class Extrapolator:
         reference = self._raw(setpoint, t)
         if not self._standing and t - setpoint.stamp > MAX_EXTRAPOLATION_NS:
             self._standing = True  # the sender has fallen silent: brake smoothly
-            self._gap_VF[:6] += setpoint.V_WD
-            self._gap_joint[7:] += setpoint.qd
+            self._gap[6:12] += setpoint.V_WD
+            self._gap[25:] += setpoint.qd
         fade = exp(-max(t - self._time, 0) * 1e-9 / SMOOTHING_S) if self._time else 1.0
         self._time = t
         if setpoint.mode is Mode.JOINT:
-            self._gap_joint *= fade
-            reference.q += self._gap_joint[:7]
-            reference.qd = reference.qd + self._gap_joint[7:]
-            return reference
-        self._gap_p *= fade
-        self._gap_R *= fade
-        self._gap_VF *= fade
-        self._gap_joint *= fade
-        reference.p_WD += self._gap_p
-        reference.R_WD = pin.exp3(self._gap_R).dot(reference.R_WD)
-        reference.V_WD = reference.V_WD + self._gap_VF[:6]
-        reference.F_W = reference.F_W + self._gap_VF[6:]
-        reference.q += self._gap_joint[:7]
-        reference.qd = reference.qd + self._gap_joint[7:]
+            self._gap[:18] = 0.0  # a joint reference has no pose of its own
+        bridge(fade, self._gap, reference.R_WD, reference.p_WD, reference.V_WD, reference.F_W, reference.joint)
         return reference

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_control import kernel
+
 Array = NDArray[np.float64]
 
 TORQUE_RATE_NM = 1.0
@@ -24,13 +26,8 @@ class LimitRepulsion:
 
     def torque(self, q: Array) -> Array | None:
         """Torque away from the limits [N m], shape (7,), or None where no joint is in its zone (the usual case)."""
-        off = q - self._middle
-        depth = np.abs(off) - self._half
-        if np.maximum.reduce(depth) <= 0:
-            return None
-        depth = np.maximum(depth, 0.0)
-        push: Array = -np.sign(off) * np.minimum(self._gain * depth * depth, self._cap)
-        return push
+        push = np.empty_like(q)
+        return push if kernel.repulsion(q, self._middle, self._half, self._gain, self._cap, push) else None
 
 
 class TorqueShaper:
@@ -48,7 +45,7 @@ class TorqueShaper:
 
     def shape(self, torque: Array, gravity: Array) -> Array:
         """The torque that may be commanded [N m], shape (7,), such that it and it plus `gravity` are within limits."""
-        low = np.maximum(np.maximum(-self._limit, -self._limit - gravity), self._last - self._rate)
-        high = np.minimum(np.minimum(self._limit, self._limit - gravity), self._last + self._rate)
-        self._last = np.minimum(np.maximum(torque, low), high)
-        return self._last
+        shaped = np.empty_like(torque)
+        kernel.shape(torque, gravity, self._limit, self._rate, self._last, shaped)
+        self._last = shaped
+        return shaped

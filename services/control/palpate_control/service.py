@@ -45,6 +45,20 @@ class ControlService(Service):
         self._facts = {"setpoints": 0, "setpoints_rejected": 0, "joint_states_rejected": 0, "ticks_without_command": 0}
         self._peak = np.zeros(DOF)
         self._problem = ""
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Compiles the law in both modes now: at 1 kHz there is no time for it."""
+        rest = np.zeros(DOF)
+        for mode in Mode:
+            guide = Extrapolator()
+            for stamp in (0, MS):
+                still, gains = np.zeros(6), np.ones(6)
+                guide.accept(
+                    Setpoint(mode, stamp, np.eye(3), np.zeros(3), still, still, gains, gains, rest, rest, np.ones(DOF)), stamp
+                )
+                self._controller.torque(rest, rest, guide.at(stamp))
+        self._controller.reset()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One control tick."""
