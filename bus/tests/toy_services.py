@@ -26,6 +26,7 @@ from palpate_bus.messages import (
     Quaternion,
     RobotStatus,
     String,
+    SupervisorState,
     SurfaceMesh,
     TFMessage,
     ToolState,
@@ -124,6 +125,8 @@ class Planning(Service):
         h = header(t, "world")
         status = inbox.latest("robot/status")
         q = 0.1 * status.applied_torque if status else np.zeros(7)
+        watch = inbox.latest("supervisor/state")
+        q = q + (watch.depth if watch else 0.0)
         end = END if t >= END - NS else -1
         out: dict[str, Any] = {
             "planning/setpoint": ImpedanceSetpoint(
@@ -178,7 +181,16 @@ class Perception(Service):
         return {"perception/surface": SurfaceMesh(header(t), level, np.zeros(0, np.float32), np.zeros(0, np.uint32))}
 
 
-TOYS: dict[str, type[Service]] = {toy.role: toy for toy in (Robot, Control, Tissue, Planning, Assessment, Camera, Perception)}
+class Supervisor(Service):
+    role = "supervisor"
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        depth = min(0.1, abs(float(inbox.latest("robot/status").position[0])))
+        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0)}
+
+
+EVERY = (Robot, Control, Tissue, Planning, Assessment, Camera, Perception, Supervisor)
+TOYS: dict[str, type[Service]] = {toy.role: toy for toy in EVERY}
 
 if __name__ == "__main__":
     main(sys.argv[1], lambda _: TOYS[sys.argv[1]](), lambda _: None)

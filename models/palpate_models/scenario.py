@@ -208,6 +208,14 @@ class Limits(_Section):
     joint_margin_rad: NonNegative = 0.05
     speed_mps: Positive = 0.5
     """Of the tool in free motion."""
+    contact_speed_mps: Positive = 0.25
+    """Of the tool while it presses: at this the supervisor stops."""
+    workspace_min_m: Vec3 = (-0.7, -0.6, -0.1)
+    """Least x, y, z of the tool in the abdomen frame ..."""
+    workspace_max_m: Vec3 = (0.7, 0.6, 1.2)
+    """... and largest."""
+    release_patience_s: NonNegative = 60.0
+    """How long a stopped exam waits for an operator's release before it ends."""
     joint_velocity_scale: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Fraction of the joint velocity limits used in free motion."""
 

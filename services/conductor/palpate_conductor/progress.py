@@ -14,7 +14,7 @@ from palpate_conductor.run import Progress as RunProgress
 
 PHASES = {
     getattr(ExamState, f"PHASE_{name}"): name.lower()
-    for name in ("HOME", "LOOK", "PLAN", "APPROACH", "INDENT", "SCAN", "RETRACT", "RETURN", "ASSESS", "DONE", "ABORTED")
+    for name in ("HOME", "LOOK", "PLAN", "APPROACH", "INDENT", "SCAN", "RETRACT", "RETURN", "ASSESS", "DONE", "ABORTED", "HELD")
 }
 """Phase names by value."""
 

@@ -25,7 +25,7 @@ from palpate_conductor.conductor import Conductor, Patience, RunFailed
 from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
 
-WORKERS = ("robot", "tissue", "control", "planning", "assessment", "camera", "perception")
+WORKERS = ("robot", "tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
 OBSERVERS = ("dashboard", "recorder")
 KNOWS_PHANTOM = frozenset({"tissue"})
 SIM_LIMIT = 3600 * NS

@@ -43,6 +43,8 @@ ASSESS_PATIENCE = 30 * SECOND
 END_AFTER = SECOND
 """The run goes on so long after the exam has ended."""
 AT_HOME_RAD = 0.01
+PALPATING = frozenset({Phase.INDENT, Phase.SCAN, Phase.RETRACT})
+"""Phases in which the strokes of the plan are carried out."""
 
 
 class Exam:
@@ -71,6 +73,7 @@ class Exam:
             Phase.ASSESS: self._assess,
             Phase.DONE: self._rest,
             Phase.ABORTED: self._rest,
+            Phase.HELD: self._held,
         }
         self._since = 0
         self._started = False
@@ -85,6 +88,8 @@ class Exam:
         self._palpation: Palpation | None = None
         self._skipped: dict[int, str] = {}
         self._broken = ""
+        self._held_in = Phase.HOME
+        self._soft = self._released = False
 
     @property
     def surface_offset(self) -> float:
@@ -125,20 +130,100 @@ class Exam:
         """Ends the exam where the arm is; it holds still."""
         assert now.reading is not None
         self._follower.hold(now.reading.q)
-        self._enter(Phase.ABORTED, now.t, f"aborted in phase {self.status.phase.name}: {why}")
+        phase = self._held_in if self.status.phase is Phase.HELD else self.status.phase
+        self._enter(Phase.ABORTED, now.t, f"aborted in phase {phase.name}: {why}")
 
     def _watch(self, now: Observation) -> None:
-        """Ends the exam when the driver holds, an operator stops it, or a service that it needs is gone."""
-        if self.status.phase in (Phase.DONE, Phase.ABORTED):
+        """Holds the exam when it is stopped, ends it when a service that it needs is gone or an operator has had enough."""
+        phase = self.status.phase
+        if phase in (Phase.DONE, Phase.ABORTED):
             return
-        if now.stop:
-            self._abort(now, now.stop)
-        elif now.lost:
-            why = f"lost {', '.join(now.lost)}"
-            if self._palpation is None or self.status.phase not in (Phase.INDENT, Phase.SCAN, Phase.RETRACT):
+        if now.stop and phase is not Phase.HELD:
+            self._hold(now)
+        if now.lost:
+            self._give_up(now, f"lost {', '.join(now.lost)}")
+        elif now.end:
+            self._give_up(now, now.end, go_home=True)
+
+    def _give_up(self, now: Observation, why: str, *, go_home: bool = False) -> None:
+        """Ends the exam: in contact by lifting off and going home, else where the arm is or at home."""
+        held = self.status.phase is Phase.HELD
+        phase = self._held_in if held else self.status.phase
+        if self._palpation is not None and phase in PALPATING:
+            self._palpation.abandon(why)
+            if held and self._soft:
+                self._enter(phase, now.t, why)
+            elif held and not go_home:
                 self._abort(now, why)
+        elif go_home:
+            self._broken = why
+            if held:
+                self._held_in = Phase.RETURN
             else:
-                self._palpation.abandon(why)
+                self._go_home(now, why)
+        else:
+            self._abort(now, why)
+
+    def _go_home(self, now: Observation, why: str) -> None:
+        assert now.reading is not None
+        self._motion = None
+        self._follower.hold(now.reading.q)
+        self._enter(Phase.RETURN, now.t, f"returning home: {why}")
+
+    # --- stopped ------------------------------------------------------------------------------------------------------
+
+    def _hold(self, now: Observation) -> None:
+        """The exam is stopped: it retreats, or leaves the arm to the driver, and remembers where it was."""
+        assert now.reading is not None
+        if self.status.phase is not Phase.HELD:
+            self._held_in = self.status.phase
+        self._soft, self._released = now.soft, False
+        self._motion, self._asked = None, None
+        self._follower.hold(now.reading.q)
+        if self._palpation is not None and self._held_in in PALPATING:
+            self._palpation.pause()
+        self._enter(Phase.HELD, now.t, f"held in phase {self._held_in.name}: {now.stop}")
+
+    def _held(self, now: Observation) -> Setpoint | None:
+        assert now.reading is not None
+        if now.stop and self._released:
+            self._hold(now)
+        if now.stop:
+            self._soft = self._soft and now.soft
+            if now.t - self._since > self._known.limits.release_patience_s * SECOND:
+                waited = self._known.limits.release_patience_s
+                self._abort(now, f"nobody released it within {waited:g} s: {now.stop}")
+            elif self._soft and self._palpation is not None and self._held_in in PALPATING:
+                if self._palpation.free_goal is None:
+                    return self._palpation.step(self._contact).setpoint
+            elif not self._soft:
+                self._follower.hold(now.reading.q)  # the driver holds without stiffness: nothing is to pull when it lets go
+            return None
+        return self._go_on(now)
+
+    def _go_on(self, now: Observation) -> Setpoint | None:
+        """The stop is lifted: back to what was interrupted, by a fresh motion where there was a free one."""
+        self._released = True
+        palpation = self._palpation if self._held_in in PALPATING else None
+        goal = None if palpation is None else palpation.free_goal
+        if self._held_in is Phase.APPROACH and self._plan_made is not None:
+            goal = self._plan_made.approach.q[-1]
+        if goal is not None:
+            try:
+                if not self._move(now, goal):
+                    return None
+            except NoPathError as error:
+                self._abort(now, f"no way back to where it was held: {error}")
+                return None
+        phase, self._motion = self._held_in, None
+        self._enter(phase, now.t, "released, going on")
+        if palpation is not None:
+            if goal is not None:
+                palpation.arrive()
+            else:
+                palpation.resume(self._contact)
+            return self._palpate(now)
+        return None
 
     def _move(self, now: Observation, goal: Array) -> bool:
         """Moves to a posture: plans, then follows. Returns whether it is there. Raises NoPathError."""

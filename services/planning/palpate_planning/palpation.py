@@ -47,6 +47,8 @@ STEADY_FRACTION = 0.5
 CREEP = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
 SOFT_STOPS_MAX = 3
+MOVED_M = 0.02
+"""An arm that was pushed further aside than this while it was held does not go on where it was."""
 
 
 class Doing(Enum):
@@ -93,6 +95,7 @@ class Palpation:
         """Outward shift of the perceived surface that the onset of force asks for [m]."""
         self._soft_stops = 0
         self._resume: float | None = None
+        self._paused = False
         self.skipped: dict[int, str] = {}
         self.failed = ""
         self._k = -1
@@ -135,8 +138,41 @@ class Palpation:
     def abandon(self, why: str) -> None:
         """Lifts off and ends."""
         self.failed = self.failed or why
+        self._paused = False
         if self.doing not in (Doing.LIFT, Doing.DONE):
             self._enter(Doing.LIFT)
+
+    @property
+    def free_goal(self) -> Array | None:
+        """Where the free motion under way ends [rad], shape (7,); None on a path."""
+        free = self._legs[self._k].free
+        return None if free is None or self.failed or self.doing is Doing.DONE else np.asarray(free.q[-1])
+
+    def arrive(self) -> None:
+        """The free motion under way has been made by others: the arm is where it ends."""
+        self._next_leg()
+
+    def pause(self) -> None:
+        """Lifts off along the normal and waits there; `resume` comes back to where it was."""
+        self._paused = True
+        if self.doing in (Doing.DESCEND, Doing.SETTLE, Doing.SLIDE, Doing.HOLD):
+            braking = self._s.velocity**2 / 0.3
+            self._resume = min(self._s.position + braking, self._legs[self._k].path.length)
+            self._enter(Doing.LIFT)
+
+    def resume(self, contact: Contact) -> None:
+        """Goes on after a pause, from where the arm is now: while the driver held, the tissue has pushed it."""
+        self._paused = False
+        path = self._legs[self._k].path
+        if self._legs[self._k].free is None:
+            place = path.at(self._s.position)
+            gap = contact.X_WI[:3, 3] - place.p
+            aside = float(np.linalg.norm(gap - (gap @ place.n) * place.n))
+            if aside > MOVED_M:
+                self.abandon(f"the arm was moved {aside * 1e3:.0f} mm aside while it was held")
+            self._depth = Axis(contact.depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05)
+            self._s = Axis(self._s.position, 0.2 if self._legs[self._k].contact else 0.8, 8.0)
+            self._regulator.reset(contact.depth)
 
     def step(self, contact: Contact) -> Progress:
         """One planning period on, given the measured contact."""
@@ -218,7 +254,7 @@ class Palpation:
     def _lift(self) -> None:
         if self._s.velocity > 1e-4:
             self._s.step(self._s.position + self._s.velocity**2 / 0.3, max(self._s.velocity, 1e-3))
-        if not self._depth.step(-self._height, LIFT_MPS):
+        if not self._depth.step(-self._height, LIFT_MPS) or self._paused:
             return
         if self.failed:
             self._enter(Doing.DONE)
@@ -228,6 +264,9 @@ class Palpation:
             self._next_leg()
 
     def _transfer(self) -> None:
+        if self._paused:
+            self._s.step(self._s.position + self._s.velocity**2 / 1.2, max(self._s.velocity, 1e-3))
+            return
         free = self._legs[self._k].free
         if free is not None:
             self._free_step += 1

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from palpate_bus.codec import Message
-from palpate_bus.contract import MS
-from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import duration_message, header
 from palpate_models.load import exam_input
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 VALID_FOR = 250 * MS
 """The contract's expiry of planning/setpoint."""
-NEEDED = ("robot", "assessment")
+NEEDED = ("robot", "assessment", "supervisor")
 """Roles whose loss ends the exam, whatever its phase."""
 NEEDED_TO_SEE = ("camera", "perception")
 """Roles whose loss ends it until the targets are there."""
@@ -47,18 +47,22 @@ class PlanningService(Service):
         self._surface: Message | None = None
         self._valid = duration_message(VALID_FOR)
         self._peak_force = 0.0
+        self._supervisor_age = (contract().topics["supervisor/state"].max_age_ms or 0) * MS
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One planning period: what is measured, what the exam makes of it, what is to be done."""
         self._read(inbox)
+        stop, soft = _stop(inbox)
         outcome = self._exam.step(
             Observation(
                 t=t,
                 reading=self._reading,
                 seen=self._perceived(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
-                stop=_stop(inbox),
-                lost=self._lost(inbox),
+                stop=stop,
+                soft=soft,
+                end=_end(inbox),
+                lost=self._lost(t, inbox),
             )
         )
         contact = outcome.contact
@@ -123,19 +127,35 @@ class PlanningService(Service):
             noise=float(targets.surface_noise),
         )
 
-    def _lost(self, inbox: Inbox) -> tuple[str, ...]:
+    def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
         seeing = self._exam.status.phase in (Phase.HOME, Phase.LOOK)
-        return tuple(role for role in NEEDED + (NEEDED_TO_SEE if seeing else ()) if inbox.lost(role))
+        gone = tuple(role for role in NEEDED + (NEEDED_TO_SEE if seeing else ()) if inbox.lost(role))
+        heard = inbox.stamp("supervisor/state")
+        if heard is not None and t - heard > self._supervisor_age:
+            gone += (f"the supervisor, silent for {(t - heard) / MS:.0f} ms",)
+        return gone
 
 
-def _stop(inbox: Inbox) -> str:
-    """Why the arm must rest: the driver's safe hold or an operator's stop; empty when all is well."""
+def _stop(inbox: Inbox) -> tuple[str, bool]:
+    """Why the arm must rest, empty when all is well; and whether planning is to retreat rather than the driver to hold."""
     for request in inbox.new("operator/request"):
         if request.request == OperatorRequest.STOP:
-            return f"stopped by the operator: {request.reason}"
+            return f"stopped by the operator: {request.reason}", False
     status = inbox.latest("robot/status")
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
-        return f"the driver holds safely: {status.reason}"
+        return f"the driver holds safely: {status.reason}", False
+    state = inbox.latest("supervisor/state")
+    if state is None or state.level == SupervisorState.LEVEL_OK:
+        return "", False
+    soft = state.level == SupervisorState.LEVEL_SOFT_STOP
+    return f"{'soft' if soft else 'emergency'} stop of the supervisor: {state.reason}", soft
+
+
+def _end(inbox: Inbox) -> str:
+    """Why the exam is to end, if an operator has just said so."""
+    for request in inbox.new("operator/request"):
+        if request.request == OperatorRequest.END:
+            return f"ended by the operator: {request.reason}"
     return ""
 
 

@@ -31,6 +31,7 @@ class Phase(IntEnum):
     ASSESS = 8
     DONE = 9
     ABORTED = 10
+    HELD = 11
 
 
 PHASE_OF: Final = {
@@ -63,7 +64,11 @@ class Observation:
     """Perception's answer, at the step at which it came."""
     findings_final: bool = False
     stop: str = ""
-    """Why the driver holds safely or the operator stops; empty when all is well."""
+    """Why the arm must rest; empty when all is well."""
+    soft: bool = False
+    """Whether the stop leaves the arm to planning, which is to retreat along the normal; else the driver holds."""
+    end: str = ""
+    """Why the exam is to go home and end, once."""
     lost: tuple[str, ...] = ()
     """Roles whose services are gone."""
 

@@ -14,6 +14,9 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
+_ONE_AT_A_TIME = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
+"""A thought that is not wanted any more goes on to its end; the next must not start beside it on the same planner."""
+
 
 class Thought(Generic[T]):
     """One piece of work: started at `t` [ns], its result taken at `t + budget`. `work` must share no state with the steps."""
@@ -21,9 +24,7 @@ class Thought(Generic[T]):
     def __init__(self, t: int, budget: int, work: Callable[[], T], *, lockstep: bool = True) -> None:
         self._due = t + budget
         self._lockstep = lockstep
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
-        self._future: Future[T] = self._pool.submit(work)
-        self._pool.shutdown(wait=False)
+        self._future: Future[T] = _ONE_AT_A_TIME.submit(work)
 
     def due(self, t: int) -> bool:
         """Whether its time has come."""

@@ -90,7 +90,7 @@ class World:
         self.t = 0
         self.depth = self.pressed = 0.0
         self.answers: list[Seen | Unseen] = [self.dome]
-        self.stop, self.lost = "", ()
+        self.stop, self.soft, self.end, self.lost = "", False, "", ()
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
         self.setpoints: list[Setpoint] = []
         self._answer_at: int | None = None
@@ -135,13 +135,15 @@ class World:
             answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
         final = self.exam.status.phase is Phase.ASSESS
         reading = Reading(self.q.copy(), wrench, qd)
-        outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.lost))
+        outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.soft, self.end, self.lost))
+        self.end = ""
         if outcome.trigger:
             self._answer_at = self.t + 300 * MS
         status = self.exam.status
         self.rows.append((status.phase, status.steady, status.force_limited, status.depth_setpoint, self.depth, self.pressed))
         self.setpoints.append(outcome.setpoint)
-        self._obey(outcome.setpoint)
+        if not self.stop or self.soft:  # else the driver holds
+            self._obey(outcome.setpoint)
         self.t += 10 * MS
         return outcome
 

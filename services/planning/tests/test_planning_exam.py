@@ -208,20 +208,6 @@ def test_silent_perception_is_tried_again_and_given_up() -> None:
     assert "no answer from perception" in world.exam.status.message
 
 
-def test_safe_hold_aborts_and_holds_still() -> None:
-    world = World(known())
-    world.run(lambda: world.exam.status.phase is Phase.SCAN)
-    world.stop = "the driver holds safely: torque limit at lbr_A2"
-    outcome = world.step()
-    status = world.exam.status
-    assert status.phase is Phase.ABORTED
-    assert "torque limit at lbr_A2" in status.message
-    assert "SCAN" in status.message
-    assert status.end_tick == world.t - 10_000_000 + 1_000_000_000
-    assert outcome.setpoint.mode is ControlMode.JOINT
-    assert not outcome.setpoint.qd.any()
-
-
 def test_lost_assessment_in_contact_lifts_off() -> None:
     world = World(known())
     world.run(lambda: world.exam.status.phase is Phase.SCAN)

@@ -14,6 +14,7 @@ from palpate_bus.messages import (
     OperatorRequest,
     PalpationTargets,
     RobotStatus,
+    SupervisorState,
     SurfaceMesh,
 )
 from palpate_bus.stamps import header, nanoseconds
@@ -189,8 +190,8 @@ def test_the_arm_is_held_where_it_was_found() -> None:
     assert np.all(out["planning/setpoint"].joint_stiffness > 0)
 
 
-@pytest.mark.parametrize("cause", ["hold", "operator", "robot"])
-def test_holds_stops_and_losses_abort(cause: str) -> None:
+@pytest.mark.parametrize("cause", ["hold", "operator", "soft", "robot"])
+def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     service = create(Scenario(robot=BASE))
     inbox = FakeInbox()
     q = np.array(lbr.HOME)
@@ -202,12 +203,19 @@ def test_holds_stops_and_losses_abort(cause: str) -> None:
         inbox.put("robot/status", hold)
     elif cause == "operator":
         inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
+    elif cause == "soft":
+        soft = SupervisorState(header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0)
+        inbox.put("supervisor/state", soft)
     else:
         inbox.gone.add("robot")
     state = sent(service.step(20_000_000, inbox))["exam/state"]
-    assert state.phase == Phase.ABORTED
-    assert {"hold": "force 41 N", "operator": "enough", "robot": "lost robot"}[cause] in state.message
-    assert state.end_tick == 1_020_000_000
+    assert {"hold": "force 41 N", "operator": "enough", "soft": "depth 27 mm", "robot": "lost robot"}[cause] in state.message
+    if cause == "robot":
+        assert state.phase == Phase.ABORTED
+        assert state.end_tick == 1_020_000_000
+    else:
+        assert state.phase == Phase.HELD
+        assert state.end_tick == -1
 
 
 def test_pose_message_round_trip() -> None:

@@ -35,6 +35,7 @@ _TransformStamped: Any = message_type("geometry_msgs/msg/TransformStamped")
 _TFMessage: Any = message_type("tf2_msgs/msg/TFMessage")
 _ToolState: Any = message_type("palpation_msgs/msg/ToolState")
 _RobotStatus: Any = message_type("palpation_msgs/msg/RobotStatus")
+_Supervisor: Any = message_type("palpation_msgs/msg/SupervisorState")
 _Request: Any = message_type("palpation_msgs/msg/OperatorRequest")
 
 _TICK = round(DT * NS)
@@ -67,6 +68,7 @@ class RobotService(Service):
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
         self._command: Command | None = None
+        self._releases = 0
         self._command_message: Message | None = None
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
@@ -110,8 +112,12 @@ class RobotService(Service):
         for message in inbox.new("operator/request"):
             if message.request == _Request.STOP:
                 self._driver.hold(t, Cause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
-            elif message.request == _Request.RELEASE:
+        for message in inbox.new("supervisor/state"):
+            if message.releases != self._releases:
+                self._releases = message.releases
                 self._driver.release(t)
+            if message.level == _Supervisor.LEVEL_EMERGENCY:
+                self._driver.hold(t, Cause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
 
     def _drive(self, t: int, inbox: Inbox) -> None:
         """Driver, then plant, up to `t`. The first tick is the state at the start."""

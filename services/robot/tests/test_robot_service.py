@@ -16,6 +16,7 @@ from palpate_robot.service import RobotService, create
 MS = 1_000_000
 STATUS = message_type("palpation_msgs/msg/RobotStatus")
 REQUEST = message_type("palpation_msgs/msg/OperatorRequest")
+SUPERVISOR = message_type("palpation_msgs/msg/SupervisorState")
 COMMAND = message_type("palpation_msgs/msg/JointTorqueCommand")
 WRENCH = message_type("geometry_msgs/msg/WrenchStamped")
 PARTS = message_type("geometry_msgs/msg/Wrench")
@@ -60,6 +61,10 @@ class Rig:
 
     def request(self, request: int) -> None:
         self.inbox.events["operator/request"] = [REQUEST(header(self.t), request, "test")]
+
+    def supervise(self, level: int, releases: int = 0) -> None:
+        state = SUPERVISOR(header(self.t), level, SUPERVISOR.CAUSE_FORCE, "force 41 N", releases, 41.0, 0.0, 0.0)
+        self.inbox.events["supervisor/state"] = [state]
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):
@@ -176,7 +181,7 @@ def test_silent_controller_brings_a_latched_hold_at_its_expiry(rig: Rig) -> None
     rig.servo(100)
     assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_COMMAND_EXPIRED), "new commands do not unlatch it"
     assert rig.status.reason
-    rig.request(REQUEST.RELEASE)
+    rig.supervise(SUPERVISOR.LEVEL_OK, releases=1)
     rig.servo(20)
     assert rig.mode == (STATUS.MODE_ACTIVE, STATUS.CAUSE_NONE)
 
@@ -193,6 +198,21 @@ def test_operator_stops(rig: Rig) -> None:
     rig.request(REQUEST.STOP)
     rig.tick()
     assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_STOP_REQUESTED)
+
+
+def test_the_supervisor_stops_and_releases_the_driver(rig: Rig) -> None:
+    rig.servo(50)
+    rig.supervise(SUPERVISOR.LEVEL_SOFT_STOP)
+    rig.servo(20)
+    assert rig.mode[0] == STATUS.MODE_ACTIVE, "a soft stop is planning's"
+    rig.supervise(SUPERVISOR.LEVEL_EMERGENCY)
+    rig.tick()
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_STOP_REQUESTED)
+    rig.servo(20)
+    assert rig.mode[0] == STATUS.MODE_SAFE_HOLD
+    rig.supervise(SUPERVISOR.LEVEL_OK, releases=1)
+    rig.servo(20)
+    assert rig.mode[0] == STATUS.MODE_ACTIVE
 
 
 def test_nan_is_rejected_and_the_arm_does_not_jump(rig: Rig) -> None:

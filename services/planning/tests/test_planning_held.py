@@ -1,0 +1,113 @@
+"""A stopped examination: it waits, goes on where it was, or ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from palpate_models import lbr
+from palpate_planning.setpoint import ControlMode
+from palpate_planning.status import Phase
+from planning_fakes import World, known
+
+PHASES = [Phase.HOME, Phase.LOOK, Phase.PLAN, Phase.APPROACH, Phase.INDENT, Phase.SCAN, Phase.RETRACT, Phase.RETURN]
+
+
+def stopped_in(phase: Phase, *, soft: bool, seconds: float = 1.0) -> World:
+    world = World(known(region_m=(0.025, 0.0125)))
+    world.q = world.q + np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    world.run(lambda: world.exam.status.phase is phase)
+    for _ in range(20):
+        world.step()
+    if world.exam.status.phase is not phase:  # shorter than that
+        world = World(known(region_m=(0.025, 0.0125)))
+        world.run(lambda: world.exam.status.phase is phase)
+    world.stop, world.soft = "force 26 N", soft
+    for _ in range(round(seconds / 0.01)):
+        world.step()
+    return world
+
+
+@pytest.mark.parametrize("soft", [True, False], ids=["soft", "emergency"])
+@pytest.mark.parametrize("phase", PHASES, ids=lambda phase: phase.name)
+def test_released_it_goes_on_and_misses_nothing(phase: Phase, soft: bool) -> None:
+    world = stopped_in(phase, soft=soft)
+    status = world.exam.status
+    assert status.phase is Phase.HELD
+    assert "force 26 N" in status.message and phase.name in status.message
+    assert status.end_tick < 0
+    world.stop = ""
+    world.run()
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.exam.status.targets_skipped == 0
+    centres = np.array([s.X_WI[:3, 3] for s, row in zip(world.setpoints, world.rows, strict=True) if row[1]])
+    for target in world.dome.positions:
+        assert np.linalg.norm(centres - target, axis=1).min() < 0.009
+    assert max(row[5] for row in world.rows) < 5.0, "going on presses no harder than before"
+
+
+def test_a_soft_stop_in_contact_retreats_along_the_normal_and_waits() -> None:
+    world = stopped_in(Phase.SCAN, soft=True, seconds=0.5)
+    assert world.pressed == 0.0
+    assert world.depth < -0.005
+    where = world.kinematics.pose(world.q)[:3, 3]
+    for _ in range(100):
+        world.step()
+    assert np.linalg.norm(world.kinematics.pose(world.q)[:3, 3] - where) < 1e-3
+
+
+def test_in_an_emergency_stop_nothing_pulls_at_the_arm() -> None:
+    world = stopped_in(Phase.SCAN, soft=False)
+    world.q = world.q + 0.01
+    outcome = world.step()
+    assert outcome.setpoint.mode is ControlMode.JOINT
+    assert np.array_equal(outcome.setpoint.q, world.q)
+    assert not outcome.setpoint.qd.any()
+
+
+def test_a_soft_stop_that_becomes_an_emergency_stop_is_left_to_the_driver() -> None:
+    world = stopped_in(Phase.SCAN, soft=True, seconds=0.05)
+    world.soft = False
+    assert world.step().setpoint.mode is ControlMode.JOINT
+    world.stop = ""
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+
+
+@pytest.mark.parametrize("phase", [Phase.HOME, Phase.PLAN, Phase.SCAN], ids=lambda phase: phase.name)
+@pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "running"])
+def test_an_operator_who_has_had_enough_gets_the_arm_home(phase: Phase, stopped: bool) -> None:
+    world = stopped_in(phase, soft=False, seconds=1.0 if stopped else 0.0)
+    world.stop = world.stop if stopped else ""
+    world.end = "ended by the operator: enough"
+    world.step()
+    world.stop = ""
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+    assert "ended by the operator: enough" in world.exam.status.message
+    assert np.abs(world.q - lbr.HOME).max() < 0.02
+    assert world.pressed == 0.0
+
+
+def test_nobody_releases_it() -> None:
+    world = stopped_in(Phase.SCAN, soft=False)
+    world.run()
+    status = world.exam.status
+    assert status.phase is Phase.ABORTED
+    assert "nobody released it within 60 s" in status.message and "SCAN" in status.message
+    assert world.t == pytest.approx(status.end_tick - 1_000_000_000 + 10_000_000)
+
+
+def test_an_arm_that_was_pushed_aside_does_not_go_on_pressing() -> None:
+    world = stopped_in(Phase.SCAN, soft=False)
+    world.q = world.q + np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    world.stop = ""
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+    assert "aside" in world.exam.status.message
+
+
+def test_lost_perception_while_held_ends_it() -> None:
+    world = stopped_in(Phase.LOOK, soft=True)
+    world.lost = ("perception",)
+    world.run()
+    assert "lost perception" in world.exam.status.message

@@ -1,0 +1,77 @@
+"""The stop that stays: what a breach latches, when a soft stop becomes an emergency stop, when a release is granted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from palpate_supervisor.watch import Breach, Cause, Level
+
+HEED = 200_000_000
+"""A soft stop whose cause is still there so much later [ns] has not been heeded: emergency stop."""
+GRACE = 50_000_000
+"""Within this time of a release [ns] the driver's old hold is passed over: the word has to reach it."""
+RECOVERABLE = frozenset({Cause.DEPTH, Cause.WORKSPACE})
+"""Causes that only motion can end: released, they are passed over until the tool is back within the limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A stop that was latched."""
+
+    t: int
+    """[ns]"""
+    level: Level
+    cause: Cause
+    reason: str
+
+
+class Latch:
+    """Level, cause and reason that stand until released."""
+
+    def __init__(self) -> None:
+        self.level = Level.OK
+        self.cause = Cause.NONE
+        self.reason = ""
+        self.releases = 0
+        """Granted so far."""
+        self.stops: list[Stop] = []
+        """Every stop so far; one that grew worse counts again."""
+        self._since = 0
+        self._released = -GRACE
+        self._recovering: set[Cause] = set()
+
+    def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
+        """One period at `t` [ns]: what does not hold now, and whether an operator asks for release."""
+        self._recovering &= {breach.cause for breach in breaches}
+        fresh = t - self._released < GRACE
+        standing = [b for b in breaches if b.cause not in self._recovering and not (fresh and b.cause is Cause.DRIVER)]
+        if release:
+            standing = self._release(t, standing)
+        for breach in sorted(standing, key=lambda breach: -breach.level):
+            self._take(t, breach)
+        same = any(breach.cause is self.cause for breach in standing)
+        if self.level is Level.SOFT_STOP and same and t - self._since > HEED:
+            words = f"soft stop not heeded within {HEED / 1e6:.0f} ms: {self.reason}"
+            self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, words))
+
+    def _take(self, t: int, breach: Breach) -> None:
+        if breach.level > self.level:
+            self._latch(t, breach)
+
+    def _latch(self, t: int, breach: Breach) -> None:
+        self.level, self.cause, self.reason = breach.level, breach.cause, breach.reason
+        self._since = t
+        self.stops.append(Stop(t, breach.level, breach.cause, breach.reason))
+
+    def _release(self, t: int, standing: list[Breach]) -> list[Breach]:
+        """Grants a release unless something that motion cannot mend still stands; returns what is still to be judged."""
+        against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not Cause.DRIVER]
+        if against:
+            self.reason = f"release refused: {against[0].reason}"
+            return standing
+        self._recovering = {breach.cause for breach in standing} & RECOVERABLE
+        self.level, self.cause, self.reason = Level.OK, Cause.NONE, ""
+        self.releases += 1
+        self._released = t
+        return []

@@ -1,0 +1,130 @@
+"""The supervisor on the bus: messages to numbers and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.stamps import NS, header
+from palpate_models.frames import inverse
+from palpate_models.load import exam_input
+from palpate_models.scenario import ExamInput, Scenario
+
+from palpate_supervisor.latch import Latch
+from palpate_supervisor.tool import RestSurface, Tool, ToolSense
+from palpate_supervisor.watch import Breach, Cause, Level, Watch
+
+Array = NDArray[np.float64]
+
+NOWHERE = -1.0
+"""Depth [m] while no surface is known."""
+MOVES = ("control", "planning")
+"""Roles without which the arm must stand still."""
+LISTENS = ("assessment",)
+"""Roles without which there is no reason to go on pressing."""
+WATCHED = ("robot/status", "exam/state")
+"""Topics whose age is watched."""
+
+
+class SupervisorService(Service):
+    """Watches the examination and stops it. Of control and planning it knows no more than whether they live."""
+
+    role: ClassVar[str] = "supervisor"
+
+    def __init__(self, known: ExamInput) -> None:
+        self._radius = known.robot.indenter_radius_m
+        self._sense = ToolSense(known.robot)
+        self._watch = Watch(known.limits, inverse(np.array(known.X_WA)))
+        self._surface: RestSurface | None = None
+        self._latch = Latch()
+        topics = contract().topics
+        self._ages = {name: (topics[name].max_age_ms or 0) * MS for name in WATCHED}
+        self._tool = Tool(np.zeros(3), 0.0, 0.0)
+        self._depth = NOWHERE
+        self._peak_force = self._peak_speed = 0.0
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """One period: measure, judge, latch."""
+        release = False
+        breaches = self._presence(t, inbox)
+        for request in inbox.new("operator/request"):
+            if request.request == OperatorRequest.STOP:
+                breaches.append(Breach(Level.EMERGENCY, Cause.OPERATOR, f"stopped by the operator: {request.reason}"))
+            else:
+                release = True
+        for mesh in inbox.new("perception/surface"):
+            breaches += self._perceive(mesh)
+        if inbox.new("robot/status"):
+            breaches += self._measure(inbox.latest("robot/status"))
+        self._latch.update(t, breaches, release)
+        latch, tool = self._latch, self._tool
+        state = SupervisorState(
+            header(t), int(latch.level), int(latch.cause), latch.reason, latch.releases, tool.force, self._depth, tool.speed
+        )
+        return {"supervisor/state": state}
+
+    def finish(self) -> Mapping[str, Any]:
+        """Every stop with its cause, granted releases, and the largest force [N] and speed [m/s] seen."""
+        stops = [
+            {"t_s": stop.t / NS, "level": stop.level.name, "cause": stop.cause.name, "reason": stop.reason}
+            for stop in self._latch.stops
+        ]
+        return {
+            "stops": stops,
+            "releases": self._latch.releases,
+            "peak_external_force_N": self._peak_force,
+            "peak_tool_speed_mps": self._peak_speed,
+        }
+
+    def _presence(self, t: int, inbox: Inbox) -> list[Breach]:
+        """Who is gone, and who has said nothing for too long."""
+        found = [
+            Breach(level, Cause.LOST, f"the service of role {role} is gone")
+            for roles, level in ((MOVES, Level.EMERGENCY), (LISTENS, Level.SOFT_STOP))
+            for role in roles
+            if inbox.lost(role)
+        ]
+        for name, limit in self._ages.items():
+            heard = inbox.stamp(name)
+            if heard is not None and t - heard > limit:
+                words = f"nothing on {name} for {(t - heard) / 1e6:.0f} ms, limit {limit / 1e6:.0f} ms"
+                found.append(Breach(Level.EMERGENCY, Cause.SILENT, words))
+        return found
+
+    def _perceive(self, mesh: Any) -> list[Breach]:
+        vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
+        normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
+        if not len(vertices):
+            return []
+        try:
+            self._surface = RestSurface(vertices, normals, self._radius)
+        except ValueError as error:
+            return [Breach(Level.SOFT_STOP, Cause.INVALID, f"perception/surface: {error}")]
+        return []
+
+    def _measure(self, status: Any) -> list[Breach]:
+        force, moment = status.wrench.force, status.wrench.torque
+        wrench = np.array((force.x, force.y, force.z, moment.x, moment.y, moment.z))
+        q, qd = np.array(status.position), np.array(status.velocity)
+        for name, values in (("position", q), ("velocity", qd), ("wrench", wrench)):
+            if not np.isfinite(values).all():
+                return [Breach(Level.EMERGENCY, Cause.INVALID, f"robot/status: {name} = {values}: must be finite")]
+        self._tool = tool = self._sense.sense(q, qd, wrench)
+        self._peak_force = max(self._peak_force, tool.force)
+        self._peak_speed = max(self._peak_speed, tool.speed)
+        depth = None if self._surface is None else self._surface.depth(tool.p_W)
+        self._depth = NOWHERE if depth is None else min(max(depth, NOWHERE), 0.2)
+        found = self._watch.judge(tool, depth)
+        if status.mode == RobotStatus.MODE_SAFE_HOLD:
+            found.append(Breach(Level.EMERGENCY, Cause.DRIVER, f"the driver holds safely: {status.reason}"))
+        return found
+
+
+def create(scenario: Scenario) -> SupervisorService:
+    """The supervisor of a scenario; it gets no phantom."""
+    return SupervisorService(exam_input(scenario))

@@ -1,0 +1,122 @@
+"""What is judged: measured values against the scenario's limits. Numbers in, breaches out."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.scenario import Limits
+
+from palpate_supervisor.tool import Tool
+
+Array = NDArray[np.float64]
+
+PERIOD_S = 0.01
+LOOKAHEAD_S = 0.05
+"""A force that will be over its limit so much later counts as over it: a retreat begins 20 to 30 ms after the stop."""
+FAST_NPS = 30.0
+"""Only a force that rises faster than this is judged by where it will be [N/s]; slower ones planning can deal with."""
+RATE_SAMPLES = 3
+"""The rate of force is taken over so many periods."""
+PATIENCE_S = 0.05
+"""Planning retreats by itself at the soft limit; the supervisor steps in when the force stays over it for so long."""
+SPEED_MARGIN = 1.3
+"""Free motion is planned to reach `speed_mps`; the arm overshoots it by some percent."""
+DEPTH_MARGIN_M = 0.005
+"""How wrong the perceived surface may be before depth means anything [A]: planning counts it from the onset of force."""
+CONTACT_N = 3.0
+"""Untared force that is surely contact: more than the sensor's bias."""
+
+
+class Level(IntEnum):
+    """Values of `palpation_msgs/SupervisorState.level`."""
+
+    OK = 0
+    SOFT_STOP = 1
+    EMERGENCY = 2
+
+
+class Cause(IntEnum):
+    """Values of `palpation_msgs/SupervisorState.cause`."""
+
+    NONE = 0
+    FORCE = 1
+    DEPTH = 2
+    SPEED = 3
+    WORKSPACE = 4
+    LOST = 5
+    SILENT = 6
+    INVALID = 7
+    OPERATOR = 8
+    DRIVER = 9
+    UNHEEDED = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Breach:
+    """A limit that does not hold now."""
+
+    level: Level
+    cause: Cause
+    reason: str
+
+
+class Watch:
+    """Judges the tool, once a period."""
+
+    def __init__(self, limits: Limits, X_AW: Array) -> None:
+        """`X_AW`: world in the abdomen frame, in which the workspace is given, shape (4, 4)."""
+        self._limits = limits
+        self._X_AW = X_AW
+        self._forces: deque[float] = deque(maxlen=RATE_SAMPLES + 1)
+        self._over_s = 0.0
+
+    def judge(self, tool: Tool, depth: float | None) -> list[Breach]:
+        """Breaches of this period; `depth` [m] below the perceived surface, None while none is known."""
+        found = [*self._force(tool.force), *self._speed(tool), *self._workspace(tool.p_W)]
+        if depth is not None:
+            found += self._depth(depth, tool.force)
+        return found
+
+    def _force(self, force: float) -> list[Breach]:
+        limits, forces = self._limits, self._forces
+        forces.append(force)
+        rate = (forces[-1] - forces[0]) / ((len(forces) - 1) * PERIOD_S) if len(forces) > RATE_SAMPLES else 0.0
+        soon = force + (rate * LOOKAHEAD_S if rate > FAST_NPS else 0.0)
+        self._over_s = self._over_s + PERIOD_S if force > limits.force_soft_stop_n else 0.0
+        words = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
+        if soon > limits.force_emergency_n:
+            return [Breach(Level.EMERGENCY, Cause.FORCE, f"{words}, emergency limit {limits.force_emergency_n:g} N")]
+        if self._over_s > PATIENCE_S or soon > limits.force_soft_stop_n >= force:
+            return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{words}, soft-stop limit {limits.force_soft_stop_n:g} N")]
+        return []
+
+    def _depth(self, depth: float, force: float) -> list[Breach]:
+        limit = self._limits.depth_m + DEPTH_MARGIN_M
+        if depth <= limit:
+            return []
+        # Without a force there is no tissue there: the arm is beside the abdomen, which the workspace watches.
+        level = Level.EMERGENCY if depth > limit + DEPTH_MARGIN_M and force > CONTACT_N else Level.SOFT_STOP
+        words = f"depth {depth * 1e3:.1f} mm below the perceived surface"
+        return [Breach(level, Cause.DEPTH, f"{words}, limit {limit * 1e3:.1f} mm")] if force > CONTACT_N else []
+
+    def _speed(self, tool: Tool) -> list[Breach]:
+        free = self._limits.speed_mps * SPEED_MARGIN
+        if tool.speed > free:
+            return [Breach(Level.EMERGENCY, Cause.SPEED, f"tool moves at {tool.speed:.2f} m/s, limit {free:.2f} m/s")]
+        contact = self._limits.contact_speed_mps
+        if tool.force > CONTACT_N and tool.speed > contact:
+            words = f"tool moves at {tool.speed:.2f} m/s with {tool.force:.1f} N on it, limit in contact {contact:.2f} m/s"
+            return [Breach(Level.EMERGENCY, Cause.SPEED, words)]
+        return []
+
+    def _workspace(self, p_W: Array) -> list[Breach]:
+        p_A = self._X_AW[:3, :3] @ p_W + self._X_AW[:3, 3]
+        for axis, value, low, high in zip("xyz", p_A, self._limits.workspace_min_m, self._limits.workspace_max_m, strict=True):
+            if not low <= value <= high:
+                words = f"tool at {axis} = {value:.3f} m in the abdomen frame, allowed {low:g} to {high:g} m"
+                return [Breach(Level.EMERGENCY, Cause.WORKSPACE, words)]
+        return []

@@ -1,0 +1,101 @@
+"""Limits one by one, on numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from palpate_models import lbr
+from palpate_models.load import exam_input, load_scenario
+from palpate_models.scenario import Limits
+from palpate_supervisor.tool import RestSurface, Tool, ToolSense
+from palpate_supervisor.watch import Breach, Cause, Level, Watch
+
+KNOWN = exam_input(load_scenario("rlq_guarding"))
+ABOVE = np.array([0.56, 0.0, 1.0])
+
+
+def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth: float | None = None) -> list[Breach]:
+    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    for _ in range(20):  # long enough for what needs patience, and without a rate
+        found = watch.judge(Tool(p_W, speed, force), depth)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("values", "level", "cause"),
+    [
+        ({"force": 26.0}, Level.SOFT_STOP, Cause.FORCE),
+        ({"force": 41.0}, Level.EMERGENCY, Cause.FORCE),
+        ({"speed": 0.7}, Level.EMERGENCY, Cause.SPEED),
+        ({"speed": 0.3, "force": 5.0}, Level.EMERGENCY, Cause.SPEED),
+        ({"depth": 0.027, "force": 9.0}, Level.SOFT_STOP, Cause.DEPTH),
+        ({"depth": 0.031, "force": 9.0}, Level.EMERGENCY, Cause.DEPTH),
+        ({"p_W": np.array([0.56, 0.0, 0.80])}, Level.EMERGENCY, Cause.WORKSPACE),
+        ({"p_W": np.array([0.56, 0.7, 1.2])}, Level.EMERGENCY, Cause.WORKSPACE),
+    ],
+)
+def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object], level: Level, cause: Cause) -> None:
+    (breach,) = judge(**values)  # type: ignore[arg-type]
+    assert (breach.level, breach.cause) == (level, cause)
+    assert any(character.isdigit() for character in breach.reason)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"force": 15.0, "depth": 0.02, "speed": 0.1},
+        {"speed": 0.55, "force": 1.8},
+        {"depth": 0.1},
+        {"p_W": np.array([0.2548758, 0.02, 1.68598239])},
+    ],
+)
+def test_what_an_examination_does_is_no_breach(values: dict[str, object]) -> None:
+    assert judge(**values) == []  # type: ignore[arg-type]
+
+
+def test_a_force_that_rises_fast_is_stopped_before_the_limit() -> None:
+    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    forces = 100.0 * 0.01 * np.arange(60)  # 100 N/s, as on something rigid
+    first = next(f for f in forces if watch.judge(Tool(ABOVE, 0.0, f), None))
+    assert 19.0 < first <= 21.0
+
+
+def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
+    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    for force in (*np.linspace(10.0, 24.9, 150), 25.3, 25.4, 25.2, 24.0, 21.0):
+        assert watch.judge(Tool(ABOVE, 0.0, float(force)), None) == []
+
+
+def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:
+    sense = ToolSense(KNOWN.robot)
+    q = np.array(lbr.HOME)
+    weight = KNOWN.robot.tool_mass_kg * 9.81
+    hanging = np.array([0.0, 0.0, weight, 0.0, 0.0, 0.0])  # tool straight down: +z reads its weight
+    tool = sense.sense(q, np.zeros(7), hanging)
+    assert tool.force == pytest.approx(0.0, abs=0.01)
+    pressed = sense.sense(q, np.zeros(7), hanging - np.array([0.0, 0.0, 7.0, 0.0, 0.0, 0.0]))
+    assert pressed.force == pytest.approx(7.0, abs=0.01)
+
+
+def test_speed_is_that_of_the_sphere() -> None:
+    sense = ToolSense(KNOWN.robot)
+    q, qd = np.array(lbr.HOME), np.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2, 0.5])
+    step = 1e-5
+    a, b = (sense.sense(q + s * qd, qd, np.zeros(6)).p_W for s in (-step, step))
+    assert sense.sense(q, qd, np.zeros(6)).speed == pytest.approx(float(np.linalg.norm(b - a)) / (2 * step), rel=1e-4)
+
+
+def test_depth_over_a_dome_is_that_of_geometry() -> None:
+    R, r = 0.25, 0.015
+    x, y = np.meshgrid(np.arange(-0.05, 0.05, 0.005), np.arange(-0.05, 0.05, 0.005))
+    p = np.column_stack((x.ravel(), y.ravel(), np.sqrt(R**2 - x.ravel() ** 2 - y.ravel() ** 2)))
+    surface = RestSurface(p, p / R, r)
+    for direction in ((0.0, 0.0, 1.0), (0.08, -0.05, 1.0), (-0.11, 0.02, 1.0)):
+        n = np.array(direction) / np.linalg.norm(direction)
+        assert surface.depth(n * (R - 0.010 + r)) == pytest.approx(0.010, abs=1e-4)
+
+
+@pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
+def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="perceived surface"):
+        RestSurface(bad, bad, 0.015)
