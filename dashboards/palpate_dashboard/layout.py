@@ -13,10 +13,11 @@ def _eye(position: tuple[float, float, float], target: tuple[float, float, float
     return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=up)
 
 
+def _whole_past() -> Any:
+    return rrb.VisibleTimeRange(TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative())
+
+
 def _scene() -> Any:
-    whole_past = rrb.VisibleTimeRange(
-        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-    )
     hidden = rrb.EntityBehavior(visible=False)
     return rrb.Spatial3DView(
         name="Examination (world frame, m)",
@@ -24,9 +25,9 @@ def _scene() -> Any:
         contents=["+ $origin/**", "- /world/camera/depth"],
         background=(24, 27, 33),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, color=(255, 255, 255, 18)),
-        eye_controls=_eye((1.22, -0.72, 1.66), (0.41, -0.02, 1.12), (0.0, 0.0, 1.0)),
+        eye_controls=_eye((0.98, -1.22, 1.90), (0.40, 0.02, 1.10), (0.0, 0.0, 1.0)),
         overrides={
-            "/world/tool/travelled": rrb.VisibleTimeRanges([whole_past]),
+            "/world/tool/travelled": rrb.VisibleTimeRanges([_whole_past()]),
             "/world/perception/normals": hidden,
             "/world/perception/surface": hidden,
         },
@@ -54,15 +55,37 @@ def _plot(name: str, origin: str, low: float, high: float) -> Any:
     )
 
 
-def blueprint(region_m: tuple[float, float], centre_m: tuple[float, float], depth_m: float, force_limit_n: float) -> Any:
-    """The layout for an exam of `region_m` about `centre_m` at `depth_m`, with its working limit."""
+Bounds = tuple[tuple[float, float], tuple[float, float]]
+
+
+def _force_depth(bounds: Bounds) -> Any:
+    (x0, x1), (y0, y1) = bounds
+    return rrb.Spatial2DView(
+        name="Force over depth",
+        origin="/force_depth",
+        background=(14, 16, 20),
+        visual_bounds=rrb.VisualBounds2D(x_range=(x0, x1), y_range=(y0, y1)),
+        overrides={"/force_depth/past": rrb.VisibleTimeRanges([_whole_past()])},
+    )
+
+
+def blueprint(
+    region_m: tuple[float, float], centre_m: tuple[float, float], depth_m: float, force_limit_n: float, plane: Bounds
+) -> Any:
+    """The layout for an exam of `region_m` about `centre_m` at `depth_m`, with its working limit.
+
+    `plane`: what of the force-depth plane is shown.
+    """
     left = rrb.Vertical(
         _scene(),
         rrb.Horizontal(
             _map("mean", "Stiffness / background", region_m, centre_m),
-            _map("band", "Half width of the 90 % band", region_m, centre_m),
-            rrb.Spatial2DView(name="Depth image", origin="/world/camera", contents=["/world/camera/depth"]),
-            column_shares=[1, 1, 1.2],
+            _map("band", "Uncertainty (90 % band)", region_m, centre_m),
+            rrb.Tabs(
+                _force_depth(plane),
+                rrb.Spatial2DView(name="Depth image [m]", origin="/world/camera", contents=["/world/camera/depth"]),
+            ),
+            column_shares=[1, 1, 1.25],
         ),
         row_shares=[2.2, 1],
     )
@@ -77,8 +100,9 @@ def blueprint(region_m: tuple[float, float], centre_m: tuple[float, float], dept
         _plot("Normal force [N]", "/plots/force", -1.0, 1.1 * force_limit_n),
         _plot("Depth [mm]", "/plots/depth", -5.0, 1.8e3 * depth_m),
         rrb.Tabs(
-            rrb.TimeSeriesView(name="Joint torque [% of limit]", origin="/plots/torque"),
-            rrb.TimeSeriesView(name="Real-time factor [1]", origin="/plots/pace"),
+            _plot("Joint torque [% of limit]", "/plots/torque", -60.0, 60.0),
+            _plot("Real-time factor [1]", "/plots/pace", 0.0, 4.0),
+            _plot("Blame [%]", "/plots/blame", 0.0, 100.0),
             _plot("Progress [%]", "/plots/progress", 0.0, 100.0),
         ),
         row_shares=[1.6, 0.85, 1.2, 1.2, 1.2],

@@ -28,21 +28,22 @@ class StiffnessMap:
         self._height = h
         recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._frame(w, h, x, y)
-        self._legend("mean", [f"{r:g} x" for r in palette.LEGEND], palette.stiffness_colors(np.array(palette.LEGEND)))
+        self._legend("mean", [f"{r:g} ×" for r in palette.LEGEND], palette.stiffness_colors(np.array(palette.LEGEND)))
         spreads = np.array((0.1, 0.2, 0.4, 0.6))
-        self._legend("band", [f"+-{100 * s:.0f} %" for s in spreads], palette.spread_colors(spreads))
+        self._legend("band", [f"± {100 * s:.0f} %" for s in spreads], palette.spread_colors(spreads))
 
     def _frame(self, w: float, h: float, x: float, y: float) -> None:
-        cross = [
-            [(x - w / 2, y, 0.002), (x + w / 2, y, 0.002)],
-            [(x, y - h / 2, 0.002), (x, y + h / 2, 0.002)],
-        ]
-        outline = [(x + a * w / 2, y + b * h / 2, 0.002) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
-        grey = (150, 150, 150, 255)
-        lines = rr.LineStrips3D([*cross, outline], colors=[grey], radii=[rr.Radius.ui_points(0.7)])
+        left, right, low, high = x - w / 2, x + w / 2, y - h / 2, y + h / 2
+        strips = [[(left, low, 0.002), (right, low, 0.002), (right, high, 0.002), (left, high, 0.002), (left, low, 0.002)]]
+        if left < 0 < right:
+            strips.append([(0, low, 0.002), (0, high, 0.002)])
+        if low < 0 < high:
+            strips.append([(left, 0, 0.002), (right, 0, 0.002)])
+        lines = rr.LineStrips3D(strips, colors=[(150, 150, 150, 255)], radii=[rr.Radius.ui_points(0.7)])
         quadrants = {"RUQ": (-1, 1), "LUQ": (1, 1), "RLQ": (-1, -1), "LLQ": (1, -1)}
-        places = [(x + 0.42 * a * w, y + 0.56 * b * h, 0.003) for a, b in quadrants.values()]
-        names = rr.Points3D(places, labels=list(quadrants), radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
+        here = {name: (a, b) for name, (a, b) in quadrants.items() if max(a * left, a * right) > 0 < max(b * low, b * high)}
+        places = [(x + 0.42 * a * w, y + 0.56 * b * h, 0.003) for a, b in here.values()]
+        names = rr.Points3D(places, labels=list(here), radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
         for layer in LAYERS:
             self._recording.log(f"map/{layer}/frame", lines, static=True)
             self._recording.log(f"map/{layer}/quadrants", names, static=True)

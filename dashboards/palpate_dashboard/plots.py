@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Final
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from palpate_bus.contract import contract
 
 from palpate_dashboard.columns import TIMELINE, Columns, scalars
 
@@ -23,6 +25,7 @@ PHASES: Final = (
     ("assess", (190, 60, 255)),
     ("done", (70, 190, 90)),
     ("aborted", (220, 40, 40)),
+    ("held", (230, 120, 200)),
 )
 """Phases of the exam by number (ExamState.PHASE_*), with a colour each."""
 
@@ -38,6 +41,8 @@ JOINT_COLORS: Final = (
     (80, 120, 230),
     (170, 90, 220),
 )
+BLAMED: Final = (*(name for name, role in contract().roles.items() if not role.observer), "grant")
+"""Who can be waited for: the services, and the conductor's grant of simulated time."""
 DEPTH_FLOOR_M: Final = -0.02
 """Above the surface by more than this the depth curve pauses: free motion would flatten the contact to a line."""
 
@@ -64,6 +69,7 @@ class Plots:
         names = [f"A{i + 1} [% of limit]" for i in range(7)]
         self._series("plots/torque/joints", list(zip(names, JOINT_COLORS, strict=True)))
         self._series("plots/pace/real_time_factor", [("real-time factor [1]", (70, 180, 200))])
+        self._series("plots/blame/roles", list(zip(BLAMED, cycle((*JOINT_COLORS, (190, 190, 190))), strict=False)))
         self._series("plots/progress/targets", [("targets visited [%]", (70, 190, 90))])
         for path, states in (("state/phase", PHASES), ("state/driver", MODES)):
             shown = rr.StateConfiguration(values=[name for name, _ in states], colors=[color for _, color in states])
@@ -104,6 +110,10 @@ class Plots:
     def pace(self, t: int, real_time_factor: float) -> None:
         """Simulated over wall time, over the last simulated second."""
         self._add("plots/pace/real_time_factor", t, real_time_factor)
+
+    def blame(self, t: int, share: NDArray[np.float64]) -> None:
+        """Of the waits that were seen, the part [1] that each of `BLAMED` was waited for, shape (k,)."""
+        self._columns.add("plots/blame/roles", scalars, t, 100.0 * share)
 
     def state(self, t: int, path: str, name: str) -> bool:
         """A state, written when it changes; returns whether it did."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from palpate_dashboard import palette
 from palpate_dashboard.columns import TIMELINE, Columns, arrows, deformations, transforms
 from palpate_dashboard.geometry import Array, Carry, Indices, VertexNormals
+from palpate_dashboard.patient import Part
 
 METRES_PER_NEWTON: Final = 0.03
 """Length of the force arrow: 5 N are 15 cm."""
@@ -64,6 +65,19 @@ class Scene:
         self._recording.log(path, rr.Transform3D(translation=X_WB[:3, 3], mat3x3=X_WB[:3, :3]), static=True)
         shape = rr.Boxes3D(sizes=[size], colors=[color], fill_mode="solid")
         self._recording.log(path, shape, static=True)
+
+    def patient(self, X_WA: Array, shapes: Iterable[Part]) -> None:
+        """The patient about the abdomen, in A at `X_WA`, shape (4, 4). For the eye alone."""
+        path = "world/patient"
+        self._recording.log(path, rr.Transform3D(translation=X_WA[:3, 3], mat3x3=X_WA[:3, :3]), static=True)
+        for part in shapes:
+            shape = rr.Mesh3D(
+                vertex_positions=part.vertices,
+                triangle_indices=part.triangles,
+                vertex_normals=part.normals,
+                albedo_factor=part.color,
+            )
+            self._recording.log(f"{path}/{part.name}", shape, static=True)
 
     def link_shape(self, link: str, meshes: Iterable[Shaded]) -> None:
         """The shape of a robot link, in its own frame."""
@@ -129,9 +143,19 @@ class Scene:
         self._recording.log("world/findings", shape)
 
     def camera(self, X_WC: Array) -> None:
-        """Pose of the camera's optical frame, shape (4, 4), as calibrated."""
+        """Pose of the camera's optical frame, shape (4, 4), as calibrated; with its body, and its tripod down to the floor."""
         pose = rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3])
         self._recording.log("world/camera", pose, static=True)
+        self._recording.log("world/furniture/camera", pose, static=True)
+        body = rr.Boxes3D(sizes=[(0.28, 0.06, 0.06)], centers=[(0, 0, -0.04)], colors=[palette.PLINTH], fill_mode="solid")
+        self._recording.log("world/furniture/camera", body, static=True)
+        x, y, z = X_WC[:3, 3]
+        top = np.array((x, y, z - 0.04))
+        knee = np.array((x, y, min(0.9, 0.6 * z)))
+        angles = np.deg2rad((90, 210, 330))
+        feet = [np.array((x + 0.38 * np.cos(a), y + 0.38 * np.sin(a), 0.0)) for a in angles]
+        legs = rr.LineStrips3D([[top, knee], *([knee, foot] for foot in feet)], colors=[palette.PLINTH], radii=[0.011])
+        self._recording.log("world/furniture/tripod", legs, static=True)
 
     def lens(self, k: Array, width: int, height: int) -> None:
         """Intrinsics of the camera, shape (3, 3) [px]."""

@@ -14,16 +14,18 @@ from typing import Any, Final
 
 import numpy as np
 from palpate_bus.codec import Message
+from palpate_bus.contract import contract
 from palpate_bus.messages import RobotStatus
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models import lbr, table
-from palpate_models.frames import apply
+from palpate_models.frames import apply, inverse
 from palpate_models.lbr_visual import visual_meshes
 from palpate_models.load import exam_input
 from palpate_models.scenario import Robot, Scenario
 
-from palpate_dashboard import arrays, palette, plots, words
+from palpate_dashboard import arrays, palette, patient, plots, words
 from palpate_dashboard.columns import Columns
+from palpate_dashboard.force_depth import ForceDepth, ForceDepthPlane
 from palpate_dashboard.geometry import VertexNormals, creased, level_lines
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.map import StiffnessMap
@@ -66,8 +68,10 @@ class DashboardService(Service):
 
     role = "dashboard"
 
-    def __init__(self, scenario: Scenario, path: Path, live: Live, *, paced: bool = True) -> None:
+    def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True) -> None:
         """Uses the exam's input and the robot of `scenario`, not its phantom; `paced`: whether the pace is worth showing.
+
+        Without a `path` nothing is kept in a file.
 
         Raises OSError if `path` is not writable.
         """
@@ -76,8 +80,11 @@ class DashboardService(Service):
         self._path = path
         self._X_WA = np.array(given.X_WA)
         exam, limit = given.exam, given.limits.force_working_n
-        layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, limit)
+        plane = ForceDepthPlane(exam.depth_m, limit)
+        layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, limit, plane.bounds)
         self._recording = open_recording(path, live, layout, scenario.name)
+        self._force_depth = ForceDepth(self._recording, plane)
+        self._region = (exam.region_m, exam.centre_m)
         self._send_period = SEND_PERIOD if live == Live() else SEND_PERIOD_LIVE
         self._columns = Columns(self._recording)
         self._scene = Scene(self._recording, self._columns)
@@ -86,6 +93,12 @@ class DashboardService(Service):
         self._shapes = dict(_shapes(given.robot))
         for box in table.boxes(given.robot):
             self._scene.box(box.name, box.X_WB, box.size, FURNITURE.get(box.name, palette.STEEL))
+        lens = given.camera
+        k = np.array(((lens.focal_px, 0, lens.width_px / 2), (0, lens.focal_px, lens.height_px / 2), (0, 0, 1)))
+        self._scene.lens(k, lens.width_px, lens.height_px)  # the messages' own follows; who joins late has missed them
+        self._waits = np.zeros(len(plots.BLAMED))
+        self._producers = {topic.name: topic.producer for topic in contract().topics.values()}
+        self._undressed = True
         self._seen: dict[str, Message] = {}
         self._due: dict[str, int] = {}
         self._in_contact = False
@@ -142,8 +155,8 @@ class DashboardService(Service):
         self._recording.flush()
         self._recording.disconnect()
         return {
-            "file": self._path.name,
-            "file_bytes": self._path.stat().st_size,
+            "file": None if self._path is None else self._path.name,
+            "file_bytes": 0 if self._path is None else self._path.stat().st_size,
             "steps": self._steps,
             "step_ms": 1e3 * self._busy_s / max(1, self._steps),
         }
@@ -171,7 +184,13 @@ class DashboardService(Service):
             self._scene.force(t, X_WI[:3, 3], -self._pressed_n * X_WI[:3, 2])
 
     def _surface(self, t: int, message: Message) -> None:
-        self._scene.abdomen(t, arrays.triples(message.vertices), arrays.triples(message.triangles))
+        vertices = arrays.triples(message.vertices)
+        if self._undressed:
+            self._undressed = False
+            bed = patient.Bed(table.TABLE_TOP_M - float(self._X_WA[2, 3]), (table.TABLE_X_M[1] - table.TABLE_X_M[0]) / 2)
+            in_A = apply(inverse(self._X_WA), vertices.astype(np.float64))
+            self._scene.patient(self._X_WA, patient.parts(in_A, bed, *self._region))
+        self._scene.abdomen(t, vertices, arrays.triples(message.triangles))
 
     def _phantom(self, _t: int, message: Message) -> None:
         vertices = arrays.triples(message.surface.vertices)
@@ -224,6 +243,7 @@ class DashboardService(Service):
         self._in_contact = bool(message.in_contact)
         self._plots.say(t, "log/exam", message.message, "ERROR" if phase == "aborted" else "INFO")
         self._plots.force(t, message.normal_force)
+        self._force_depth.add(t, message.depth, message.normal_force, self._in_contact)
         self._plots.depth(t, message.depth, message.depth_setpoint)
         self._plots.progress(t, message.target_index, message.target_count)
         if not self._is_due("text", t, TEXT_PERIOD):
@@ -281,8 +301,18 @@ class DashboardService(Service):
         rows = []
         for status in message.status:
             level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
-            rows.append((status.name, level, status.message, [(item.key, item.value) for item in status.values]))
-        self._plots.document(t, "text/services", words.services(rows))
+            values = [(item.key, item.value) for item in status.values]
+            rows.append((status.name, level, status.message, values))
+            self._count_wait(dict(values).get("waiting_for", ""))
+        share = self._waits / max(1.0, self._waits.sum())
+        self._plots.blame(t, share)
+        self._plots.document(t, "text/services", words.services(rows, zip(plots.BLAMED, share, strict=True)))
+
+    def _count_wait(self, what: str) -> None:
+        """A service was seen waiting for a topic, or for the grant; a wait of observers says nothing."""
+        role = self._producers.get(what, what)
+        if role in plots.BLAMED:
+            self._waits[plots.BLAMED.index(role)] += 1
 
 
 def create(scenario: Scenario) -> DashboardService:

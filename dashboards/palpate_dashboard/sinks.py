@@ -60,16 +60,18 @@ def _serve(port: int) -> Any:
     return server
 
 
-def open_recording(path: Path, live: Live, blueprint: Any, name: str) -> rr.RecordingStream:
-    """A recording named `name` that goes to the file `path`, and to viewers as `live` says.
+def open_recording(path: Path | None, live: Live, blueprint: Any, name: str) -> rr.RecordingStream:
+    """A recording named `name` that goes to the file `path`, if there is one, and to viewers as `live` says.
 
     Its rows carry simulated time and nothing else. Raises OSError if the file cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     recording = rr.RecordingStream(APPLICATION, recording_id=uuid4())
     recording.set_log_tick_enabled(False)
     recording.set_log_time_enabled(False)
-    sinks: list[Any] = [rr.FileSink(path)]
+    sinks: list[Any] = []
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sinks.append(rr.FileSink(path))
     if live.serve_port is not None:
         sinks.append(_serve(live.serve_port))
     if live.connect_url is not None:

@@ -16,7 +16,17 @@ LEGEND = """
 | red arrow beside the tool | true normal force, 5 N are 15 cm |
 | violet outline | true lesion at half contrast: switch it off under `world/truth` |
 | white points | palpation targets; light blue: perceived points |
-| pyramid | view of the depth camera |
+| pyramid | view of the depth camera, on its tripod |
+| head, pillow, drape | for the eye alone: neither arm nor camera meets them; switch them off under `world/patient` |
+
+| elsewhere | |
+|---|---|
+| stiffness map | stiffness over that of the background, seen from the front: the patient's right is on the left |
+| uncertainty | half width of the 90 % band over the mean |
+| force over depth | red: the last second; blue: all before; grey line: wanted depth |
+| joint torque | applied, gravity excluded, in percent of each joint's limit |
+| blame | of the waits seen since the start of the run, the part that each service was waited for |
+| time | simulated |
 """
 
 
@@ -41,12 +51,18 @@ def status(
     ))  # fmt: skip
 
 
-def services(rows: Iterable[tuple[str, int, str, Sequence[tuple[str, str]]]]) -> str:
-    """Health of every service: name, level, message, and further values by key."""
-    lines = ["| service | state | | |", "|---|---|---|---|"]
+def services(rows: Iterable[tuple[str, int, str, Sequence[tuple[str, str]]]], blame: Iterable[tuple[str, float]] = ()) -> str:
+    """Health of every service: name, level, message, and further values by key; then who was waited for, as parts [1]."""
+    lines = ["| service | state | | at | silent for |", "|---|---|---|---|---|"]
     for name, level, message, values in rows:
         word = LEVELS[level] if 0 <= level < len(LEVELS) else str(level)
-        lines.append(f"| {name} | {word} | {message} | {', '.join(f'{key} {value}' for key, value in values)} |")
+        known = dict(values)
+        tick = f"{known['tick_s']} s" if "tick_s" in known else ""
+        age = f"{known['report_age_s']} s" if "report_age_s" in known else ""
+        lines.append(f"| {name.removeprefix('palpate/')} | {word} | {message} | {tick} | {age} |")
+    waited = [f"{role} {100 * share:.0f} %" for role, share in blame if share > 0]
+    if waited:
+        lines += ["", f"**Waited for**: {', '.join(waited)}"]
     return "\n".join(lines)
 
 

@@ -13,9 +13,11 @@ import rerun as rr
 from dashboard_messages import FakeInbox, Messages, latched, run
 from mcap.writer import Writer
 from palpate_bus import codec
+from palpate_bus.codec import message_type
 from palpate_bus.contract import contract
 from palpate_dashboard import replay
 from palpate_dashboard.columns import TIMELINE
+from palpate_dashboard.plots import BLAMED
 from palpate_dashboard.service import FILE, DashboardService, create
 from palpate_dashboard.sinks import Live
 from palpate_models import lbr
@@ -59,6 +61,10 @@ class Recording:
         return sorted(found[0], key=lambda row: row[0])
 
 
+WAITS = ("sim/contact_wrench", "sim/surface", "grant")
+"""Two topics of the tissue's, and the conductor's grant."""
+
+
 def draw(path: Path, messages: Iterable[tuple[int, Messages]], without: tuple[str, ...] = ()) -> dict[str, Any]:
     rr.set_strict_mode(True)  # else the library logs its errors and goes on
     service = DashboardService(Scenario(name="test"), path, Live())
@@ -85,9 +91,11 @@ def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
         "/plots/force/limit", "/plots/depth/measured", "/plots/depth/setpoint", "/plots/depth/true",
         "/plots/torque/joints", "/plots/pace/real_time_factor", "/plots/progress/targets", "/state/phase",
         "/state/driver", "/text/status", "/text/services", "/log/robot", "/log/exam", "/log/findings",
-        "/log/perception", "/map/mean/surface", "/map/band/surface", "/map/mean/findings",
+        "/log/perception", "/force_depth/past", "/force_depth/now", "/plots/blame/roles",
+        "/map/mean/surface", "/map/band/surface", "/map/mean/findings",
     }  # fmt: skip
     assert expected <= recording.temporal.keys()
+    assert {"/world/patient/drape", "/world/patient/head", "/world/furniture/tripod"} <= recording.static
     for box in ("table_top", "table_column", "robot_base"):
         assert f"/world/furniture/{box}" in recording.static
     assert {"/world/truth/lesions", "/map/mean/truth", "/map/mean/legend", "/world/camera"} <= recording.static
@@ -275,3 +283,29 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
     again.temporal.pop("/text/status")
     assert again.temporal == live.temporal
     assert again.static == live.static
+
+
+def test_force_over_depth_holds_every_reading_in_contact_once(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    pieces = recording.cells("/force_depth/past", "Points2D:positions")
+    points = np.concatenate([np.array(value.as_py()) for _, value in pieces])
+    force = dict(recording.cells("/plots/force/measured", "Scalars:scalars"))
+    depth = dict(recording.cells("/plots/depth/measured", "Scalars:scalars"))
+    pressed = [t for t, value in force.items() if value.as_py()[0] > 0.1]
+    assert len(pressed) - 20 <= len(points) <= len(pressed)
+    assert points[:, 0] == pytest.approx([10 * depth[t].as_py()[0] for t in pressed[: len(points)]], rel=1e-5)
+    assert points[:, 1] == pytest.approx([-10 * force[t].as_py()[0] for t in pressed[: len(points)]], rel=1e-5)
+
+
+def test_blame_is_of_those_who_were_waited_for(tmp_path: Path) -> None:
+    messages = list(run(3.0, Scenario().robot))
+    pair = message_type("diagnostic_msgs/msg/KeyValue")
+    for _, new in messages:
+        for status, what in zip(new["diagnostics"].status if "diagnostics" in new else (), WAITS, strict=False):
+            status.values = [pair("waiting_for", what)]
+    draw(tmp_path / FILE, messages, without=("sim/surface", "camera/depth/image_raw", "perception/points"))
+    rows = Recording(tmp_path / FILE).cells("/plots/blame/roles", "Scalars:scalars")
+    share = dict(zip(BLAMED, rows[-1][1].as_py(), strict=True))
+    assert share["tissue"] == pytest.approx(200 / 3)
+    assert share["grant"] == pytest.approx(100 / 3)
+    assert sum(share.values()) == pytest.approx(100)
