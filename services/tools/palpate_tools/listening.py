@@ -44,10 +44,10 @@ class Listener:
             self._subscriber = session.declare_subscriber(key, handler)
 
     def get(self, timeout: float) -> Heard | None:
-        """The next message, None after `timeout` [s]."""
+        """The next message, None after `timeout` [s]; 0 does not wait."""
         while True:
             try:
-                sample = self._queue.get(timeout=timeout)
+                sample = self._queue.get(timeout=timeout) if timeout else self._queue.get_nowait()
             except Empty:
                 return None
             try:
@@ -58,6 +58,10 @@ class Listener:
                 continue
             if sequence != HELLO:
                 return Heard(sequence, sent, gid, sample.payload.to_bytes())
+
+    def take(self) -> Heard | None:
+        """The next message, None when none waits."""
+        return self.get(0)
 
     def close(self) -> None:
         """Stops listening."""
