@@ -31,6 +31,8 @@ class Collected:
     indentation: list[Any] = field(default_factory=list)
     samples: list[Any] = field(default_factory=list)
     status_changes: list[Any] = field(default_factory=list)
+    supervisor: Any | None = None
+    """Its newest state."""
     phantom: Any | None = None
     surface: Any | None = None
     targets: Any | None = None
@@ -76,6 +78,7 @@ class Collector(Service):
             last = c.status_changes[-1] if c.status_changes else None
             if last is None or (last.mode, last.cause) != (status.mode, status.cause):
                 c.status_changes.append(status)
+        c.supervisor = inbox.latest("supervisor/state")
         c.phantom = inbox.latest("truth/phantom")
         c.surface = inbox.latest("perception/surface")
         c.targets = inbox.latest("perception/targets")

@@ -19,11 +19,12 @@ from palpate_bus import codec
 from palpate_bus.contract import MS, Contract
 from palpate_bus.lockstep import NEVER, run_hash
 from palpate_bus.member import Member
-from palpate_bus.messages import DiagnosticStatus, RunControl, ServiceReport
+from palpate_bus.messages import DiagnosticStatus, OperatorRequest, RunControl, ServiceReport
 from palpate_bus.observer import ObservedService
-from palpate_bus.stamps import NS
+from palpate_bus.stamps import NS, header
 
 from palpate_conductor.collector import Collector, Health
+from palpate_conductor.operator import OperatorDesk
 from palpate_conductor.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
@@ -107,6 +108,7 @@ class Conductor:
         self._roles = roles
         self._collector = collector
         self._observed = ObservedService(collector, member, lossless=True)
+        self._desk = OperatorDesk(session, domain, self.request)
         self._patience = patience or Patience()
         self._realtime = realtime
         self._limit = limit
@@ -146,6 +148,13 @@ class Conductor:
         self._last = last
         self._granted_at = monotonic()
         self._say(RunControl.GRANT, tick, last)
+
+    def request(self, request: int, reason: str) -> None:
+        """Passes an operator's request on to robot, supervisor and planning; see `palpation_msgs/OperatorRequest`."""
+        port = self._observed.stepper.ports["operator/request"]
+        t = max(self._observed.now, 0)
+        payload = port.pack(OperatorRequest(header(t), request, reason), t)
+        self._observed.publishers["operator/request"].put(payload, port.sequence)
 
     def abort(self, reason: str) -> None:
         """Tells every service to stop at once."""
@@ -203,6 +212,7 @@ class Conductor:
             self.outcome.failure = self.outcome.failure or str(failure)
             self.outcome.wall_time_s = monotonic() - self._started_at
             self.abort(str(failure))
+        self._desk.close()
         self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
         self._observed.drain_and_step()
         return self.outcome
@@ -246,6 +256,7 @@ class Conductor:
             for complaint in self._member.complaints():
                 log.error("%s", complaint)
                 self.outcome.trouble.append(complaint)
+            self._desk.attend(self._collector.collected.supervisor)
             self._extend()
             self._watch()
             tell(self)
