@@ -140,6 +140,7 @@ def _facts(topic: Topic) -> list[tuple[str, str]]:
     rows += [("frame", f"`{topic.frame}`")] if topic.frame else []
     rows += [("QoS class", f"`{topic.qos}`"), ("read by", readers), ("may be known to", _VISIBILITY[topic.visibility])]
     rows += [("in the run hash", "yes" if topic.hashed else "no")]
+    rows += [("may be sent by", "anyone: a ROS 2 node too")] if topic.open else []
     rows += [("stale after", f"{topic.max_age_ms} ms")] if topic.max_age_ms else []
     rows += [("expires after", f"{topic.expiry_ms} ms: the receiver then acts safely")] if topic.expiry_ms else []
     return rows

@@ -41,7 +41,7 @@ class Member:
     def subscription(self, topic: Topic, history: bool = False) -> Subscription:
         """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
         self._tokens.subscription(topic, self.rules.qos[topic.qos])
-        return Subscription(self.session, topic_key(topic, self.domain), history)
+        return Subscription(self.session, topic_key(topic, self.domain), history, topic.open)
 
     def observed(self, topic: Topic) -> str:
         """Declares a subscription that the caller makes; returns the key."""

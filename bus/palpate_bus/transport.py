@@ -63,12 +63,13 @@ class Subscription:
     """Receives on one key.
 
     After its hello only the first sender's messages count: bytes without a valid attachment are counted in `garbage`, those of
-    another sender in `foreign`.
+    another sender in `foreign`; with `open_to_all` every sender's messages count.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, history: bool = False) -> None:
+    def __init__(self, session: zenoh.Session, key: str, history: bool = False, open_to_all: bool = False) -> None:
         """Subscribes. With `history`, what a latched topic sent before is delivered too."""
         self.key = key
+        self._open = open_to_all
         self.garbage = 0
         self.foreign = 0
         self.heard = False
@@ -96,7 +97,7 @@ class Subscription:
                 self.garbage += 1
                 continue
             if gid != self._gid:
-                if self._gid is not None:
+                if self._gid is not None and not self._open:
                     self.foreign += 1
                     continue
                 self._gid = gid

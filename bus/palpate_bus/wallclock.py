@@ -128,9 +128,9 @@ class WallClockNode:
             data = self._data[name]
             while (sample := data.get(0)) is not None:
                 last = self._sequences[name]
-                if sample.sequence <= last:
+                if sample.sequence <= last and not buffer.topic.open:
                     continue
-                if sample.sequence > last + 1:
+                if sample.sequence > last + 1 and not buffer.topic.open:
                     self.gaps += sample.sequence - last - 1
                 self._sequences[name] = sample.sequence
                 age = self._ages[name]
