@@ -1,10 +1,13 @@
 """The compliance of a phantom's skin: normal displacement of each free vertex by a normal force on each other.
 
-    S = D K D + P M (S_het - D S_hom D) M' P'
+It begins with the Green's function of a uniform layer, exact at any distance. Then the modulus is changed: from uniform to the
+healthy body's, and by one lesion after another. Each change E -> E' turns S into
 
-K is the Green's function of the uniform layer, exact at any distance; D scales it by the modulus at the skin. The second term
-is what finite elements on a coarse grid say of everything else: modulus that varies along the skin and below it.
-Both S_het and S_hom are finite-element solutions on the same grid, so that their local errors cancel in the difference.
+    S' = D S D + P M (F' - D F D) M' P'
+
+D scales by the modulus at the skin, (E / E')^(1/2), which is all there is to near points. The rest is what finite elements say of
+the modulus that changes along the skin and below it: F and F' are their compliances before and after on one coarse grid, whose
+local errors cancel in the difference; P M carries them to the vertices.
 """
 
 from __future__ import annotations
@@ -28,8 +31,8 @@ from palpate_tissue_elastic.solid import Grid, graded_grid, skin_compliance
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
-PITCH_M = 0.010
-"""Of the finite elements below the examined region."""
+PITCH_M = 0.0125
+"""Of the finite elements for the healthy body; those for a lesion near the skin are finer."""
 GRID_HALF_M = 0.13
 """They are even over at most this half width and length: 0.1 m of region, and a margin."""
 POISSON = 0.49
@@ -58,10 +61,11 @@ def compliance(
     poisson: float = POISSON,
     pitch_m: float = PITCH_M,
 ) -> Compliance:
-    """The skin compliance of a phantom, from the cache or computed (seconds).
+    """The skin compliance of a phantom, from the cache or computed (tens of seconds; well under one when it is uniform).
 
     `lesions` replace those in the phantom's own stiffness; `thickness_m` is that of the layer on its rigid base, by default the
-    height of the phantom; infinite for a half-space, which is then uniform along its depth. Raises SizeError.
+    height of the phantom, and infinite for a half-space, which has to be uniform. `pitch_m` is that of the finite elements.
+    Raises SizeError.
     """
     free = np.flatnonzero(~model.fixed)
     if len(free) > MOST_VERTICES:
@@ -70,71 +74,101 @@ def compliance(
             "(phantom.edge_m), or tissue.implementation default"
         )
     thickness = float(np.ptp(model.vertices[:, 2])) if thickness_m is None else thickness_m
-    uniform = not lesions and np.ptp(model.background) <= 1e-9 * model.background.mean()
-    if uniform:
-        return Compliance(_layer(model, free, ModulusField(model), LayerKernel(poisson, thickness)).astype(np.float32), free)
-    if not math.isfinite(thickness):
-        raise ValueError("a half-space cannot vary: give the layer a finite thickness_m")
-
-    def compute() -> Array32:
-        modulus = ModulusField(model, lesions)
-        matrix = _layer(model, free, modulus, LayerKernel(poisson, thickness))
-        _correct(matrix, model, free, modulus, thickness, poisson, pitch_m)
-        return matrix.astype(np.float32)
-
-    arrays = (model.vertices, model.normals, model.areas, model.background, model.fixed)
-    key = content_key("compliance", *arrays, tuple(lesions), thickness, poisson, pitch_m)
-    return Compliance(remembered(key, compute), free)
+    return Compliance(_Body(model, free, thickness, poisson, pitch_m).matrix(tuple(lesions)), free)
 
 
-def _layer(model: PhantomModel, free: NDArray[np.intp], modulus: ModulusField, kernel: LayerKernel) -> Array:
-    """D K D on the free vertices, shape (f, f)."""
-    young = modulus.at_skin()[free]
-    vertices = model.vertices[free]
-    matrix = cdist(vertices, vertices)
-    np.fill_diagonal(matrix, 1.0)
-    matrix = kernel(matrix)
-    np.fill_diagonal(matrix, kernel.at_own_place(model.areas[free]))
-    scale = np.sqrt(kernel.factor(1.0) / young)
-    matrix *= scale[:, None] * scale
-    return matrix
+@dataclass(frozen=True)
+class _Body:
+    model: PhantomModel
+    free: NDArray[np.intp]
+    thickness: float
+    poisson: float
+    pitch: float
 
+    def matrix(self, lesions: tuple[Lesion, ...]) -> Array32:
+        """S with these lesions, shape (f, f)."""
+        model = self.model
+        if not lesions and np.ptp(model.background) <= 1e-9 * model.background.mean():
+            return self._layer().astype(np.float32)
+        if not math.isfinite(self.thickness):
+            raise ValueError("a half-space has to be uniform: give the layer a finite thickness_m")
+        arrays = (model.vertices, model.normals, model.areas, model.background, model.fixed)
+        key = content_key("compliance", *arrays, lesions, self.thickness, self.poisson, self.pitch)
+        return remembered(key, lambda: self._changed(lesions))
 
-def _correct(
-    matrix: Array,
-    model: PhantomModel,
-    free: NDArray[np.intp],
-    modulus: ModulusField,
-    thickness: float,
-    poisson: float,
-    pitch: float,
-) -> None:
-    """Adds to the matrix what the uniform layer leaves out."""
-    front = model.vertices[model.normals[:, 2] > 0.5]
-    half = np.minimum(np.abs(front[:, :2]).max(axis=0), GRID_HALF_M)
-    grid = graded_grid(float(half[0]), float(half[1]), thickness, pitch)
-    uniform = YOUNG_OVER_K_W * float(np.median(model.background))
-    key = content_key("uniform", grid.x, grid.y, grid.depth, poisson)
-    plain = np.asarray(remembered(key, lambda: skin_compliance(grid, lambda points: np.ones(len(points)), poisson))) / uniform
-    x, y = grid.skin
-    nodes = np.column_stack([axis.ravel() for axis in np.meshgrid(x, y, indexing="ij")])
-    at_skin = modulus(np.column_stack((nodes, np.zeros(len(nodes)))))
-    scale = np.sqrt(uniform / at_skin)
-    difference = skin_compliance(grid, modulus, poisson) - scale[:, None] * plain * scale
-    to_vertices = _interpolation(grid, model.vertices[free], model.normals[free]) @ _smoothing(len(x), len(y))
-    matrix += (to_vertices @ (to_vertices @ difference).T).T
+    def _changed(self, lesions: tuple[Lesion, ...]) -> Array32:
+        """S with the last of the lesions, from S without it; or of the healthy body, from the uniform layer's."""
+        after = ModulusField(self.model, lesions)
+        young = after.at_skin()[self.free]
+        if lesions:
+            before = ModulusField(self.model, lesions[:-1])
+            base = self.matrix(lesions[:-1]).astype(np.float64)
+            scale = np.sqrt(before.at_skin()[self.free] / young)
+            grid = self._grid_about(lesions[-1])
+            elements = skin_compliance(grid, before, self.poisson)
+        else:
+            base = self._layer()
+            uniform = self._uniform()
+            scale = np.sqrt(uniform / young)
+            grid = self._grid()
+            key = content_key("uniform", grid.x, grid.y, grid.depth, self.poisson)
+            elements = remembered(key, lambda: skin_compliance(grid, lambda points: np.ones(len(points)), self.poisson)) / uniform
+        base *= scale[:, None] * scale
+        x, y = grid.skin
+        nodes = np.column_stack([axis.ravel() for axis in np.meshgrid(x, y, indexing="ij")])
+        skin = np.column_stack((nodes, np.zeros(len(nodes))))
+        at_nodes = np.sqrt((before(skin) if lesions else uniform) / after(skin))
+        difference = skin_compliance(grid, after, self.poisson) - at_nodes[:, None] * elements * at_nodes
+        weights = _interpolation(grid, self.model.vertices[self.free], self.model.normals[self.free])
+        weights = weights @ _smoothing(len(x), len(y))
+        base += (weights @ (weights @ difference).T).T
+        return base.astype(np.float32)
+
+    def _uniform(self) -> float:
+        """Young's modulus [Pa] of the uniform layer to begin with."""
+        return YOUNG_OVER_K_W * float(np.median(self.model.background))
+
+    def _layer(self) -> Array:
+        """S of the uniform layer, shape (f, f)."""
+        kernel = LayerKernel(self.poisson, self.thickness)
+        vertices = self.model.vertices[self.free]
+        matrix = cdist(vertices, vertices)
+        np.fill_diagonal(matrix, 1.0)
+        matrix = kernel(matrix)
+        np.fill_diagonal(matrix, kernel.at_own_place(self.model.areas[self.free]))
+        matrix *= kernel.factor(self._uniform())
+        return matrix
+
+    def _front(self) -> Array:
+        """Half width and length of the body's front, and not more than what is examined [m], shape (2,)."""
+        front = self.model.vertices[self.model.normals[:, 2] > 0.5, :2]
+        return np.asarray(np.minimum(np.abs(front).max(axis=0), GRID_HALF_M))
+
+    def _grid(self) -> Grid:
+        half = self._front()
+        return graded_grid(-half, half, self.thickness, self.pitch)
+
+    def _grid_about(self, lesion: Lesion) -> Grid:
+        """The shallower a lesion begins, the finer are the elements that show it, and the nearer fades what it does."""
+        depth = lesion.depth_m or 0.0
+        half = self._front()
+        centre = np.clip(np.asarray(lesion.centre_m), -half, half)
+        reach = np.asarray(lesion.radii_m) + 0.045 + 0.5 * depth
+        finest = max(0.005, 0.3 * min(lesion.radii_m))
+        pitch = min(self.pitch, finest, 0.4 * self.pitch + 0.2 * depth)
+        return graded_grid(np.maximum(centre - reach, -half), np.minimum(centre + reach, half), self.thickness, pitch)
 
 
 def _smoothing(nx: int, ny: int) -> sparse.csr_array:
-    """M: weights 1/4, 1/2, 1/4 along x and y, shape (nx ny, nx ny).
+    """M: weights (-1, 4, 10, 4, -1) / 16 along x and y, shape (nx ny, nx ny).
 
     Nodal forces on trilinear elements excite a displacement of alternating sign (nothing finer can answer them). These weights
-    are blind to it, and otherwise spread force and displacement over half a pitch, to second order in the pitch.
+    are blind to it, and leave cubic polynomials as they are.
     """
 
     def along(n: int) -> sparse.csr_array:
-        total = sparse.csr_array(0.5 * np.eye(n) + 0.25 * (np.eye(n, k=1) + np.eye(n, k=-1)))
-        return sparse.csr_array(sparse.diags_array(1 / np.asarray(total.sum(axis=1))) @ total)
+        total = sum((w / 16 * np.eye(n, k=k) for k, w in ((-2, -1), (-1, 4), (0, 10), (1, 4), (2, -1))), np.zeros((n, n)))
+        return sparse.csr_array(total / total.sum(axis=1, keepdims=True))
 
     return sparse.csr_array(sparse.kron(along(nx), along(ny)))
 

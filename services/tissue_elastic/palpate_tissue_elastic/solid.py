@@ -35,11 +35,13 @@ class Grid:
         return self.x[self.loaded_x], self.y[self.loaded_y]
 
 
-def graded_grid(half_x: float, half_y: float, thickness: float, pitch: float) -> Grid:
-    """A grid that is even, of `pitch` [m], within +-half_x, +-half_y [m], and grows coarser beside and below."""
-    x, along_x = _axis(half_x, pitch)
-    y, along_y = _axis(half_y, pitch)
-    return Grid(x, y, _layers(thickness, pitch), along_x, along_y)
+def graded_grid(low: Array, high: Array, thickness: float, pitch: float) -> Grid:
+    """A grid that is even, of `pitch` [m], between the corners `low` and `high` (2,) [m], and grows coarser beside and below."""
+    half = (high - low) / 2
+    x, along_x = _axis(float(half[0]), pitch)
+    y, along_y = _axis(float(half[1]), pitch)
+    centre = (low + high) / 2
+    return Grid(centre[0] + x, centre[1] + y, _layers(thickness, pitch), along_x, along_y)
 
 
 def _axis(half: float, pitch: float) -> tuple[Array, slice]:
