@@ -8,6 +8,7 @@
 | `PALPATE_MODE` | `peer` (default) or `client` (everything through the router: for a service behind NAT) |
 | `PALPATE_LOWLATENCY` | `1`: the low-latency transport, see below; not in wall-clock mode |
 | `PALPATE_SHARED_MEMORY` | `0`: none (default on: messages over 3 KiB between processes of one host go through it) |
+| `PALPATE_TLS` | folder with `ca.pem`, `cert.pem`, `key.pem` (`palpate keys init`): mutual TLS, endpoints are `tls/host:port` |
 | `PALPATE_RUNTIME` | `wallclock`: a publisher does not wait for a reader that does not keep up, see below |
 | `PALPATE_ZENOH_CONFIG` | a zenoh configuration file (JSON5), used as it is; nothing else above applies |
 
@@ -54,6 +55,8 @@ UNIX_PATH_MAX = 107
 _PRIORITIES = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
+TLS_FILES = ("ca.pem", "cert.pem", "key.pem")
+"""What `PALPATE_TLS` names a folder of."""
 LOCKSTEP_DROP_WAIT_US = 1_000_000
 WALL_CLOCK_DROP_WAIT_US = 1_000
 
@@ -82,6 +85,8 @@ class BusOptions:
     """Whether to offer the low-latency transport."""
     shared_memory: bool = True
     """Whether large messages go through shared memory where both ends are on one host."""
+    tls: Path | None = None
+    """Folder with `ca.pem`, `cert.pem` and `key.pem`: links are encrypted, and both ends show a certificate of that authority."""
     drop_wait_us: int = LOCKSTEP_DROP_WAIT_US
     """How long a put waits for room before it drops a message [us]."""
     file: Path | None = None
@@ -94,6 +99,13 @@ class BusOptions:
             raise BusConfigError("PALPATE_MODE is client, but neither PALPATE_ROUTER nor PALPATE_CONNECT says of whom")
         for endpoint in (*self.listen, *self.connect, *([self.router] if self.router else [])):
             _check_endpoint(endpoint)
+            if self.tls is not None and not endpoint.startswith("tls/"):
+                raise BusConfigError(
+                    f"PALPATE_TLS is {self.tls}, but endpoint {endpoint!r} is not encrypted; want tls/<host>:<port>"
+                )
+        for name in TLS_FILES if self.tls is not None else ():
+            if self.tls is not None and not (self.tls / name).is_file():
+                raise BusConfigError(f"PALPATE_TLS is {self.tls}: no {name} in it; `palpate keys init` makes such folders")
 
     @classmethod
     def from_env(cls, environ: Mapping[str, str] = os.environ) -> BusOptions:
@@ -109,6 +121,7 @@ class BusOptions:
             shared_memory=_flag(environ, "PALPATE_SHARED_MEMORY", default=True),
             drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wall_clock else LOCKSTEP_DROP_WAIT_US,
             file=Path(file) if file else None,
+            tls=Path(environ["PALPATE_TLS"]) if environ.get("PALPATE_TLS") else None,
         )
 
     def to_env(self) -> dict[str, str]:
@@ -124,6 +137,7 @@ class BusOptions:
             "PALPATE_LOWLATENCY": str(int(self.lowlatency)),
             "PALPATE_SHARED_MEMORY": str(int(self.shared_memory)),
             "PALPATE_ZENOH_CONFIG": str(self.file) if self.file else "",
+            "PALPATE_TLS": str(self.tls) if self.tls else "",
         }
 
 
@@ -189,10 +203,27 @@ def _settings(options: BusOptions) -> dict[str, Any]:
     }
     if options.mode != "client":
         settings["listen/endpoints"] = listen
+    if options.tls is not None:
+        settings |= _tls_settings(options.tls)
     if options.lowlatency:
         settings["transport/unicast/qos/enabled"] = False
         settings["transport/unicast/lowlatency"] = True
     return settings
+
+
+def _tls_settings(folder: Path) -> dict[str, Any]:
+    """Mutual TLS with the certificate in `folder`, whichever side opens a link. Shared memory would go past the encryption."""
+    ca, certificate, key = (str(folder / name) for name in TLS_FILES)
+    return {
+        "transport/link/tls/root_ca_certificate": ca,
+        "transport/link/tls/enable_mtls": True,
+        "transport/link/tls/listen_certificate": certificate,
+        "transport/link/tls/listen_private_key": key,
+        "transport/link/tls/connect_certificate": certificate,
+        "transport/link/tls/connect_private_key": key,
+        "transport/link/tls/close_link_on_expiration": True,
+        "transport/shared_memory/enabled": False,
+    }
 
 
 def mesh(roles: Sequence[str], folder: Path, *, lowlatency: Sequence[str] = ()) -> dict[str, BusOptions]:

@@ -1,6 +1,7 @@
-"""Access control: a router that has the contract's rules passes what the rows say and nothing else."""
+"""Access control with real sessions: a secure router passes what the rows say, nothing else, and tells whom it denied."""
 
 import json
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,87 +9,86 @@ from queue import Empty, SimpleQueue
 
 import pytest
 import zenoh
-from palpate_bus.access import VIEWER, access_control
+from palpate_bus.access import ROUTER, VIEWER, access_control
 from palpate_bus.contract import contract
+from palpate_bus.denials import STRANGER, DenialReader
+from palpate_bus.guard import Guard, denials
+from palpate_bus.keys import KeysError, certificates, init, members, read
+from palpate_bus.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
 from palpate_bus.wire import message_key, topic_key
-from palpate_bus.zenoh_config import BusOptions, close_session, zenoh_config
+from palpate_bus.zenoh_config import BusConfigError, BusOptions, close_session, open_session, zenoh_config
 
 RULES = contract()
+CONTROL = message_key("palpate/control", "palpation_msgs/msg/RunControl", 0)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 class Bus:
-    """A router with the contract's rules, and clients that log in as a role."""
+    """A secure router and its members' sessions."""
 
     def __init__(self, folder: Path) -> None:
-        self.endpoint = f"unixsock-stream/{folder}/router.sock"
-        users = folder / "users.txt"
-        users.write_text("".join(f"{user}:secret-{user}\n" for user in (*RULES.roles, VIEWER)))
-        config = zenoh_config(BusOptions(mode="router", listen=(self.endpoint,)))
-        config.insert_json5("access_control", json.dumps(access_control(RULES)))
-        config.insert_json5("transport/auth/usrpwd/dictionary_file", json.dumps(str(users)))
-        config.insert_json5("transport/auth/usrpwd/user", '"router"')
-        config.insert_json5("transport/auth/usrpwd/password", '"router"')
-        self.sessions = [zenoh.open(config)]
+        self.keys = folder / "keys"
+        init(self.keys)
+        self.endpoint = f"tls/127.0.0.1:{free_port()}"
+        self.guard = Guard(self.keys / ROUTER, self.endpoint, lambda _: None).__enter__()
+        self.sessions: dict[str, zenoh.Session] = {}
 
-    def join(self, user: str) -> zenoh.Session:
-        config = zenoh_config(BusOptions(mode="client", router=self.endpoint))
-        config.insert_json5("transport/auth/usrpwd/user", json.dumps(user))
-        config.insert_json5("transport/auth/usrpwd/password", json.dumps(f"secret-{user}"))
-        self.sessions.append(zenoh.open(config))
-        return self.sessions[-1]
+    def join(self, name: str) -> zenoh.Session:
+        if name not in self.sessions:
+            options = BusOptions(mode="client", router=self.endpoint, tls=self.keys / name)
+            self.sessions[name] = open_session(options)
+        return self.sessions[name]
 
-    def passes(self, sender: str, reader: str, topic: str) -> bool:
-        """Whether a message that `sender` puts on a topic reaches `reader`; a permitted topic shows that the way is open."""
-        key = topic_key(RULES.topics[topic], 0)
+    def passes(self, sender: str, reader: str, key: str) -> bool:
+        """Whether what `sender` puts on `key` reaches `reader`; a message that is allowed shows that the way is open."""
+        open_key = message_key(f"palpate/advance/{sender}", "palpation_msgs/msg/Advance", 0)
+        if reader == VIEWER:
+            open_key = topic_key(RULES.topics["joint_states"], 0)
         queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
         to, of = self.join(reader), self.join(sender)
         handler = zenoh.handlers.Callback(queue.put, indirect=False)
-        to.declare_subscriber(key, handler)
-        control = message_key("palpate/control", "palpation_msgs/msg/RunControl", 0)
-        to.declare_subscriber(control, handler)  # open to all: when it gets through, the other had its chance
-        end = time.monotonic() + 20
-        arrived = set()
+        subscribers = [to.declare_subscriber(name, handler) for name in dict.fromkeys((key, open_key))]
+        arrived: set[str] = set()
         rounds_after = 0
+        end = time.monotonic() + 20
         while time.monotonic() < end and rounds_after < 5:
             of.put(key, b"x")
-            of.put(control, b"x")
+            of.put(open_key, b"x")
             time.sleep(0.02)
             while True:
                 try:
                     arrived.add(str(queue.get_nowait().key_expr))
                 except Empty:
                     break
-            rounds_after += control in arrived
-        assert control in arrived, "the way was never open"
+            rounds_after += open_key in arrived
+        for subscriber in subscribers:
+            subscriber.undeclare()
+        assert open_key in arrived, "the way was never open"
         return key in arrived
 
+    def denied(self, who: str, action: str, topic: str) -> bool:
+        """Whether the router tells a viewer of this attempt, within a moment."""
+        for _ in range(100):
+            found = denials(self.join(VIEWER)) or []
+            if any((d.who, d.action, d.topic) == (who, action, topic) for d in found):
+                return True
+            time.sleep(0.02)
+        return False
+
     def close(self) -> None:
-        for opened in reversed(self.sessions):
+        for opened in self.sessions.values():
             close_session(opened)
+        self.guard.close()
 
 
-def test_a_late_joiner_gets_a_latched_topic_through_the_router(bus: Bus) -> None:
-    topic = RULES.topics["tf_static"]
-    key = topic_key(topic, 0)
-    camera = bus.join("camera")
-    publisher = zenoh.ext.declare_advanced_publisher(camera, key, cache=zenoh.ext.CacheConfig(1), publisher_detection=True)
-    publisher.put(b"latched")
-    queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
-    late = bus.join("perception")
-    subscriber = zenoh.ext.declare_advanced_subscriber(
-        late,
-        key,
-        zenoh.handlers.Callback(queue.put, indirect=False),
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
-    )
-    assert queue.get(timeout=20).payload.to_bytes() == b"latched"
-    subscriber.undeclare()
-    publisher.undeclare()
-
-
-@pytest.fixture
-def bus(tmp_path: Path) -> Iterator[Bus]:
-    made = Bus(tmp_path)
+@pytest.fixture(scope="module")
+def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
+    made = Bus(tmp_path_factory.mktemp("secure"))
     yield made
     made.close()
 
@@ -99,24 +99,173 @@ def bus(tmp_path: Path) -> Iterator[Bus]:
         ("control", "robot", "control/joint_torque", True),
         ("robot", "control", "joint_states", True),
         ("tissue", "dashboard", "truth/phantom", True),
+        ("robot", VIEWER, "joint_states", True),
+        ("camera", "robot", "control/joint_torque", False),
         ("planning", "robot", "control/joint_torque", False),
         ("tissue", "planning", "truth/phantom", False),
         ("tissue", "planning", "sim/contact_wrench", False),
         ("robot", "assessment", "sim/tool_state", False),
+        ("robot", VIEWER, "sim/tool_state", False),
     ],
 )
 def test_a_message_passes_where_its_row_says_so(bus: Bus, sender: str, reader: str, topic: str, allowed: bool) -> None:
-    assert bus.passes(sender, reader, topic) is allowed
+    assert bus.passes(sender, reader, topic_key(RULES.topics[topic], 0)) is allowed
 
 
-def test_a_stranger_cannot_join(bus: Bus) -> None:
+def test_only_the_conductor_may_stop_a_run(bus: Bus) -> None:
+    assert bus.passes("conductor", "robot", CONTROL)
+    assert not bus.passes("planning", "robot", CONTROL)
+    assert bus.denied("planning", "Put", "palpate/control")
+
+
+def test_a_report_is_of_its_own_role_and_chunks_reach_the_recorder_alone(bus: Bus) -> None:
+    report = message_key("palpate/report/robot", "palpation_msgs/msg/ServiceReport", 0)
+    chunk = message_key("palpate/record/tissue", "palpation_msgs/msg/RecordChunk", 0)
+    assert bus.passes("robot", "conductor", report)
+    assert not bus.passes("camera", "conductor", report)
+    assert bus.passes("tissue", "recorder", chunk)
+    assert not bus.passes("tissue", "planning", chunk)
+
+
+def test_a_torque_by_the_cameras_certificate_is_denied_and_shows(bus: Bus) -> None:
+    bus.join("camera").put(topic_key(RULES.topics["control/joint_torque"], 0), b"x")
+    assert bus.denied("camera", "Put", "control/joint_torque")
+
+
+def test_looking_at_the_truth_is_denied_and_shows(bus: Bus) -> None:
+    subscriber = bus.join("perception").declare_subscriber(topic_key(RULES.topics["truth/phantom"], 0))
+    assert bus.denied("perception", "Declare Subscriber", "truth/phantom")
+    subscriber.undeclare()
+
+
+def test_a_viewer_sends_nothing(bus: Bus) -> None:
+    bus.join(VIEWER).put(topic_key(RULES.topics["operator/request"], 0), b"x")
+    assert bus.denied(VIEWER, "Put", "operator/request")
+
+
+def test_no_one_lives_under_anothers_name(bus: Bus) -> None:
+    watch = GraphWatch(bus.join("conductor"), 0)
+    false = NodeTokens(bus.join("camera"), "robot", 0)
+    true = NodeTokens(bus.join("camera"), "camera", 0)
+    end = time.monotonic() + 10
+    while "camera" not in watch.roles() and time.monotonic() < end:
+        watch.changes(0.05)
+    assert watch.roles() == {"camera"}
+    for tokens in (false, true):
+        tokens.undeclare()
+    watch.close()
+
+
+@pytest.mark.parametrize("certificate", [False, True])
+def test_a_stranger_cannot_connect_and_shows(bus: Bus, tmp_path: Path, certificate: bool) -> None:
+    """Without a certificate, and with one of an authority of its own."""
+    init(tmp_path / "own", ("robot",))
+    config = zenoh_config(BusOptions(mode="client", router=bus.endpoint, tls=tmp_path / "own" / "robot"))
+    config.insert_json5("transport/link/tls/root_ca_certificate", json.dumps(str(bus.keys / "ca.pem")))
+    if not certificate:
+        config.insert_json5("transport/link/tls/enable_mtls", "false")
+    before = sum(d.count for d in bus.guard.denials() if d.who == STRANGER)
     with pytest.raises(zenoh.ZError):
-        bus.join("stranger")
+        zenoh.open(config)
+    for _ in range(100):
+        if sum(d.count for d in bus.guard.denials() if d.who == STRANGER) > before:
+            return
+        time.sleep(0.02)
+    pytest.fail(f"the router does not tell of the stranger: {bus.guard.denials()}")
 
 
-def test_a_viewer_may_read_public_topics_only() -> None:
+def test_without_encryption_nobody_connects(bus: Bus) -> None:
+    with pytest.raises(BusConfigError):
+        open_session(BusOptions(mode="client", router=bus.endpoint.replace("tls/", "tcp/")))
+
+
+def test_a_late_joiner_gets_a_latched_topic_through_the_router(bus: Bus) -> None:
+    key = topic_key(RULES.topics["tf_static"], 0)
+    camera = bus.join("camera")
+    publisher = zenoh.ext.declare_advanced_publisher(camera, key, cache=zenoh.ext.CacheConfig(1), publisher_detection=True)
+    publisher.put(b"latched")
+    queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    subscriber = zenoh.ext.declare_advanced_subscriber(
+        bus.join("perception"),
+        key,
+        zenoh.handlers.Callback(queue.put, indirect=False),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+    )
+    assert queue.get(timeout=20).payload.to_bytes() == b"latched"
+    subscriber.undeclare()
+    publisher.undeclare()
+
+
+def test_every_row_has_its_rules() -> None:
+    """From the rows alone: who may put a topic's key into the router, and who gets it out."""
     block = access_control(RULES)
-    keys = next(rule["key_exprs"] for rule in block["rules"] if rule["id"] == "viewer gets")
-    assert not [key for key in keys if "/truth/" in key or "/sim/" in key]
-    assert any("joint_states" in key for key in keys)
-    assert VIEWER not in RULES.roles
+    policy = {p["subjects"][0]: set(p["rules"]) for p in block["policies"]}
+
+    def may(who: str, flow: str, message: str, key: str) -> bool:
+        return any(
+            rule["id"] in policy[who] and flow in rule["flows"] and message in rule["messages"]
+            and any(zenoh.KeyExpr(k).includes(zenoh.KeyExpr(key)) for k in rule["key_exprs"])
+            for rule in block["rules"]
+        )  # fmt: skip
+
+    for topic in RULES.topics.values():
+        key = topic_key(topic, 7)
+        for role in RULES.roles:
+            assert may(role, "ingress", "put", key) is (role == topic.producer), (role, topic.name)
+            assert may(role, "egress", "put", key) is (role in topic.readers), (role, topic.name)
+            assert may(role, "ingress", "declare_subscriber", key) is (role in topic.readers), (role, topic.name)
+        assert may(VIEWER, "egress", "put", key) is (topic.visibility == "public"), topic.name
+        assert not may(VIEWER, "ingress", "put", key)
+        assert not may(ROUTER, "ingress", "put", key)
+    token = f"{ADMIN_SPACE}/0/ab/0/0/NN/%/%/robot"
+    assert may("robot", "ingress", "liveliness_token", token)
+    assert not may("camera", "ingress", "liveliness_token", token)
+
+
+def test_the_log_is_read_in_any_pieces() -> None:
+    zid, key = "c0ffee", topic_key(RULES.topics["control/joint_torque"], 0)
+    target = "zenoh::net::routing::interceptor"
+    log = (
+        f"t TRACE rx-0 ThreadId(8) {target}::access_control: {zid} on Interface(lo)+CertCommonName(camera)+{zid} is "
+        f"unauthorized to Put (ingress) on {key}\nt TRACE rx-0 ThreadId(8) {target}: Msg intercepted!\n"
+        f"t TRACE rx-0 ThreadId(8) {target}::access_control: Using cached result: {zid} is unauthorized to Put "
+        f"(ingress) on {key}\n"
+        f"t TRACE rx-1 ThreadId(9) {target}::access_control: Using cached result: {zid} is authorized to Put (ingress) on {key}\n"
+        f"t TRACE rx-0 ThreadId(8) {target}: Msg intercepted!\n"
+        f"t TRACE rx-1 ThreadId(9) {target}::access_control: ab is unauthorized to Put (egress) on {key}\n"
+        f"t TRACE rx-1 ThreadId(9) {target}: Msg intercepted!\n"
+        "t  WARN acc-0 ThreadId(5) zenoh_link_tls::unicast: peer sent no certificates. Hint: increase the limit.\n"
+    ).encode()
+    for size in (1, 7, 100, len(log)):
+        reader = DenialReader()
+        new = [d for i in range(0, len(log), size) for d in reader.feed(log[i : i + size])]
+        assert [(d.who, d.action, d.topic) for d in new] == [
+            ("camera", "Put", "control/joint_torque"),
+            (STRANGER, "Connect", "peer sent no certificates"),
+        ]
+        assert [d.count for d in reader.denials.values()] == [2, 1]
+
+
+def test_keys_are_kept_renewed_and_private(tmp_path: Path) -> None:
+    first = init(tmp_path, hosts=("bus.example", "10.0.0.7"))
+    assert {c.name for c in first} == set(members())
+    assert init(tmp_path) == []
+    assert (tmp_path / "robot" / "key.pem").stat().st_mode & 0o077 == 0
+    assert (tmp_path / "ca.key").stat().st_mode & 0o077 == 0
+    assert not any(c.expired for c in certificates(tmp_path))
+    fingerprint = read(tmp_path / "robot" / "cert.pem").fingerprint
+    (tmp_path / "robot" / "cert.pem").unlink()
+    (made,) = init(tmp_path)
+    assert made.name == "robot"
+    assert made.fingerprint != fingerprint
+    (tmp_path / "ca.key").unlink()
+    with pytest.raises(KeysError, match=r"ca\.key"):
+        init(tmp_path)
+
+
+def test_bad_secure_options_are_named(tmp_path: Path) -> None:
+    with pytest.raises(BusConfigError, match=r"no ca\.pem"):
+        BusOptions(mode="client", router="tls/127.0.0.1:1", tls=tmp_path)
+    init(tmp_path, ("robot",))
+    with pytest.raises(BusConfigError, match="tcp/127"):
+        BusOptions(mode="client", router="tcp/127.0.0.1:1", tls=tmp_path / "robot")

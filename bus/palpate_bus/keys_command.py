@@ -1,0 +1,59 @@
+"""`palpate keys`: certificates for the secure mode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from palpate_bus.keys import CA_KEY, DAYS, KeysError, certificates, init, members
+
+app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
+
+Folder = Annotated[Path, typer.Argument(help="Folder of the keys.")]
+DEFAULT = Path("keys")
+EXIT_BAD_INPUT = 2
+
+
+@app.command("init")
+def make(
+    folder: Folder = DEFAULT,
+    host: Annotated[list[str] | None, typer.Option(help="Name or address of the router; may be repeated.")] = None,
+    name: Annotated[list[str] | None, typer.Option(help="For whom; by default every role, the router and a viewer.")] = None,
+    days: Annotated[int, typer.Option(min=1, help="How long certificates hold.")] = DAYS,
+) -> None:
+    """Make an authority and a certificate a role; what is there and still holds is kept."""
+    console = Console(stderr=True)
+    for known in name or ():
+        if known not in members():
+            console.print(f"[bold red]palpate keys:[/] --name {known}: members are {', '.join(members())}", highlight=False)
+            raise typer.Exit(EXIT_BAD_INPUT)
+    try:
+        made = init(folder, name or (), host or (), days)
+    except (KeysError, OSError, ValueError) as error:
+        console.print(f"[bold red]palpate keys:[/] {error}", highlight=False, soft_wrap=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+    console.print(
+        f"{len(made)} new in {folder}: {', '.join(c.name for c in made)}" if made else f"{folder}: all hold", highlight=False
+    )
+    console.print(
+        f"give each member its own folder only; keep {folder / CA_KEY} away from the machines of a run", highlight=False
+    )
+
+
+@app.command()
+def show(folder: Folder = DEFAULT) -> None:
+    """List the certificates of a folder, until when they hold, and their fingerprints."""
+    try:
+        found = certificates(folder)
+    except KeysError as error:
+        Console(stderr=True).print(f"[bold red]palpate keys:[/] {error}", highlight=False, soft_wrap=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+    table = Table("name", "holds until", "SHA-256", box=None)
+    for certificate in found:
+        until = f"{certificate.until:%Y-%m-%d}" + (" [red]expired[/]" if certificate.expired else "")
+        table.add_row(certificate.name, until, certificate.fingerprint[:32])
+    Console().print(table)
