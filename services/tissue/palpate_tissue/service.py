@@ -13,10 +13,11 @@ from palpate_bus.contract import contract
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import NS, header
 from palpate_models.frames import matrix
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Phantom, Scenario
+from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.scenario import Pose, Scenario
 from scipy.spatial.transform import Rotation
 
+from palpate_tissue.soft_body import SoftBody
 from palpate_tissue.surface import Surface
 from palpate_tissue.tissue import Tissue
 
@@ -43,15 +44,16 @@ class TissueService(Service):
 
     role: ClassVar[str] = "tissue"
 
-    def __init__(self, phantom: Phantom, seed: int) -> None:
-        self._model = build_phantom(phantom, seed)
+    def __init__(self, model: PhantomModel, body: SoftBody, pose: Pose, facts: Mapping[str, Any]) -> None:
+        """A soft body with its rest surface and true stiffness, at its true pose in world; `facts` are for log and report."""
+        self._model = model
+        self._tissue = body
+        self._facts = {"vertices": len(model.vertices), **facts}
         rules = contract()
-        period = rules.roles[self.role].period
-        self._tissue = Tissue(self._model, phantom.stiffness, phantom.breathing, period / NS)
         self._surface = Surface(self._model)
         self._surface_period = rules.topics["sim/surface"].period
         self._truth_period = rules.topics["truth/indentation"].period
-        self._X_WA = matrix(phantom.pose.true)
+        self._X_WA = matrix(pose)
         self._R_AW = np.ascontiguousarray(self._X_WA[:3, :3].T)
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
         self._p_WA = self._X_WA[:3, 3].copy()
@@ -62,15 +64,9 @@ class TissueService(Service):
         self._touching = False
 
     def start(self) -> Outbox:
-        """The truth about the phantom, latched; logs the stability bound."""
-        mechanics, model = self._tissue.mechanics, self._model
-        _log.info(
-            "%d vertices; explicit step: dt * rate = %.2f (Gershgorin %.2f), passive below 2; %d sub-step(s) of a period",
-            len(model.vertices),
-            self._tissue.dt * mechanics.rate,
-            self._tissue.dt * mechanics.gershgorin,
-            self._tissue.substeps,
-        )
+        """The truth about the phantom, latched; logs the facts."""
+        model = self._model
+        _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
         surface = _SurfaceMesh(header(0, "abdomen"), _flat(model.vertices), _flat(model.normals), self._triangles)
         x, y, z, w = Rotation.from_matrix(self._R_WA).as_quat().tolist()
         return {
@@ -112,12 +108,9 @@ class TissueService(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """Facts about the mesh, its stability bound and the contact."""
-        mechanics, tissue = self._tissue.mechanics, self._tissue
+        """Facts about the body and the contact."""
         return {
-            "vertices": len(self._model.vertices),
-            "stability_dt_rate": round(tissue.dt * mechanics.rate, 4),
-            "substeps": tissue.substeps,
+            **self._facts,
             "peak_force_n": round(self._peak_n, 4),
             "contact_steps": self._contact_steps,
             "contact_onsets": self._onsets,
@@ -164,4 +157,12 @@ def _flat(array: Array) -> NDArray[np.float32]:
 
 def create(scenario: Scenario) -> TissueService:
     """The tissue of a scenario; with scoring, the one role that may look at its phantom."""
-    return TissueService(scenario.phantom, scenario.seed)
+    phantom = scenario.phantom
+    model = build_phantom(phantom, scenario.seed)
+    tissue = Tissue(model, phantom.stiffness, phantom.breathing, contract().roles[TissueService.role].period / NS)
+    facts = {
+        "stability_dt_rate": round(tissue.dt * tissue.mechanics.rate, 4),  # passive below 2
+        "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),
+        "substeps": tissue.substeps,
+    }
+    return TissueService(model, tissue, phantom.pose.true, facts)
