@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.compiled import compiled
 from palpate_models.phantom import PhantomModel
 from scipy import sparse
 from scipy.spatial import cKDTree
@@ -37,47 +39,34 @@ class Surface:
         self._model = model
         self._tree = cKDTree(model.vertices)
         corners = model.vertices[model.triangles]
-        self._corner = corners[:, 0]
         sides = corners[:, 1:] - corners[:, :1]
-        # Maps an offset from the first corner to its barycentric coordinates, shape (m, 2, 3).
-        self._flat: Array = np.linalg.pinv(sides.transpose(0, 2, 1)).astype(np.float64)
+        self._triangles = np.ascontiguousarray(model.triangles, np.uint32)
         self._faces = _incident_faces(model)
-        self._gradient = _gradient(model, self._flat)
+        # Maps an offset from the first corner to its barycentric coordinates, shape (m, 2, 3).
+        self._gradient = _gradient(model, np.linalg.pinv(sides.transpose(0, 2, 1)).astype(np.float64))
+        self._weights = np.zeros(3)
+        nearest_on_faces(np.zeros(3), self._faces[0], self._triangles, model.vertices, self._weights)  # compiles it
 
     def nearest(self, p: Array, excursion: float = 0.0) -> RestPoint:
         """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m]."""
         model = self._model
         distance, vertex = self._tree.query(p)
+        weights = self._weights
         if distance > _FAR_M:
-            corners, weights = np.array([vertex]), np.ones(1)
+            corners = np.array([vertex, vertex, vertex])
+            weights[:] = (1.0, 0.0, 0.0)
         else:
             shifted = p - excursion * model.breathing[vertex] * model.normals[vertex] if excursion else p
-            corners, weights = self._project(shifted, self._faces[vertex])
-        normal = weights @ model.normals[corners]
-        normal /= np.sqrt(normal @ normal)
-        position = weights @ model.vertices[corners]
+            face = nearest_on_faces(shifted, self._faces[vertex], self._triangles, model.vertices, weights)
+            corners = model.triangles[face]
+        normal = weights.dot(model.normals[corners])
+        normal /= sqrt(normal.dot(normal))
+        position = weights.dot(model.vertices[corners])
         if excursion:
-            position += excursion * (weights @ model.breathing[corners]) * normal
+            position += excursion * weights.dot(model.breathing[corners]) * normal
         offset = p - position
-        length = np.sqrt(offset @ offset)
-        height = float(offset @ normal) if distance <= _FAR_M else float(length)
-        return RestPoint(position, normal, height, float(weights @ model.stiffness[corners]))
-
-    def _project(self, p: Array, faces: NDArray[np.intp]) -> tuple[NDArray[np.int32], Array]:
-        """The vertices (3,) of the face nearest to `p` among some, and the nearest point's barycentric coordinates (3,)."""
-        offset = p - self._corner[faces]
-        vw = (self._flat[faces] * offset[:, None, :]).sum(axis=2)
-        least = np.minimum(vw.min(axis=1), 1 - vw.sum(axis=1))
-        best = int(least.argmax())
-        if least[best] >= 0:  # over one face; over several only beneath a concave edge, where they hardly differ
-            v, w = vw[best]
-            return self._model.triangles[faces[best]], np.array((1 - v - w, v, w))
-        corners = self._model.triangles[faces]
-        points = self._model.vertices[corners]
-        weights = nearest_weights(p, points)
-        at = (weights[:, :, None] * points).sum(axis=1)
-        best = int(((p - at) ** 2).sum(axis=1).argmin())
-        return corners[best], weights[best]
+        height = float(offset.dot(normal)) if distance <= _FAR_M else sqrt(offset.dot(offset))
+        return RestPoint(position, normal, height, float(weights.dot(model.stiffness[corners])))
 
     def normals(self, inward: Array) -> Array:
         """Unit vertex normals (n, 3) of the surface whose vertices have moved inward by (n,) [m] along their normals.
@@ -89,12 +78,12 @@ class Surface:
         return np.asarray(normals)
 
 
-def _incident_faces(model: PhantomModel) -> list[NDArray[np.intp]]:
+def _incident_faces(model: PhantomModel) -> list[NDArray[np.uint32]]:
     """The triangles at each vertex."""
     corner = model.triangles.ravel()
     order = np.argsort(corner, kind="stable")
     first = np.searchsorted(corner[order], np.arange(1, len(model.vertices)))
-    return np.split(order // 3, first)
+    return np.split((order // 3).astype(np.uint32), first)
 
 
 def _gradient(model: PhantomModel, flat: Array) -> sparse.csr_array:
@@ -112,25 +101,45 @@ def _gradient(model: PhantomModel, flat: Array) -> sparse.csr_array:
     return sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * n, n))
 
 
-def nearest_weights(p: Array, triangles: Array) -> Array:
-    """Barycentric coordinates (m, 3) of the point of each triangle (m, 3, 3) that is nearest to `p` (3,)."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    ab, ac, ap = b - a, c - a, p - a
-    d11, d12, d22 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
-    d1, d2 = (ab * ap).sum(1), (ac * ap).sum(1)
-    determinant = d11 * d22 - d12 * d12
-    v = (d22 * d1 - d12 * d2) / determinant
-    w = (d11 * d2 - d12 * d1) / determinant
-    weights = np.stack((1 - v - w, v, w), axis=1)
-    outside = np.flatnonzero((weights < 0).any(axis=1))
-    nearest = np.full(len(outside), np.inf)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        start, edge = triangles[outside, i], triangles[outside, j] - triangles[outside, i]
-        t = np.clip(((p - start) * edge).sum(1) / (edge * edge).sum(1), 0, 1)
-        distance = ((p - start - t[:, None] * edge) ** 2).sum(1)
-        closer = distance < nearest
-        nearest = np.where(closer, distance, nearest)
-        on_edge = np.zeros((len(outside), 3))
-        on_edge[np.arange(len(outside)), i], on_edge[np.arange(len(outside)), j] = 1 - t, t
-        weights[outside[closer]] = on_edge[closer]
-    return weights
+@compiled
+def nearest_on_faces(p: Array, faces: NDArray[np.uint32], triangles: NDArray[np.uint32], vertices: Array, weights: Array) -> int:
+    """The face, among some, that is nearest to `p` (3,); `weights` (3,) get the barycentric coordinates of its nearest point."""
+    best = -1
+    least = np.inf
+    for face in faces:
+        a, b, c = vertices[triangles[face, 0]], vertices[triangles[face, 1]], vertices[triangles[face, 2]]
+        d11 = d12 = d22 = d1 = d2 = 0.0
+        for k in range(3):
+            ab, ac, ap = b[k] - a[k], c[k] - a[k], p[k] - a[k]
+            d11 += ab * ab
+            d12 += ab * ac
+            d22 += ac * ac
+            d1 += ab * ap
+            d2 += ac * ap
+        determinant = d11 * d22 - d12 * d12
+        v, w = (d22 * d1 - d12 * d2) / determinant, (d11 * d2 - d12 * d1) / determinant
+        if v < 0.0 or w < 0.0 or v + w > 1.0:  # outside: the nearest point is on one of the sides
+            on_ab = min(max(d1 / d11, 0.0), 1.0)
+            on_ac = min(max(d2 / d22, 0.0), 1.0)
+            # Along bc, from b: (p - b).(c - b) = (ap - ab).(ac - ab).
+            on_bc = min(max((d2 - d1 - d12 + d11) / (d11 - 2.0 * d12 + d22), 0.0), 1.0)
+            closest = np.inf
+            for tv, tw in ((on_ab, 0.0), (0.0, on_ac), (1.0 - on_bc, on_bc)):
+                distance = _square_distance(p, a, b, c, tv, tw)
+                if distance < closest:
+                    closest, v, w = distance, tv, tw
+        distance = _square_distance(p, a, b, c, v, w)
+        if distance < least:
+            least, best = distance, int(face)
+            weights[0], weights[1], weights[2] = 1.0 - v - w, v, w
+    return best
+
+
+@compiled
+def _square_distance(p: Array, a: Array, b: Array, c: Array, v: float, w: float) -> float:
+    """Of `p` from the point a + v (b - a) + w (c - a)."""
+    total = 0.0
+    for k in range(3):
+        offset = p[k] - (a[k] + v * (b[k] - a[k]) + w * (c[k] - a[k]))
+        total += offset * offset
+    return total

@@ -12,7 +12,7 @@ from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Breathing, Lesion, Phantom, Pose, Registration, Scenario
 from palpate_tissue import bench
 from palpate_tissue.service import create
-from palpate_tissue.surface import Surface, nearest_weights
+from palpate_tissue.surface import Surface, nearest_on_faces
 
 LESION = Lesion(centre_m=(-0.02, 0.0))
 
@@ -164,11 +164,28 @@ def test_nearest_rest_point_against_brute_force():
     model = build_phantom(Phantom(), 0)
     surface = Surface(model)
     rng = np.random.default_rng(0)
-    corners = model.vertices[model.triangles]
+    triangles = model.triangles.astype(np.uint32)
+    everything, weights = np.arange(len(triangles), dtype=np.uint32), np.zeros(3)
     for p in np.column_stack((rng.uniform(-0.1, 0.1, (40, 2)), rng.uniform(-0.03, 0.05, 40))):
-        at = np.einsum("fk,fkx->fx", nearest_weights(p, corners), corners)
-        brute = np.linalg.norm(p - at, axis=1).min()
+        face = nearest_on_faces(p, everything, triangles, model.vertices, weights)
+        brute = np.linalg.norm(p - weights @ model.vertices[triangles[face]])
         assert abs(surface.nearest(p).height) == pytest.approx(brute, abs=1e-5)
+
+
+def test_nearest_point_of_a_triangle_by_sampling():
+    rng = np.random.default_rng(1)
+    triangle, one, weights = np.array([[0, 1, 2]], dtype=np.uint32), np.zeros(1, np.uint32), np.zeros(3)
+    v, w = np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 201))
+    inside = v + w <= 1
+    grid = np.column_stack(((1 - v - w)[inside], v[inside], w[inside]))
+    for _ in range(200):
+        corners, p = rng.normal(size=(3, 3)), 2 * rng.normal(size=3)
+        nearest_on_faces(p, one, triangle, corners, weights)
+        assert weights.min() >= -1e-12
+        assert weights.sum() == pytest.approx(1)
+        sampled = np.linalg.norm(grid @ corners - p, axis=1).min()
+        assert np.linalg.norm(weights @ corners - p) == pytest.approx(sampled, abs=1e-2)
+        assert np.linalg.norm(weights @ corners - p) <= sampled + 1e-12
 
 
 def test_nearest_rest_point_breathes():
