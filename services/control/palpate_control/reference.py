@@ -56,16 +56,22 @@ class Setpoint:
     """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
 
     def __post_init__(self) -> None:
-        for name in ("R_WD", "p_WD", "V_WD", "F_W", "stiffness", "damping_ratio", "q", "qd", "joint_stiffness"):
-            value = getattr(self, name)
-            if not np.isfinite(value).all():
-                raise ValueError(f"set-point: {name} = {value}: must be finite")
-        for name in ("stiffness", "damping_ratio", "joint_stiffness"):
-            value = getattr(self, name)
-            if value.min() < 0:
-                raise ValueError(f"set-point: {name} = {value}: must not be negative")
-        if abs(np.linalg.det(self.R_WD) - 1) > 1e-6:
-            raise ValueError(f"set-point: R_WD has determinant {np.linalg.det(self.R_WD)}: must be a rotation")
+        everything = np.concatenate([getattr(self, name).ravel() for name in _FIELDS])
+        if not np.isfinite(everything).all():
+            name = next(name for name in _FIELDS if not np.isfinite(getattr(self, name)).all())
+            raise ValueError(f"set-point: {name} = {getattr(self, name)}: must be finite")
+        if everything[:_POSITIVE].min() < 0:
+            name = next(name for name in _FIELDS if getattr(self, name).min() < 0)
+            raise ValueError(f"set-point: {name} = {getattr(self, name)}: must not be negative")
+        a, b, c, d, e, f, g, h, i = everything[-9:].tolist()
+        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        if abs(determinant - 1) > 1e-6:
+            raise ValueError(f"set-point: R_WD has determinant {determinant}: must be a rotation")
+
+
+_FIELDS = ("stiffness", "damping_ratio", "joint_stiffness", "p_WD", "V_WD", "F_W", "q", "qd", "R_WD")
+"""Those that must not be negative come first: 6, 6 and 7 numbers."""
+_POSITIVE = 19
 
 
 def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:

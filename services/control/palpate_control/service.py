@@ -11,7 +11,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import JointTorqueCommand
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import duration_message, header, nanoseconds
-from palpate_models.lbr import JOINT_NAMES, urdf
+from palpate_models.lbr import HOME, JOINT_NAMES, urdf
 from palpate_models.load import exam_input
 from palpate_models.scenario import Limits, Robot, Scenario
 
@@ -57,7 +57,7 @@ class ControlService(Service):
                 guide.accept(
                     Setpoint(mode, stamp, np.eye(3), np.zeros(3), still, still, gains, gains, rest, rest, np.ones(DOF)), stamp
                 )
-                self._controller.torque(rest, rest, guide.at(stamp))
+                self._controller.torque(np.array(HOME), rest, guide.at(stamp))
         self._controller.reset()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
