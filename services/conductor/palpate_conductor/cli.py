@@ -12,6 +12,8 @@ from typing import Annotated, NoReturn
 
 import typer
 from palpate_bus.contract import contract
+from palpate_bus.guard import serve as serve_secure
+from palpate_bus.keys import KeysError
 from palpate_bus.router import DEFAULT_ENDPOINT, serve
 from palpate_bus.zenoh_config import BusConfigError, close_session, open_session
 from palpate_models.load import ScenarioError, load_scenario, scenario_names
@@ -32,9 +34,11 @@ from palpate_conductor.progress import RunDisplay
 from palpate_conductor.report import print_findings, write_results
 from palpate_conductor.run import OBSERVERS, WORKERS, RunResult, run_composed, run_distributed, write_scenario_files
 from palpate_conductor.run import conduct as run_conduct
+from palpate_conductor.secure import SecureBus
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
+SECURE_ENDPOINT = "tls/[::]:7447"
 WIDE = 160
 """Columns of the wide tables, where the terminal has fewer or there is none."""
 
@@ -63,6 +67,8 @@ RUN_EXAMPLES = """
 
   palpate run --set exam.pattern=raster --set exam.mode=point
 
+  palpate run --secure                          encrypted, and nobody does what is not his
+
   palpate run my.yaml --composed                all services in one process, for sweeps and debugging
 """
 
@@ -78,6 +84,10 @@ def run(
     realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
     wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer, as with hardware.")] = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd and the MCAP recording.")] = True,
+    secure: Annotated[bool, typer.Option("--secure", help="Mutual TLS, and each role may do what its row allows.")] = False,
+    keys: Annotated[
+        Path | None, typer.Option(help="With --secure: folder of `palpate keys init`; else keys of this run.")
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
     ] = None,
@@ -94,6 +104,8 @@ def run(
         _fail(console, EXIT_BAD_INPUT, str(error))
     if composed and (realtime or wallclock):
         _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
+    if (composed and secure) or (keys and not secure):
+        _fail(console, EXIT_BAD_INPUT, "--secure is for processes, so it goes without --composed; --keys goes with --secure")
     folder = out or Path("out") / f"{chosen.name}-{datetime.now():%Y%m%d-%H%M%S}"
     observers = OBSERVERS if record else ()
     if not quiet:
@@ -107,8 +119,9 @@ def run(
                 result = run_composed(chosen, folder.resolve(), display.tell, observers)
             else:
                 pace = 1.0 if realtime else None
-                result = run_distributed(chosen, folder.resolve(), display.tell, observers, pace, wallclock)
-    except (ProcessListError, OSError) as error:
+                with SecureBus(folder.resolve(), keys) if secure else nullcontext() as bus:
+                    result = run_distributed(chosen, folder.resolve(), display.tell, observers, pace, wallclock, secure=bus)
+    except (ProcessListError, BusConfigError, KeysError, OSError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     except RunFailed as error:
         _fail(console, EXIT_FAILED, str(error))
@@ -240,10 +253,16 @@ def evaluate(
 @app.command()
 def router(
     listen: Annotated[list[str] | None, typer.Argument(help="Endpoints to listen on, e.g. tcp/0.0.0.0:7447.")] = None,
+    keys: Annotated[
+        Path | None, typer.Option(help="The router's folder of certificates: a secure router, at one tls/ endpoint.")
+    ] = None,
 ) -> None:
     """Run a zenoh router for services in containers or on several machines, until a signal."""
     console = Console(stderr=True)
     try:
+        if keys is not None:
+            serve_secure(keys, (listen or [SECURE_ENDPOINT])[0], ready=console.print)
+            return
         serve(listen or (DEFAULT_ENDPOINT,), ready=console.print)
     except BusConfigError as error:
         _fail(console, EXIT_BAD_INPUT, str(error))

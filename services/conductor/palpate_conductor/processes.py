@@ -19,6 +19,7 @@ from palpate_bus.runs import Announcement, Run
 from palpate_bus.zenoh_config import mesh
 
 from palpate_conductor.__main__ import FIXED
+from palpate_conductor.secure import SecureBus
 
 COMPOSE = "docker-compose.yml"
 BARRIER = ("robot", "control", "tissue")
@@ -73,17 +74,27 @@ def read_processes(path: Path, roles: tuple[str, ...]) -> dict[str, ServiceProce
 class LocalProcesses:
     """Service processes on this machine, each with its log file; unix sockets in a folder of their own carry the bus."""
 
-    def __init__(self, roles: tuple[str, ...], out: Path, scenario_files: Mapping[str, Path], extra: Mapping[str, str]) -> None:
-        """`scenario_files` gives the scenario that each role may see."""
+    def __init__(
+        self,
+        roles: tuple[str, ...],
+        out: Path,
+        scenario_files: Mapping[str, Path],
+        extra: Mapping[str, str],
+        secure: SecureBus | None = None,
+    ) -> None:
+        """`scenario_files` gives the scenario that each role may see; with `secure` all are clients of its router."""
         self._out = out
         self._scenario_files = scenario_files
         self._extra = dict(extra)
         self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
-        router = os.environ.get("PALPATE_ROUTER") or None
+        router = secure.endpoint if secure else os.environ.get("PALPATE_ROUTER") or None
         bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
         self.bus = {role: replace(options, router=router) for role, options in bus.items()}
         """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
         endpoints = {role: options.listen[0] for role, options in bus.items()}
+        if secure is not None:
+            self.bus = {role: secure.options(role) for role in bus}
+            endpoints = dict.fromkeys(bus, secure.endpoint)
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
         self._announcement = Announcement(
             Run(

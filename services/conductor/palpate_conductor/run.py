@@ -24,6 +24,7 @@ from palpate_conductor.collector import Collected, Collector
 from palpate_conductor.conductor import Conductor, Patience, RunFailed
 from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
+from palpate_conductor.secure import SecureBus
 
 WORKERS = ("robot", "tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
 OBSERVERS = ("dashboard", "recorder")
@@ -84,10 +85,12 @@ def run_distributed(
     realtime: float | None = None,
     wallclock: bool = False,
     patience: Patience | None = None,
+    secure: SecureBus | None = None,
 ) -> RunResult:
-    """Starts the local processes of the compose file and conducts them to the end.
+    """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
 
-    Raises ProcessListError when the compose file cannot be used; later failures are in the result.
+    Raises ProcessListError when the compose file cannot be used, BusConfigError when the certificates cannot; later failures are
+    in the result.
     """
     begin = perf_counter()
     roles = (*WORKERS, *observers)
@@ -98,7 +101,7 @@ def run_distributed(
         "PALPATE_RECORD": str(int("recorder" in observers)),
         **chosen_environment(scenario),
     }
-    local = LocalProcesses(roles, out, files, extra)
+    local = LocalProcesses(roles, out, files, extra, secure)
     try:
         session = open_session(local.bus["conductor"])
         for role in roles:
