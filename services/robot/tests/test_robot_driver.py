@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from palpate_bus.codec import message_type
 from palpate_models import lbr
-from palpate_robot.driver import HOLD_DAMPING, Cause, Command, Driver, Mode
+from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, Cause, Command, Driver, Mode
 
 MS = 1_000_000
 STILL = np.zeros(7)
@@ -134,6 +134,8 @@ def test_release_without_a_hold_changes_nothing(active: Driver) -> None:
 def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
     assert not active.damping(STILL, GRAVITY).any(), "an obeying driver adds no damping"
     active.hold(2 * MS, Cause.STOP_REQUESTED, "operator")
+    for _ in range(BRAKE_TICKS):
+        np.testing.assert_array_equal(active.damping(STILL, GRAVITY), BRAKE * HOLD_DAMPING)
     np.testing.assert_array_equal(active.damping(STILL, GRAVITY), HOLD_DAMPING)
     fast = np.array([1.7, -1.7, 1.7, 2.2, -2.4, 3.1, 3.1])
     total = np.abs(active.damping(fast, GRAVITY) * fast) + np.abs(GRAVITY)
