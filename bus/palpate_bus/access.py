@@ -24,10 +24,15 @@ from palpate_bus.liveliness import ADMIN_SPACE
 
 VIEWER = "viewer"
 """A member who may read every public topic and send nothing: a guest's RViz or Foxglove, or `palpate doctor`."""
+OPERATOR = "operator"
+"""A viewer who may also stop and release: `palpate stop` asks the conductor, who alone passes it on."""
 ROUTER = "router"
 """The router's own certificate; it may tell whom it turned away, and nothing else."""
 DENIALS = "palpate/denials"
 """Where a router is asked whom it turned away (see `guard`)."""
+OPERATOR_DESK = "*/palpate/operator"
+"""Where the conductor is asked to stop or release, in any domain."""
+
 _VIEWED = ("palpate/control", "palpate/report/*")
 """Messages of the runtime that a viewer may see: how far each service is."""
 
@@ -77,8 +82,11 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
         made.allow(role, "gets", gets, False, data)
         made.allow(role, "lives", _tokens(role), True, presence)
     public = [topic.name for topic in rules.topics.values() if topic.visibility is Visibility.PUBLIC]
-    made.allow(VIEWER, "gets", [key for name in (*public, *_VIEWED) for key in _keys(name)], False, data)
-    for member in (*rules.roles, VIEWER):
+    for guest in (VIEWER, OPERATOR):
+        made.allow(guest, "gets", [key for name in (*public, *_VIEWED) for key in _keys(name)], False, data)
+    made.allow("conductor", "serves", [OPERATOR_DESK], True, data)
+    made.allow(OPERATOR, "orders", [OPERATOR_DESK], False, data)
+    for member in (*rules.roles, VIEWER, OPERATOR):
         made.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
         made.allow(member, "asks", [DENIALS], False, data)
     made.allow(ROUTER, "tells", [DENIALS], True, data)

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from palpate_bus.access import ROUTER, VIEWER
+from palpate_bus.access import OPERATOR, ROUTER, VIEWER
 from palpate_bus.contract import contract
 
 CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
@@ -56,8 +56,8 @@ class Certificate:
 
 
 def members() -> tuple[str, ...]:
-    """Everybody who gets a certificate: the roles of the contract, the router and a viewer, who may only read."""
-    return (*contract().roles, ROUTER, VIEWER)
+    """Everybody who gets a certificate: roles, the router, a viewer, who may only read, and an operator, who may also stop."""
+    return (*contract().roles, ROUTER, VIEWER, OPERATOR)
 
 
 def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), days: int = DAYS) -> list[Certificate]:

@@ -9,7 +9,7 @@ from queue import Empty, SimpleQueue
 
 import pytest
 import zenoh
-from palpate_bus.access import ROUTER, VIEWER, access_control
+from palpate_bus.access import OPERATOR, ROUTER, VIEWER, access_control
 from palpate_bus.contract import contract
 from palpate_bus.denials import STRANGER, DenialReader
 from palpate_bus.guard import Guard, denials
@@ -141,6 +141,20 @@ def test_looking_at_the_truth_is_denied_and_shows(bus: Bus) -> None:
 def test_a_viewer_sends_nothing(bus: Bus) -> None:
     bus.join(VIEWER).put(topic_key(RULES.topics["operator/request"], 0), b"x")
     assert bus.denied(VIEWER, "Put", "operator/request")
+
+
+@pytest.mark.parametrize(("who", "allowed"), [(OPERATOR, True), (VIEWER, False), ("planning", False)])
+def test_an_operator_may_ask_the_conductor_to_stop(bus: Bus, who: str, allowed: bool) -> None:
+    desk = "0/palpate/operator"
+    queryable = bus.join("conductor").declare_queryable(desk, lambda query: query.reply(desk, b"stopped"))
+    answered = False
+    for _ in range(50 if allowed else 3):
+        answered = any(reply.ok is not None for reply in bus.join(who).get(desk, timeout=0.2))
+        if answered:
+            break
+    assert answered is allowed
+    assert allowed or bus.denied(who, "Query", desk)
+    queryable.undeclare()
 
 
 def test_no_one_lives_under_anothers_name(bus: Bus) -> None:
