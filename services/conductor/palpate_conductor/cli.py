@@ -16,7 +16,7 @@ from palpate_bus.guard import serve as serve_secure
 from palpate_bus.keys import KeysError
 from palpate_bus.router import DEFAULT_ENDPOINT, serve
 from palpate_bus.zenoh_config import BusConfigError, close_session, open_session
-from palpate_models.load import ScenarioError, load_scenario, scenario_names
+from palpate_models.load import ScenarioError, exam_input, load_scenario, scenario_names
 from palpate_models.scenario import Scenario
 from rich.console import Console
 from rich.table import Table
@@ -35,6 +35,7 @@ from palpate_conductor.report import print_findings, write_results
 from palpate_conductor.run import OBSERVERS, WORKERS, RunResult, run_composed, run_distributed, write_scenario_files
 from palpate_conductor.run import conduct as run_conduct
 from palpate_conductor.secure import SecureBus
+from palpate_conductor.tree import FrameTree
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
@@ -180,7 +181,8 @@ def conduct(
         _fail(console, EXIT_BAD_INPUT, str(error))
     roles = (*WORKERS, *(name for name in observers.split(",") if name))
     with RunDisplay(console, quiet) as display:
-        result = run_conduct(session, roles, display.tell, realtime=1.0 if realtime else None, wallclock=wallclock)
+        pace, tree = 1.0 if realtime else None, FrameTree(exam_input(chosen))
+        result = run_conduct(session, roles, display.tell, realtime=pace, wallclock=wallclock, tree=tree)
     close_session(session)
     _conclude(console, out, chosen, result, quiet)
 

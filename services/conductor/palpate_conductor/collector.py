@@ -6,12 +6,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from palpate_bus.contract import MS
 from palpate_bus.messages import Clock, DiagnosticArray, DiagnosticStatus, KeyValue
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import NS, header, nanoseconds, time_message
 
+from palpate_conductor.tree import FrameTree
+
 HEALTH_PERIOD = NS
 """Simulated time between two messages on `diagnostics`."""
+TREE_PERIOD = 50 * MS
+"""Simulated time between two messages on `tf`."""
 
 
 class Health(NamedTuple):
@@ -62,11 +67,13 @@ class Collector(Service):
 
     role = "conductor"
 
-    def __init__(self, health: Callable[[], Mapping[str, Health]] | None = None) -> None:
-        """`health` says how each service is, for `diagnostics`."""
+    def __init__(self, health: Callable[[], Mapping[str, Health]] | None = None, tree: FrameTree | None = None) -> None:
+        """`health` says how each service is, for `diagnostics`; `tree` makes `tf` of the measured joints."""
         self.collected = Collected()
         self.health = health
+        self._tree = tree
         self._said = -HEALTH_PERIOD
+        self._drawn = -TREE_PERIOD
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Takes everything new and publishes the clock."""
@@ -88,6 +95,10 @@ class Collector(Service):
         if self.health is not None and t - self._said >= HEALTH_PERIOD:
             self._said = t
             out["diagnostics"] = DiagnosticArray(header(t), [_status(role, health) for role, health in self.health().items()])
+        status = inbox.latest("robot/status")
+        if self._tree is not None and status is not None and t - self._drawn >= TREE_PERIOD:
+            self._drawn = t
+            out["tf"] = self._tree.message(nanoseconds(status.header.stamp), status.position)
         return out
 
     def finish(self) -> Mapping[str, Any]:

@@ -17,7 +17,7 @@ from palpate_bus.recording import RawRecorder
 from palpate_bus.service import Service
 from palpate_bus.stamps import NS
 from palpate_bus.zenoh_config import close_session, open_session
-from palpate_models.load import dump_scenario, redacted
+from palpate_models.load import dump_scenario, exam_input, redacted
 from palpate_models.scenario import Scenario
 
 from palpate_conductor.collector import Collected, Collector
@@ -25,6 +25,7 @@ from palpate_conductor.conductor import Conductor, Patience, RunFailed
 from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
 from palpate_conductor.secure import SecureBus
+from palpate_conductor.tree import FrameTree
 
 WORKERS = ("robot", "tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
 OBSERVERS = ("dashboard", "recorder")
@@ -111,7 +112,8 @@ def run_distributed(
             return {role: _how(code) for role, code in local.ended().items()}
 
         try:
-            return conduct(session, roles, tell, died, realtime, wallclock, patience, begin)
+            tree = FrameTree(exam_input(scenario))
+            return conduct(session, roles, tell, died, realtime, wallclock, patience, begin, tree)
         finally:
             close_session(session)
     finally:
@@ -127,13 +129,15 @@ def conduct(
     wallclock: bool = False,
     patience: Patience | None = None,
     begin: float | None = None,
+    tree: FrameTree | None = None,
 ) -> RunResult:
     """Conducts services that somebody else has started on the bus of `session`, to the end.
 
-    `died` gives the roles whose process is known to be gone, with how; `begin` [s] is when the command came, by `perf_counter`.
+    `died` gives the roles whose process is known to be gone, with how; `begin` [s] is when the command came, by `perf_counter`;
+    `tree` makes `tf`.
     """
     begin = perf_counter() if begin is None else begin
-    collector = Collector()
+    collector = Collector(tree=tree)
     domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
     conductor = Conductor(session, contract(), domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock=wallclock)
 
@@ -193,7 +197,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     write_scenario_files(scenario, out)
     os.environ["PALPATE_OUT"] = str(out)
     os.environ.update(chosen_environment(scenario))
-    collector = Collector()
+    collector = Collector(tree=FrameTree(exam_input(scenario)))
     observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]

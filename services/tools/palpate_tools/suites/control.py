@@ -10,9 +10,9 @@ from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Qua
 from palpate_bus.stamps import duration_message, header, nanoseconds
 from palpate_models import lbr
 from palpate_models.frames import Array
+from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
 from scipy.spatial.transform import Rotation
 
-from palpate_tools.kinematics import tool_jacobian, tool_pose
 from palpate_tools.report import Report
 from palpate_tools.rig import Feed, Heard, Rig, Source
 
