@@ -8,7 +8,7 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export PYTHONHASHSEED := 0
 
-.PHONY: run test test-slow test-docker test-all lint format bench docs install clean
+.PHONY: run test test-slow test-docker test-browser test-all lint format bench docs install clean
 
 run: install  ## the default examination, as processes on this machine
 	$(BIN)/palpate run $(ARGS)
@@ -21,6 +21,10 @@ test-slow: install  ## long cases: seeds, scenarios, faults
 
 test-docker: install  ## builds the images and runs a short examination on a Docker engine
 	$(BIN)/python -m pytest -q -m "docker"
+
+test-browser: install  ## opens the dashboard of live runs in headless Chromium
+	@command -v chromium chromium-browser google-chrome google-chrome-stable >/dev/null || echo "test-browser: no Chromium on the PATH: THE BROWSER TESTS ARE SKIPPED"
+	$(BIN)/python -m pytest -q -m "browser"
 
 bench: install  ## figures with ratios, as a table and as bench.json
 	$(BIN)/palpate bench

@@ -5,12 +5,18 @@ python -m palpate_dashboard.replay DIR            # writes DIR/recording.rrd fro
 
 from __future__ import annotations
 
+import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from heapq import heappop, heappush
 from itertools import groupby
 from pathlib import Path
 
+from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.records import Channel
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
 from palpate_bus import codec
 from palpate_bus.codec import Message
 from palpate_bus.contract import contract
@@ -18,6 +24,11 @@ from palpate_models.load import load_scenario
 
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
+
+DISORDER = 2_000_000_000
+"""Messages in a recording are at most so far out of order [ns]."""
+_BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
+"""What reading beyond the last complete chunk raises."""
 
 
 class RecordedInbox:
@@ -63,25 +74,81 @@ def messages(path: Path) -> Iterator[tuple[int, str, bytes]]:
             yield message.log_time, channel.topic.removeprefix("/"), message.data
 
 
-def replay(recording: Path, service: DashboardService) -> None:
-    """Steps `service` through the messages of an MCAP file, every period of its role, and finishes it."""
+def recording_of(folder: Path) -> Path | None:
+    """The MCAP file of the run in `folder`, None when there is none."""
+    path = folder / "recording_mcap" / "recording_mcap_0.mcap"
+    return path if path.is_file() else None
+
+
+def messages_so_far(path: Path) -> Iterator[tuple[int, str, bytes]]:
+    """The same of a file that is still written, or was cut off: all that is complete in it.
+
+    Chunks of the services come as they were sent, so the order of time is restored within `DISORDER`.
+    """
+    topics = {f"/{topic.name}" for topic, _ in contract().inputs("dashboard")}
+    names: dict[int, str] = {}
+    waiting: list[tuple[int, int, str, bytes]] = []
+    count = 0
+    with path.open("rb") as stream:
+        records = StreamReader(stream).records
+        while True:
+            try:
+                record = next(records)
+            except (StopIteration, *_BROKEN):
+                break
+            if isinstance(record, Channel) and record.topic in topics:
+                names[record.id] = record.topic.removeprefix("/")
+            elif isinstance(record, McapMessage) and record.channel_id in names:
+                count += 1
+                heappush(waiting, (record.log_time, count, names[record.channel_id], record.data))
+                while waiting[0][0] < record.log_time - DISORDER:
+                    time, _, topic, payload = heappop(waiting)
+                    yield time, topic, payload
+    while waiting:
+        time, _, topic, payload = heappop(waiting)
+        yield time, topic, payload
+
+
+def draw(source: Iterable[tuple[int, str, bytes]], service: DashboardService, tell: Callable[[int], None] | None = None) -> int:
+    """Steps `service` through messages in order of time, every period of its role; returns the last time [ns], -1 if none.
+
+    `tell` hears the simulated time [ns] that is reached.
+    """
     period = contract().roles[service.role].period
     inbox = RecordedInbox()
-    for tick, group in groupby(messages(recording), key=lambda item: -(-item[0] // period)):
+    last = -1
+    for tick, group in groupby(source, key=lambda item: -(-item[0] // period)):
         for stamp, topic, payload in group:
             inbox.put(topic, payload, stamp)
-        service.step(tick * period, inbox)
+        last = tick * period
+        service.step(last, inbox)
+        if tell is not None:
+            tell(last)
+    return last
+
+
+def catch_up(recording: Path, service: DashboardService) -> int:
+    """Draws what a recording that is still written holds so far; returns the time [ns] reached."""
+    return draw(messages_so_far(recording), service)
+
+
+def replay(recording: Path, service: DashboardService, tell: Callable[[int], None] | None = None) -> None:
+    """Steps `service` through the messages of an MCAP file and finishes it. Raises OSError."""
+    try:
+        draw(messages(recording), service, tell)
+    except McapError:  # without an index: cut off, or still written
+        draw(messages_so_far(recording), service, tell)
     service.finish()
 
 
-def main(folder: Path) -> Path:
+def main(folder: Path, tell: Callable[[int], None] | None = None) -> Path:
     """Draws the run in `folder` again; returns the file. Raises FileNotFoundError naming what is missing."""
     recording = folder / "recording_mcap" / "recording_mcap_0.mcap"
     scenario = folder / "exam.yaml"
     for needed in (recording, scenario):
         if not needed.is_file():
             raise FileNotFoundError(f"{needed}: not there; give the folder of a run that was recorded")
-    replay(recording, DashboardService(load_scenario(str(scenario)), folder / FILE, Live(), paced=False))
+    replay(recording, DashboardService(load_scenario(str(scenario)), folder / FILE, Live(), paced=False), tell)
     return folder / FILE
 
 

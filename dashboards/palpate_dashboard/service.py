@@ -149,10 +149,14 @@ class DashboardService(Service):
         self._busy_s += perf_counter() - start
         return {}
 
-    def finish(self) -> Mapping[str, Any]:
-        """Completes the recording."""
+    def flush(self) -> None:
+        """Sends what is collected so far."""
         self._columns.send()
         self._recording.flush()
+
+    def finish(self) -> Mapping[str, Any]:
+        """Completes the recording."""
+        self.flush()
         self._recording.disconnect()
         return {
             "file": None if self._path is None else self._path.name,

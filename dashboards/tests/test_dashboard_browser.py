@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+import os
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 
 import numpy as np
 import pytest
@@ -17,7 +21,10 @@ from palpate_dashboard.sinks import Live, address
 from palpate_models.scenario import Scenario
 
 ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PATIENCE_S = 240
+SCENE = {"skin": (palette.SKIN, 4, 0.002), "table": (palette.SHEET, 4, 0.001), "drape": (palette.DRAPE, 5, 0.01)}
+"""What the scene must show: colour, reach of its hue [deg], part of the page."""
 
 
 def free_ports() -> int:
@@ -42,19 +49,13 @@ def share(image: np.ndarray, color: palette.Rgba, reach: int) -> float:
     return float(np.mean((angle < reach) & (bright > 120)))
 
 
-@pytest.mark.browser
-def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api")
+def look(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> None:
+    """Opens the page in a headless browser until each colour fills its share: (colour, reach of hue [deg], share)."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
     pillow = pytest.importorskip("PIL.Image")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    chromium = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if chromium is None:
-        pytest.skip("needs Chromium")
-    port = free_ports()
-    service = DashboardService(Scenario(name="live"), tmp_path / FILE, Live(serve_port=port))
-    inbox = FakeInbox()
-    for t, new in run(6.0, Scenario().robot):  # all of it before the viewer joins
-        inbox.put(t, new)
-        service.step(t, inbox)
+        pytest.skip(f"SKIPPED for want of a browser: none of {', '.join(BROWSERS)} is on the PATH")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1000, "height": 700}, color_scheme="dark")
@@ -64,17 +65,50 @@ def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
         while monotonic() < until:
             page.wait_for_timeout(3000)
             image = np.asarray(pillow.open(io.BytesIO(page.screenshot())).convert("RGB"))
-            seen = {
-                "skin": share(image, palette.SKIN, 4),
-                "table": share(image, palette.SHEET, 4),
-                "outline": share(image, palette.TRUTH, 6),
-            }
-            if seen["skin"] > 0.002 and seen["table"] > 0.02 and seen["outline"] > 0.0002:
+            seen = {name: share(image, color, reach) for name, (color, reach, _) in wanted.items()}
+            if all(seen[name] > least for name, (_, _, least) in wanted.items()):
                 break
         else:
             pytest.fail(f"not drawn within {PATIENCE_S} s: {seen}")
         browser.close()
+
+
+@pytest.mark.browser
+def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
+    port = free_ports()
+    service = DashboardService(Scenario(name="live"), tmp_path / FILE, Live(serve_port=port))
+    inbox = FakeInbox()
+    for t, new in run(6.0, Scenario().robot):  # all of it before the viewer joins
+        inbox.put(t, new)
+        service.step(t, inbox)
+    look(port, SCENE | {"outline": (palette.TRUTH, 6, 0.0002), "curve": (palette.FORCE, 6, 0.0001)})
     service.finish()
+
+
+@pytest.mark.browser
+@pytest.mark.timeout(900)
+def test_a_run_that_is_joined_late_is_drawn(tmp_path: Path) -> None:
+    port = free_ports()
+    palpate = str(Path(sys.executable).with_name("palpate"))
+    environment = {**os.environ, "PALPATE_RUNS": str(tmp_path / "runs"), "OMP_NUM_THREADS": "1"}
+    settings = ["exam.region_m=[0.06,0.06]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=10"]
+    words = [word for setting in settings for word in ("--set", setting)]
+    running = subprocess.Popen([palpate, "run", "--quiet", "--realtime", "--out", str(tmp_path / "out"), *words], env=environment)
+    recording = tmp_path / "out" / "recording_mcap" / "recording_mcap_0.mcap"
+    watching = None
+    try:
+        until = monotonic() + PATIENCE_S
+        while not (recording.is_file() and recording.stat().st_size > 1_000_000):  # it has looked: the start is over
+            assert running.poll() is None, "the run ended before it could be joined"
+            assert monotonic() < until, "the run did not start"
+            sleep(0.5)
+        watching = subprocess.Popen([palpate, "dashboard", "--port", str(port)], env=environment)
+        look(port, SCENE)
+    finally:
+        for process in (watching, running):
+            if process is not None:
+                process.send_signal(signal.SIGINT)
+                process.wait(60)
 
 
 def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:

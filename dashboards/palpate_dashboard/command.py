@@ -1,0 +1,147 @@
+"""`palpate dashboard`: a run in the browser or in the native viewer, live or from its recording."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from time import sleep
+from typing import Annotated, NoReturn
+
+import typer
+from palpate_bus.runs import Run, live
+from palpate_bus.zenoh_config import BusConfigError
+from palpate_models.load import ScenarioError, load_scenario
+from rich.console import Console
+from rich.status import Status
+
+from palpate_dashboard import replay
+from palpate_dashboard.join import follow
+from palpate_dashboard.service import FILE, DashboardService
+from palpate_dashboard.sinks import MEMORY_LIMIT, Live, address
+
+EXIT_BAD_INPUT = 2
+DEFAULT_PORT = 9876
+
+
+class NothingToShow(RuntimeError):
+    """No run and no recording. Says what to do."""
+
+
+def dashboard(
+    source: Annotated[
+        str | None, typer.Argument(metavar="[DIR|FILE]", help="Results folder, .rrd or .mcap; none: the run that is on.")
+    ] = None,
+    port: Annotated[
+        int, typer.Option(min=1024, max=65534, help="For viewers; the browser's page is at the next.")
+    ] = DEFAULT_PORT,
+    native: Annotated[bool, typer.Option("--native", help="In rerun's own window, not in the browser.")] = False,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="Open the browser.")] = False,
+    chosen: Annotated[
+        str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")
+    ] = None,
+    leave: Annotated[bool, typer.Option("--leave", help="End with the run; else its picture stays until Ctrl+C.")] = False,
+) -> None:
+    """Watch a run: live in the browser, joined late or not, or from its recording. It slows no run down."""
+    console = Console(stderr=True)
+    try:
+        if source is None:
+            _watch(_the_run(chosen), port, native, show, leave, console)
+        else:
+            _view(_recording(Path(source), console), port, native, show, console)
+    except (NothingToShow, BusConfigError, ScenarioError, OSError, ValueError) as error:
+        _fail(console, str(error))
+    except KeyboardInterrupt:
+        raise typer.Exit from None
+
+
+def _fail(console: Console, message: str) -> NoReturn:
+    console.print(f"[bold red]palpate:[/] {message}", highlight=False, soft_wrap=True)
+    raise typer.Exit(EXIT_BAD_INPUT)
+
+
+def _the_run(chosen: str | None) -> Run:
+    """The newest run that is on, or the newest that `chosen` names. Raises NothingToShow."""
+    runs = live()
+    found = [run for run in runs if chosen is None or chosen == str(run.pid) or chosen in run.name]
+    if found:
+        return found[-1]
+    if runs:
+        names = ", ".join(f"{run.name} ({run.pid})" for run in runs)
+        raise NothingToShow(f"--run {chosen}: no run on this machine is called so; there are {names}")
+    raise NothingToShow("no run is on: start one with `palpate run`, or give a results folder, a .rrd or a .mcap file")
+
+
+def _watch(run: Run, port: int, native: bool, show: bool, leave: bool, console: Console) -> None:
+    """Follows a run to its end and, unless told to leave, keeps its picture afterwards."""
+    exam = Path(run.out) / "exam.yaml"
+    if not exam.is_file():
+        raise NothingToShow(f"{exam} is not there: the folder of the run {run.name} is not on this machine")
+    service = DashboardService(load_scenario(str(exam)), None, Live(serve_port=port))
+    viewer = subprocess.Popen(_rerun(f"rerun+http://127.0.0.1:{port}/proxy")) if native else None
+    console.print(f"{run.name} (process {run.pid}): {address(port)}", highlight=False, soft_wrap=True)
+    if show:
+        webbrowser.open(address(port))
+    try:
+        console.print(follow(run, service, lambda words: console.print(words, highlight=False, soft_wrap=True)))
+        if not leave:
+            console.print("its picture stays until Ctrl+C", highlight=False)
+            while viewer is None or viewer.poll() is None:
+                sleep(0.5)
+    finally:
+        service.finish()
+        if viewer is not None:
+            viewer.terminate()
+
+
+def _recording(source: Path, console: Console) -> Path:
+    """The .rrd of a source; drawn from the MCAP recording when there is none. Raises NothingToShow."""
+    if source.suffix == ".rrd" and source.is_file():
+        return source
+    if (source / FILE).is_file():
+        return source / FILE
+    if source.suffix == ".mcap" and source.is_file():
+        exam = source.parent.parent / "exam.yaml"
+        if not exam.is_file():
+            raise NothingToShow(f"{exam} is not there: a recording is drawn with its run's exam.yaml, two folders up")
+        target = Path(tempfile.mkdtemp(prefix="palpate-dashboard-")) / FILE
+        drawn = DashboardService(load_scenario(str(exam)), target, Live(), paced=False)
+        with _drawing(console) as status:
+            replay.replay(source, drawn, _teller(status))
+        return target
+    if replay.recording_of(source) is not None:
+        with _drawing(console) as status:
+            return replay.main(source, _teller(status))
+    raise NothingToShow(f"{source}: neither a .rrd nor a .mcap file, nor the folder of a run that was recorded")
+
+
+def _drawing(console: Console) -> AbstractContextManager[Status | None]:
+    """A line that shows how far the drawing is, where there is a terminal."""
+    return console.status("drawing") if console.is_terminal else nullcontext()
+
+
+def _teller(status: Status | None) -> Callable[[int], None] | None:
+    return None if status is None else lambda t: status.update(f"drawing {t / 1e9:.0f} s")
+
+
+def _view(recording: Path, port: int, native: bool, show: bool, console: Console) -> None:
+    """Shows a .rrd file until Ctrl+C, or until the native viewer is closed."""
+    if native:
+        subprocess.run(_rerun(str(recording)), check=False)
+        return
+    console.print(f"{recording}: {address(port)}  (Ctrl+C ends it)", highlight=False, soft_wrap=True)
+    if show:
+        webbrowser.open(address(port))
+    ports = ["--port", str(port), "--web-viewer-port", str(port + 1), "--server-memory-limit", MEMORY_LIMIT]
+    status = subprocess.run([*_rerun(str(recording)), "--serve-web", *ports], check=False).returncode
+    if status not in (0, -2, 130):
+        raise OSError(f"rerun left with status {status}: are ports {port} and {port + 1} free? (--port)")
+
+
+def _rerun(*words: str) -> list[str]:
+    """The words that start rerun's own command."""
+    return [sys.executable, "-m", "rerun_cli", *words]

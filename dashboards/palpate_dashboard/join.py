@@ -1,0 +1,60 @@
+"""A viewer that joins a run which is on: what happened so far from the run's recording, what comes from the bus.
+
+It is a node of its own beside the run's dashboard. It reads what is sent anyway, latest wins, and no service waits for it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from time import monotonic, sleep
+
+from palpate_bus import codec
+from palpate_bus.contract import contract
+from palpate_bus.member import Member
+from palpate_bus.messages import RunControl
+from palpate_bus.observer import IDLE_S, ObservedService
+from palpate_bus.runs import Run, live
+from palpate_bus.zenoh_config import session
+
+from palpate_dashboard.replay import catch_up, recording_of
+from palpate_dashboard.service import DashboardService
+
+CHECK_S = 1.0
+"""How often it is looked whether the run is still announced."""
+Say = Callable[[str], None]
+
+
+def follow(run: Run, service: DashboardService, say: Say) -> str:
+    """Draws `run` until it ends, and finishes `service`; returns how it ended."""
+    rules = contract()
+    with session(run.options()) as bus:
+        member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)
+        control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
+        decode = codec.decoder("palpation_msgs/msg/RunControl")
+        observed = ObservedService(service, member)  # listens from now on, while the past is drawn
+        recording = recording_of(Path(run.out))
+        if recording is not None:
+            say(f"drawing what happened so far, from {recording}")
+            until = catch_up(recording, service)
+            say(f"joined at {max(until, 0) / 1e9:.1f} s of simulated time")
+        checked = monotonic()
+        end = ""
+        while not end:
+            if not observed.drain_and_step():
+                sleep(IDLE_S)
+            while (sample := control.get(0)) is not None:
+                message = decode(sample.payload)
+                if message.command == RunControl.END:
+                    end = "the run is over"
+                elif message.command == RunControl.ABORT:
+                    end = f"the run was aborted: {message.reason}"
+            if monotonic() - checked > CHECK_S:
+                checked = monotonic()
+                if all((other.pid, other.started) != (run.pid, run.started) for other in live()):
+                    end = "the run is gone"
+        observed.drain_and_step()
+        service.flush()
+        member.leave()
+    return end

@@ -1,0 +1,78 @@
+"""`palpate dashboard`: what it shows when it is given what; a recording that is still written; a run that is joined late."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import typer
+from dashboard_messages import run
+from mcap.writer import CompressionType, Writer
+from palpate_bus import codec
+from palpate_bus.contract import contract
+from palpate_dashboard import replay
+from palpate_dashboard.command import dashboard
+from palpate_dashboard.service import FILE, DashboardService
+from palpate_dashboard.sinks import Live
+from palpate_models.load import dump_scenario
+from palpate_models.scenario import Scenario
+from typer.testing import CliRunner
+
+app = typer.Typer()
+app.command()(dashboard)
+
+
+def record(folder: Path, seconds: float) -> Path:
+    """A run's folder with an MCAP recording of hand-made messages in chunks of 0.1 s."""
+    (folder / "recording_mcap").mkdir(parents=True)
+    (folder / "exam.yaml").write_text(dump_scenario(Scenario(name="recorded")), encoding="utf-8")
+    path = folder / "recording_mcap" / "recording_mcap_0.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=200_000, compression=CompressionType.NONE)
+        writer.start()
+        channels: dict[str, int] = {}
+        for t, messages in run(seconds, Scenario().robot):
+            for topic, message in messages.items():
+                kind = contract().topics[topic].type
+                if topic not in channels:
+                    schema = writer.register_schema(kind, "ros2msg", b"")
+                    channels[topic] = writer.register_channel(f"/{topic}", "cdr", schema)
+                writer.add_message(channels[topic], t, codec.encode(message, kind), t)
+        writer.finish()
+    return path
+
+
+def test_nothing_to_show_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
+    done = CliRunner().invoke(app, [])
+    assert done.exit_code == 2
+    assert "no run is on: start one with `palpate run`" in done.output
+    done = CliRunner().invoke(app, [str(tmp_path / "nothing")])
+    assert done.exit_code == 2
+    assert "neither a .rrd nor a .mcap file" in done.output
+
+
+def test_a_recording_that_is_still_written_is_drawn_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = record(tmp_path, 3.0)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: 2 * len(whole) // 3])
+    service = DashboardService(Scenario(name="late"), tmp_path / FILE, Live())
+    reached = replay.catch_up(path, service)
+    service.finish()
+    assert 0.5e9 < reached < 2.9e9
+    assert (tmp_path / FILE).stat().st_size > 10_000
+
+
+def test_messages_come_in_order_of_time(tmp_path: Path) -> None:
+    path = record(tmp_path, 1.0)
+    times = [time for time, _, _ in replay.messages_so_far(path)]
+    assert times == sorted(times)
+    assert [item[:2] for item in replay.messages_so_far(path)] == [item[:2] for item in replay.messages(path)]
+
+
+def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) -> None:
+    record(tmp_path, 1.0)
+    heard: list[int] = []
+    assert replay.main(tmp_path, heard.append) == tmp_path / FILE
+    assert heard == sorted(heard)
+    assert heard[-1] >= 0.9e9
