@@ -1,0 +1,251 @@
+"""The contract enforced live: every fault is named with topic, sender, expected and got, within a second of the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from palpate_bus import codec
+from palpate_bus.checker import Checker, Kind
+from palpate_bus.conformance import violations
+from palpate_bus.contract import MS, contract
+from palpate_bus.liveliness import Endpoint, Entity, qos_token
+from palpate_bus.liveliness import Kind as EntityKind
+from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueCommand, Vector3, Wrench, WrenchStamped
+from palpate_bus.monitor import Monitor, Violation, diagnostics
+from palpate_bus.stamps import duration_message, header
+from palpate_bus.strategies import messages
+
+RULES = contract()
+NAMES = [f"lbr_A{i}" for i in range(1, 8)]
+LOOK_MS = 50
+
+
+def entity(node: str, topic: str, number: int, type_hash: str | None = None) -> Entity:
+    row = RULES.topics[topic]
+    end = Endpoint(topic, row.type, type_hash or row.type_hash, qos_token(RULES.qos[row.qos]))
+    return Entity(0, "ab", 0, number, EntityKind.PUBLISHER, node, endpoint=end)
+
+
+def joint_state(t: int) -> Any:
+    return JointState(header(t), NAMES, np.zeros(7), np.zeros(7), np.zeros(7))
+
+
+def wrench(t: int) -> Any:
+    return WrenchStamped(header(t, "ft_sensor"), Wrench(Vector3(0.0, 0.0, 5.0), Vector3(0.0, 0.0, 0.0)))
+
+
+def torque(t: int) -> Any:
+    return JointTorqueCommand(header(t), np.zeros(7), duration_message(50 * MS))
+
+
+MAKE = {"joint_states": joint_state, "ft/wrench": wrench, "control/joint_torque": torque}
+
+
+@dataclass
+class Bus:
+    """Three 1 kHz topics on a simulated clock, at half real time; `meddle` may change or drop what is sent."""
+
+    monitor: Monitor = field(default_factory=lambda: Monitor(RULES))
+    tick: int = 0
+    named: dict[str, tuple[int, Violation]] = field(default_factory=dict)
+    sequences: dict[str, int] = field(default_factory=lambda: dict.fromkeys(MAKE, 0))
+    entities: list[Entity] = field(
+        default_factory=lambda: [entity(RULES.topics[name].producer, name, i) for i, name in enumerate(MAKE)]
+    )
+    factor: float = 2.0
+
+    def run(self, ticks: int, meddle: Callable[[str, int, Any], Any] = lambda name, t, message: message) -> None:
+        """`meddle` returns the message, other bytes, a list of messages, or None for nothing."""
+        for _ in range(ticks):
+            t = self.tick * MS
+            wall = self.factor * self.tick / 1000
+            for i, (name, make) in enumerate(MAKE.items()):
+                sent = meddle(name, t, make(t))
+                for item in sent if isinstance(sent, list) else [sent] if sent is not None else []:
+                    self.sequences[name] += 1
+                    payload = item if isinstance(item, bytes) else codec.encode(item, RULES.topics[name].type)
+                    self.monitor.hear(name, round(wall * 1e9), self.sequences[name], self.entities[i].gid, payload, wall)
+            self.tick += 1
+            if self.tick % LOOK_MS == 0:
+                self.monitor.see(self.entities, wall)
+                for violation in self.monitor.look(wall, round(wall * 1e9)):
+                    self.named.setdefault(f"{violation.topic} {violation.kind}", (self.tick, violation))
+
+
+def test_a_healthy_bus_has_no_violation_at_any_speed() -> None:
+    for factor in (0.2, 1.0, 5.0):
+        bus = Bus(factor=factor)
+        bus.run(3000)
+        assert bus.named == {}
+        assert all(row.alive for row in bus.monitor.health() if row.topic.name in MAKE)
+
+
+def spoiled(name: str, change: Callable[[Any], None]) -> Callable[[str, int, Any], Any]:
+    def meddle(topic: str, t: int, message: Any) -> Any:
+        if topic == name:
+            change(message)
+        return message
+
+    return meddle
+
+
+def set_nan(message: Any) -> None:
+    message.position[3] = np.nan
+
+
+def degrees(message: Any) -> None:
+    message.position[:] = 57.0
+
+
+def far(message: Any) -> None:
+    message.wrench.force.x = 1e4
+
+
+def other_frame(message: Any) -> None:
+    message.header.frame_id = "world"
+
+
+def backwards(message: Any) -> None:
+    message.header.stamp.sec = 0
+    message.header.stamp.nanosec = 5
+
+
+FAULTS = [
+    ("joint_states", set_nan, Kind.NAN, "-3.2..3.2 [rad]", "nan"),
+    ("joint_states", degrees, Kind.UNIT, "-3.2..3.2 [rad]", "57, plausible if it is in deg"),
+    ("ft/wrench", far, Kind.RANGE, "-200..200 [N]", "10000"),
+    ("ft/wrench", other_frame, Kind.FRAME, "'ft_sensor'", "'world'"),
+    ("ft/wrench", backwards, Kind.STAMP, "at least 1999000000 ns", "5 ns: it goes backwards"),
+]
+
+
+@pytest.mark.parametrize(("topic", "change", "kind", "expected", "got"), FAULTS, ids=[str(fault[2]) for fault in FAULTS])
+def test_a_single_bad_message_is_named(topic: str, change: Any, kind: Kind, expected: str, got: str) -> None:
+    bus = Bus()
+    bus.run(2000)
+    bus.run(1, spoiled(topic, change))
+    bus.run(LOOK_MS)
+    tick, violation = bus.named.pop(f"{topic} {kind}")
+    assert (violation.sender, violation.expected, violation.got) == ("robot", expected, got)
+    assert tick <= 2000 + LOOK_MS
+    assert bus.named == {}
+    assert str(violation).startswith(f"{topic}")
+
+
+def half(name: str, t: int, message: Any) -> Any:
+    return None if name == "control/joint_torque" and t // MS % 2 else message
+
+
+def twice(name: str, t: int, message: Any) -> Any:
+    return [message, message] if name == "control/joint_torque" else message
+
+
+def none(name: str, t: int, message: Any) -> Any:
+    return None if name == "control/joint_torque" else message
+
+
+@pytest.mark.parametrize(
+    ("meddle", "kind", "got"), [(half, Kind.RATE, "500 Hz"), (twice, Kind.RATE, "2000 Hz"), (none, Kind.SILENT, "nothing")]
+)
+def test_a_wrong_rate_is_named_within_a_second(meddle: Any, kind: Kind, got: str) -> None:
+    bus = Bus(factor=1.0)
+    bus.run(2000)
+    bus.run(1000, meddle)
+    tick, violation = bus.named[f"control/joint_torque {kind}"]
+    assert violation.sender == "control"
+    assert violation.expected.startswith("1000 Hz")
+    assert tick - 2000 <= 1000
+    assert got in bus.monitor.active["control/joint_torque", "control", kind, ""].violation.got
+    assert not any(name.startswith(("joint_states", "ft/wrench")) for name in bus.named)
+
+
+def test_a_gap_is_counted_and_named() -> None:
+    bus = Bus()
+    bus.run(1000)
+    bus.sequences["joint_states"] += 3
+    bus.run(LOOK_MS)
+    violation = bus.named["joint_states gap"][1]
+    assert (violation.expected, violation.got[:13]) == ("sequence 1001", "1004: 3 missi")
+    assert next(row.missing for row in bus.monitor.health() if row.topic.name == "joint_states") == 3
+
+
+def test_bytes_that_are_no_message_are_named() -> None:
+    bus = Bus()
+    bus.run(1000)
+    bus.run(1, lambda name, t, message: b"\x00\x01\x00\x00" if name == "ft/wrench" else message)
+    bus.run(LOOK_MS)
+    assert bus.named["ft/wrench garbage"][1].expected == "geometry_msgs/msg/WrenchStamped"
+
+
+def test_another_type_hash_is_named_from_the_token_alone() -> None:
+    bus = Bus()
+    bus.entities.append(entity("driver", "joint_states", 9, "RIHS01_" + "0" * 64))
+    bus.run(LOOK_MS)
+    violation = bus.named["joint_states type hash"][1]
+    assert violation.sender == "driver"
+    assert violation.expected == "sensor_msgs/msg/JointState RIHS01_a13ee3a3"
+    assert violation.got == "sensor_msgs/msg/JointState RIHS01_00000000"
+
+
+def test_a_second_sender_is_named() -> None:
+    bus = Bus()
+    bus.entities.append(entity("camera", "control/joint_torque", 9))
+    bus.run(LOOK_MS)
+    violation = bus.named["control/joint_torque sender"][1]
+    assert (violation.sender, violation.expected) == ("camera", "control only")
+
+
+def test_anyone_may_send_on_an_open_topic() -> None:
+    bus = Bus()
+    bus.entities.append(entity("rqt", "operator/request", 9))
+    bus.run(LOOK_MS)
+    assert bus.named == {}
+
+
+def test_a_topic_that_lags_behind_the_others_is_too_old() -> None:
+    bus = Bus(monitor=Monitor(RULES, wallclock=False), factor=1.0)
+    late: dict[str, list[Any]] = {"sent": []}
+
+    def lag(name: str, t: int, message: Any) -> Any:
+        if name != "control/joint_torque":
+            return message
+        late["sent"].append(message)
+        return late["sent"].pop(0) if len(late["sent"]) > 300 else None
+
+    bus.run(2500, lag)
+    assert bus.named["control/joint_torque age"][1].expected == "at most 20 ms"
+
+
+def test_diagnostics_say_it_to_ros_tools() -> None:
+    bus = Bus()
+    bus.run(1000)
+    bus.run(1, spoiled("joint_states", set_nan))
+    bus.run(LOOK_MS)
+    array = diagnostics(bus.monitor.health(), bus.monitor.active.values(), 7)
+    by_name = {status.name: status for status in array.status}
+    bad, good = by_name["palpate/topic/joint_states"], by_name["palpate/topic/ft/wrench"]
+    assert bad.level == DiagnosticStatus.ERROR
+    assert "nan" in bad.message
+    assert good.level == DiagnosticStatus.OK
+    codec.decode(codec.encode(array, "diagnostic_msgs/msg/DiagnosticArray"), "diagnostic_msgs/msg/DiagnosticArray")
+
+
+@pytest.mark.parametrize("name", ["ft/wrench", "sim/link_poses", "planning/setpoint", "sim/surface", "robot/status"])
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_the_compiled_check_agrees_with_the_plain_one(name: str, data: st.DataObject) -> None:
+    topic = RULES.topics[name]
+    message = data.draw(messages(topic.type))
+    plain = {sentence.split(": ", 1)[1].split(" is ")[0] for sentence in violations(topic, message)}
+    ranged = {
+        fault.field if fault.field != "header.frame_id" else "frame_id"
+        for fault in Checker(topic)(message)
+        if fault.field in topic.ranges or fault.kind is Kind.FRAME
+    }
+    assert ranged == plain
