@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from palpate_bus.contract import MS, Contract, Topic, contract
-from palpate_bus.lockstep import InputBuffer, OutputPort, Received, Stepper, run_hash
+from palpate_bus.lockstep import InputBuffer, Received, Sent, Stepper, run_hash
 from palpate_bus.service import Service
 
 Tap = Callable[[Topic, bytes, int, int], None]
@@ -48,13 +48,13 @@ class Composed:
         self._started = False
         self.t = 0
 
-    def _send(self, sent: Sequence[tuple[OutputPort, bytes]], t: int) -> None:
-        for port, payload in sent:
-            received = Received(payload, t, port.sequence)
+    def _send(self, sent: Sequence[Sent], t: int) -> None:
+        for port, payload, sequence in sent:
+            received = Received(payload, t, sequence)
             for buffer in self._readers[port.topic.name]:
                 buffer.deliver(received)
             for tap in self._taps:
-                tap(port.topic, payload, t, port.sequence)
+                tap(port.topic, payload, t, sequence)
 
     def start(self) -> None:
         """Sends the latched messages."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from palpate_bus import codec
 from palpate_bus.contract import Contract, Edge
-from palpate_bus.lockstep import NEVER, InputBuffer, Received, Stepper
+from palpate_bus.lockstep import NEVER, InputBuffer, Received, Sent, Stepper
 from palpate_bus.member import Member
 from palpate_bus.messages import Advance, RunControl, ServiceReport
 from palpate_bus.outlet import Outlet
@@ -125,7 +125,9 @@ class LockstepNode:
         """Runs the service to the end of the run. Raises what the service raises, after reporting it, or RunAborted."""
         try:
             self._handshake()
-            self._outlet.send(self._stepper.start(), 0)
+            latched = self._stepper.start()
+            self._outlet.send(latched)
+            self._outlet.record(latched, 0)
             self._loop()
             self._report_end()
         except RunAborted:
@@ -177,9 +179,14 @@ class LockstepNode:
                     self._await(buffer, t)
             for buffer in self._observed:
                 self._collect(buffer, t)
-            sent = stepper.step(t)
+            everything: list[Sent] = []
+            for sent in stepper.parts(t):
+                start = perf_counter_ns()
+                outlet.send(sent)
+                stepper.blame.send += perf_counter_ns() - start
+                everything += sent
             start = perf_counter_ns()
-            outlet.send(sent, t)
+            outlet.record(everything, t)
             if self._advance_publisher is not None:
                 self._advance_sequence += 1
                 sequences = [stepper.ports[name].sequence for name in self._own_events]

@@ -10,14 +10,15 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
+from typing import NamedTuple
 
 from palpate_bus import codec
 from palpate_bus.blame import Blame
 from palpate_bus.codec import Message
 from palpate_bus.contract import Contract, Edge, Topic
-from palpate_bus.service import Service
+from palpate_bus.service import Outbox, Service
 
 _CHAIN = struct.Struct("<qqq")
 NEVER = -1
@@ -192,18 +193,28 @@ class OutputPort:
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
 
-    def pack(self, message: Message, stamp: int) -> bytes:
-        """Encodes and numbers a message, and chains it into the digest."""
-        payload = self.encode(message)
+    def pack(self, message: Message) -> bytes:
+        """Encodes and numbers a message."""
         self.sequence += 1
+        return self.encode(message)
+
+    def chain(self, payload: bytes, stamp: int, sequence: int) -> None:
+        """Takes a sent message into the digest."""
         if self._digest is not None:
-            self._digest.update(_CHAIN.pack(stamp, self.sequence, len(payload)))
+            self._digest.update(_CHAIN.pack(stamp, sequence, len(payload)))
             self._digest.update(payload)
-        return payload
 
     def digest(self) -> str | None:
         """Hexadecimal digest, None for a topic that is not hashed."""
         return None if self._digest is None else self._digest.hexdigest()
+
+
+class Sent(NamedTuple):
+    """A message on its way out."""
+
+    port: OutputPort
+    payload: bytes
+    sequence: int
 
 
 class Stepper:
@@ -224,47 +235,65 @@ class Stepper:
         self._strict = strict and not self.role.observer
         self._periodic = tuple(port for port in self.ports.values() if not (port.event or port.latched))
 
-    def start(self) -> list[tuple[OutputPort, bytes]]:
+    def start(self) -> list[Sent]:
         """The latched messages, packed. They are numbered and stamped zero."""
         sent = []
         for name, message in self.service.start().items():
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
-            sent.append((port, port.pack(message, 0)))
+            payload = port.pack(message)
+            port.chain(payload, 0, port.sequence)
+            sent.append(Sent(port, payload, port.sequence))
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
             raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
         return sent
 
-    def step(self, t: int) -> list[tuple[OutputPort, bytes]]:
-        """Steps the service at `t` [ns] and returns what it sends, packed, in contract-independent outbox order.
+    def step(self, t: int) -> list[Sent]:
+        """Steps the service at `t` [ns] and returns all that it sends, packed, in outbox order. Raises as `parts`."""
+        return [sent for part in self.parts(t) for sent in part]
+
+    def parts(self, t: int) -> Iterator[list[Sent]]:
+        """Steps the service at `t` [ns]; yields what each part of the step sends, packed, in outbox order.
 
         Raises LockstepError when the service leaves out a periodic message or sends one off its tick.
         """
         for buffer in self._all:
             buffer.take(t)
         blame = self.blame
-        decoded = blame.decode
-        begin = perf_counter_ns()
-        outbox = self.service.step(t, self.inbox)
-        stepped = perf_counter_ns()
-        blame.compute += stepped - begin - (blame.decode - decoded)
+        begin, decoded = perf_counter_ns(), blame.decode
+        for outbox in self.service.parts(t, self.inbox):
+            stepped = perf_counter_ns()
+            blame.compute += stepped - begin - (blame.decode - decoded)
+            sent = self._pack(outbox, t)
+            begin = perf_counter_ns()
+            blame.encode += begin - stepped
+            yield sent
+            begin, decoded = perf_counter_ns(), blame.decode
+            for port, payload, sequence in sent:  # after they are on their way
+                port.chain(payload, t, sequence)
+            stepped = perf_counter_ns()
+            blame.encode += stepped - begin
+            begin = stepped
+        for port in self._periodic if self._strict else ():
+            if not t % port.period and port.sequence != t // port.period + 1:
+                raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+        blame.steps += 1
+
+    def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
         sent = []
         for name, message in outbox.items():
             port = self._port(name)
             if port.event:
-                items = message if isinstance(message, list) else (message,)
-                sent.extend([(port, port.pack(item, t)) for item in items])
+                for item in message if isinstance(message, list) else (message,):
+                    payload = port.pack(item)
+                    sent.append(Sent(port, payload, port.sequence))
             elif t % port.period:
                 raise LockstepError(f"{self.role.name} sent {name} at {t} ns, which is no tick of its period {port.period} ns")
             else:
-                sent.append((port, port.pack(message, t)))
-        for port in self._periodic if self._strict else ():
-            if not t % port.period and port.sequence != t // port.period + 1:
-                raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
-        blame.encode += perf_counter_ns() - stepped
-        blame.steps += 1
+                payload = port.pack(message)
+                sent.append(Sent(port, payload, port.sequence))
         return sent
 
     def _port(self, name: str) -> OutputPort:

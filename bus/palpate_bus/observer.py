@@ -86,8 +86,8 @@ class ObservedService:
         period = self.stepper.role.period
         due = self.now - self.now % period
         if busy and due >= 0 and (due > self._stepped or not self.stepper.ports):
-            for port, payload in self.stepper.step(due):
-                self.publishers[port.topic.name].put(payload, port.sequence)
+            for port, payload, sequence in self.stepper.step(due):
+                self.publishers[port.topic.name].put(payload, sequence)
             self._stepped = due
         return busy
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from palpate_bus.lockstep import OutputPort
+from palpate_bus.lockstep import Sent
 from palpate_bus.member import Member
 from palpate_bus.spool import CHUNK_TYPE, Spool, recording
 
@@ -25,15 +25,18 @@ class Outlet:
             publisher.hello()
         self._chunks.hello()
 
-    def send(self, sent: Sequence[tuple[OutputPort, bytes]], t: int) -> None:
-        """Sends what a step at `t` [ns] produced, and passes it on to the recorder."""
+    def send(self, sent: Sequence[Sent]) -> None:
+        """Sends what a part of a step produced."""
         publishers = self._publishers
-        for port, payload in sent:
-            publishers[port.topic.name].put(payload, port.sequence)
+        for port, payload, sequence in sent:
+            publishers[port.topic.name].put(payload, sequence)
+
+    def record(self, sent: Sequence[Sent], t: int) -> None:
+        """Passes what a step at `t` [ns] sent on to the recorder, if the run has one."""
         spool = self._spool
         if spool is not None:
-            for port, payload in sent:
-                spool.add(port.topic.name, payload, t, port.sequence)
+            for port, payload, sequence in sent:
+                spool.add(port.topic.name, payload, t, sequence)
             if spool.due(t):
                 self.flush(t)
 

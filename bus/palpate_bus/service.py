@@ -14,7 +14,7 @@ A service never touches a socket, a thread or a wall clock. The contract says wh
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, Protocol
 
 from palpate_bus.codec import Message
@@ -55,6 +55,13 @@ class Service(ABC):
         A periodic topic of this role needs a message at each of its ticks (t a multiple of the topic's period).
         Nothing here may depend on wall time, thread timing or an unseeded generator.
         """
+
+    def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
+        """The step in parts, each sent before the next is computed; the runtimes call this.
+
+        By default one part, `step`'s. A service on the 1 kHz path yields first what others wait for, then the rest.
+        """
+        yield self.step(t, inbox)
 
     def finish(self) -> Mapping[str, Any]:
         """Called once at the end; returns JSON-able facts for the report. Write files and close them here."""

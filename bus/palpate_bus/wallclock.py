@@ -14,7 +14,7 @@ from typing import Any
 from palpate_bus.codec import CodecError
 from palpate_bus.contract import MS, Edge
 from palpate_bus.distributed import Link, RunAborted
-from palpate_bus.lockstep import NEVER, Received, Stepper
+from palpate_bus.lockstep import NEVER, Received, Sent, Stepper
 from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.outlet import Outlet
@@ -52,7 +52,9 @@ class WallClockNode:
         """Runs until the conductor ends the run."""
         try:
             epoch = self._await_start()
-            self._outlet.send(self._stepper.start(), 0)
+            latched = self._stepper.start()
+            self._outlet.send(latched)
+            self._outlet.record(latched, 0)
             self._loop(epoch)
             self._finish()
         except RunAborted:
@@ -99,10 +101,13 @@ class WallClockNode:
                     epoch = now - t
                     self.resyncs += 1
             self._receive(t)
-            sent = self._stepper.step(t)
-            start = perf_counter_ns()
-            self._outlet.send(sent, t)
-            self._stepper.blame.send += perf_counter_ns() - start
+            everything: list[Sent] = []
+            for sent in self._stepper.parts(t):
+                start = perf_counter_ns()
+                self._outlet.send(sent)
+                self._stepper.blame.send += perf_counter_ns() - start
+                everything += sent
+            self._outlet.record(everything, t)
             self._tick = t
             while (message := self._link.poll()) is not None:
                 self._obey(message)

@@ -20,8 +20,8 @@ def rerun(service: Service, rules: Contract, inputs: Iterable[Recorded], end: in
     """
     stepper = Stepper(service, rules)
     late = {name for name, buffer in stepper.buffers.items() if buffer.edge is Edge.OBSERVE}
-    for port, payload in stepper.start():
-        yield Recorded(0, port.topic.name, payload, port.sequence)
+    for port, payload, sequence in stepper.start():
+        yield Recorded(0, port.topic.name, payload, sequence)
     source = iter(inputs)
     following = next(source, None)
     held: list[Recorded] = []
@@ -36,5 +36,5 @@ def rerun(service: Service, rules: Contract, inputs: Iterable[Recorded], end: in
                 received = Received(following.payload, following.stamp, following.sequence)
                 stepper.buffers[following.topic].deliver(received)
             following = next(source, None)
-        for port, payload in stepper.step(t):
-            yield Recorded(t, port.topic.name, payload, port.sequence)
+        for port, payload, sequence in stepper.step(t):
+            yield Recorded(t, port.topic.name, payload, sequence)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 from zlib import crc32
 
@@ -84,19 +84,26 @@ class RobotService(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Moves the plant to `t` under what arrived up to the tick before, and measures."""
+        return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
+
+    def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
+        """The same: first what control and tissue wait for."""
         self._obey_operator(t, inbox)
         self._drive(t, inbox)
         stamp = _Time(t // NS, t % NS)
-        outbox: dict[str, Message] = {"joint_states": self._joint_state(stamp)}
         p_WI, q_WI = self._plant.tool_pose()
         w, x, y, z = q_WI.w(), q_WI.x(), q_WI.y(), q_WI.z()
-        outbox["ft/wrench"] = self._wrench(stamp, (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
-        outbox["sim/tool_state"] = self._tool_state(stamp, p_WI, _Quaternion(x, y, z, w))
+        yield {
+            "joint_states": self._joint_state(stamp),
+            "sim/tool_state": self._tool_state(stamp, p_WI, _Quaternion(x, y, z, w)),
+        }
+        up_S = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+        outbox: dict[str, Message] = {"ft/wrench": self._wrench(stamp, up_S)}
         if not t % _STATUS_PERIOD:
             outbox["robot/status"] = self._status(stamp)
         if not t % _LINKS_PERIOD:
             outbox["sim/link_poses"] = self._link_poses(stamp)
-        return outbox
+        yield outbox
 
     def finish(self) -> Mapping[str, Any]:
         """Safe holds, rejected commands, and the largest external force that the sensor saw."""

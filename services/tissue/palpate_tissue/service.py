@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -81,6 +81,10 @@ class TissueService(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One millisecond of tissue."""
+        return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
+
+    def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
+        """The same: first the wrench, for which the robot waits."""
         tool = inbox.latest("sim/tool_state")
         if tool is None:
             self._tissue.idle(t / NS)
@@ -98,14 +102,17 @@ class TissueService(Service):
             p_A, v_A, w_A = motion_W @ self._R_WA
             force_A, torque_A = self._tissue.step(t / NS, p_A, v_A, float(tool.radius), w_A)
             force_W, torque_W = self._R_WA @ force_A, self._R_WA @ torque_A
-            self._count(force_W)
         wrench = _Wrench(_Vector3(*force_W.tolist()), _Vector3(*torque_W.tolist()))
-        outbox: dict[str, Message | list[Message]] = {"sim/contact_wrench": _WrenchStamped(header(t, "world"), wrench)}
+        yield {"sim/contact_wrench": _WrenchStamped(header(t, "world"), wrench)}
+        if tool is not None:
+            self._count(force_W)
+        outbox: dict[str, Message | list[Message]] = {}
         if t % self._surface_period == 0:
             outbox["sim/surface"] = self._surface_message(t)
         if t % self._truth_period == 0:
             outbox["truth/indentation"] = self._truth(t, tool, force_W)
-        return outbox
+        if outbox:
+            yield outbox
 
     def finish(self) -> Mapping[str, Any]:
         """Facts about the body and the contact."""

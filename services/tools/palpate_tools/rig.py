@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from palpate_bus import codec
 from palpate_bus.codec import Message
 from palpate_bus.contract import MS, Contract, contract
-from palpate_bus.lockstep import OutputPort, Received, Stepper
+from palpate_bus.lockstep import Received, Sent, Stepper
 from palpate_bus.service import Service
 from palpate_models.scenario import Scenario
 
@@ -122,7 +122,7 @@ class ServiceRig(Rig):
         """Marks a role lost."""
         self._stepper.inbox.lost_roles.add(role)
 
-    def _take(self, sent: list[tuple[OutputPort, bytes]]) -> None:
-        for port, payload in sent:
+    def _take(self, sent: list[Sent]) -> None:
+        for port, payload, sequence in sent:
             message = codec.decode(payload, port.topic.type)
-            self.log[port.topic.name].append(Heard(self.t, message, port.sequence, self.t))
+            self.log[port.topic.name].append(Heard(self.t, message, sequence, self.t))
