@@ -81,14 +81,20 @@ class Spool:
 
 
 def unpack_chunk(payload: bytes) -> tuple[int, Iterator[Recorded]]:
-    """The tick [ns] that a chunk covers, and its messages. Raises CodecError when it is none."""
+    """The tick [ns] that a chunk covers, and its messages. Raises CodecError when it is none, or not one piece."""
     chunk = _decode(payload)
     data = chunk.data.tobytes()
+    columns = (chunk.topic.tolist(), chunk.stamp.tolist(), chunk.sequence.tolist(), chunk.length.tolist())
+    if len({len(column) for column in columns}) != 1:
+        raise codec.CodecError(f"{CHUNK_TYPE}: columns of {', '.join(str(len(column)) for column in columns)} messages")
+    if sum(columns[3]) != len(data):
+        raise codec.CodecError(f"{CHUNK_TYPE}: messages of {sum(columns[3])} bytes in {len(data)} bytes")
+    if columns[0] and max(columns[0]) >= len(chunk.topics):
+        raise codec.CodecError(f"{CHUNK_TYPE}: a message of topic {max(columns[0])} of {len(chunk.topics)}")
 
     def messages() -> Iterator[Recorded]:
         begin = 0
-        rows = zip(chunk.topic.tolist(), chunk.stamp.tolist(), chunk.sequence.tolist(), chunk.length.tolist(), strict=True)
-        for topic, stamp, sequence, length in rows:
+        for topic, stamp, sequence, length in zip(*columns, strict=True):
             yield Recorded(chunk.topics[topic], data[begin : begin + length], stamp, sequence)
             begin += length
 

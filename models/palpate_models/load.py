@@ -35,7 +35,10 @@ def _read(source: str) -> tuple[str, str]:
         raise ScenarioError(
             f"{source}: no such scenario; known are {', '.join(scenario_names())}, or give the path of a YAML file"
         )
-    return path.read_text(encoding="utf-8"), source
+    try:
+        return path.read_text(encoding="utf-8"), source
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{source}: not UTF-8: {error.reason} at byte {error.start}") from error
 
 
 def _override(raw: dict[str, Any], setting: str) -> None:
@@ -46,17 +49,25 @@ def _override(raw: dict[str, Any], setting: str) -> None:
     *parents, last = field.split(".")
     node: Any = raw
     for parent in parents:
-        node = node[int(parent)] if isinstance(node, list) else node.setdefault(parent, {})
+        node = node[_index(node, parent, setting)] if isinstance(node, list) else node.setdefault(parent, {})
         if not isinstance(node, dict | list):
             raise ScenarioError(f"--set {setting}: {parent!r} is a value, not a section")
+    node[_index(node, last, setting) if isinstance(node, list) else last] = _parse(value, f"--set {setting}")
+
+
+def _index(items: list[Any], word: str, setting: str) -> int:
+    """The index of an item that is there."""
+    if not (word.isascii() and word.isdigit() and int(word) < len(items)):
+        raise ScenarioError(f"--set {setting}: {word!r} is no item; there are {len(items)}, counted from 0")
+    return int(word)
+
+
+def _parse(text: str, name: str) -> Any:
+    """YAML as Python values. PyYAML raises ValueError for a date such as 2001-13-45, and RecursionError for deep nesting."""
     try:
-        parsed = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise ScenarioError(f"--set {setting}: {error}") from error
-    if isinstance(node, list):
-        node[int(last)] = parsed
-    else:
-        node[last] = parsed
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ScenarioError(f"{name}: not YAML: {error}") from error
 
 
 def _explain(name: str, error: ValidationError) -> str:
@@ -73,10 +84,7 @@ def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = 
     Raises ScenarioError naming file, field, value and what is allowed.
     """
     text, name = _read(source)
-    try:
-        raw = yaml.safe_load(text) or {}
-    except yaml.YAMLError as error:
-        raise ScenarioError(f"{name}: not YAML: {error}") from error
+    raw = _parse(text, name) or {}
     if not isinstance(raw, dict):
         raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)

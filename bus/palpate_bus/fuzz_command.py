@@ -1,0 +1,43 @@
+"""`palpate fuzz`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from palpate_bus.fuzz import campaign, choose, guided
+
+EXIT_BAD_INPUT = 2
+EXIT_FOUND = 3
+
+
+def fuzz(
+    names: Annotated[list[str] | None, typer.Argument(help="Targets or patterns, e.g. 'codec:*'; all by default.")] = None,
+    inputs: Annotated[int, typer.Option(min=1, help="Inputs in all; with --coverage for each target.")] = 100_000,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same inputs.")] = 0,
+    coverage: Annotated[bool, typer.Option("--coverage", help="Guided by coverage, with atheris.")] = False,
+) -> None:
+    """Feed broken bytes to all that reads from the bus, and see that each is refused as it should be."""
+    console = Console(stderr=True)
+    try:
+        chosen = choose(names or [])
+    except ValueError as error:
+        console.print(f"[bold red]palpate fuzz:[/] {error}", highlight=False, soft_wrap=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+    if coverage:
+        bad = [target.name for target in chosen if guided(target, inputs, seed)]
+        console.print(f"{len(chosen)} targets, finds in: {', '.join(bad) or 'none'}", highlight=False)
+        raise typer.Exit(EXIT_FOUND if bad else 0)
+    done = campaign(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
+    for find in done.finds:
+        console.print(f"[red]{find.target}[/] {find.error}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
+    rate = sum(done.inputs.values()) / done.seconds
+    print(f"{sum(done.inputs.values())} inputs, {len(chosen)} targets, seed {seed}: {len(done.finds)} finds, {rate:.0f} inputs/s")
+    raise typer.Exit(EXIT_FOUND if done.finds else 0)
+
+
+def main() -> None:
+    """`python -m palpate_bus.fuzz`."""
+    typer.run(fuzz)

@@ -1,0 +1,89 @@
+"""Fuzzing in small, and every input that a campaign broke something with."""
+
+import math
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+from palpate_bus import codec
+from palpate_bus.fuzz import all_targets, attempt, campaign, choose, mutate
+from palpate_bus.fuzz_targets import Broken, Target
+from palpate_bus.messages import RecordChunk
+from palpate_bus.spool import CHUNK_TYPE, unpack_chunk
+from palpate_models.load import ScenarioError, load_scenario
+
+
+@pytest.mark.parametrize("target", all_targets(), ids=lambda target: target.name)
+def test_no_input_of_a_small_campaign_breaks_anything(target: Target) -> None:
+    done = campaign([target], 150, seed=20, slow_s=math.inf)
+    assert not done.finds, [(find.error, find.data.hex()) for find in done.finds]
+
+
+def test_the_same_seed_gives_the_same_inputs() -> None:
+    first, second = random.Random(4), random.Random(4)
+    assert [mutate(b"abcdefgh", first, [b"xy"]) for _ in range(50)] == [mutate(b"abcdefgh", second, [b"xy"]) for _ in range(50)]
+
+
+def test_a_broken_target_is_found() -> None:
+    def check(data: bytes) -> None:
+        if len(data) > 8:
+            raise Broken("too long")
+
+    done = campaign([Target("long", check, lambda _: [b"12345678"])], 500)
+    assert [find.error for find in done.finds] == ["Broken: too long"]
+    assert len(done.finds[0].data) > 8
+
+
+def test_choosing_targets() -> None:
+    assert {target.name for target in choose(["key", "tok*"])} == {"key", "token"}
+    with pytest.raises(ValueError, match="no target 'nothing'"):
+        choose(["nothing"])
+
+
+@pytest.mark.parametrize(
+    ("topic", "stamp", "length", "data", "words"),
+    [
+        ([0, 0], [1], [2, 3], 5, "columns"),
+        ([0, 7], [1, 1], [2, 3], 5, "topic 7 of 2"),
+        ([0, 1], [1, 1], [2, 3], 6, "bytes"),
+    ],
+)
+def test_a_chunk_that_is_not_one_piece_is_refused(
+    topic: list[int], stamp: list[int], length: list[int], data: int, words: str
+) -> None:
+    """Found by fuzzing: IndexError and ValueError came out while the recorder was writing."""
+    columns = np.array(topic, np.uint16), np.array(stamp, np.int64), np.array(stamp, np.uint32), np.array(length, np.uint32)
+    message = RecordChunk("robot", 0, ["a", "b"], *columns, np.zeros(data, np.uint8))
+    with pytest.raises(codec.CodecError, match=words):
+        unpack_chunk(codec.encode(message, CHUNK_TYPE))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [(b"seed: \xff", "not UTF-8"), (b"seed: 2001-13-45", "month"), (b"seed: " + b"[" * 400, "not YAML")],
+)
+def test_a_scenario_file_of_rubbish_is_refused_with_its_name(tmp_path: Path, text: bytes, words: str) -> None:
+    """Found by fuzzing: UnicodeDecodeError, ValueError and RecursionError came out."""
+    file = tmp_path / "broken.yaml"
+    file.write_bytes(text)
+    with pytest.raises(ScenarioError, match=words) as error:
+        load_scenario(str(file))
+    assert "broken.yaml" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "setting", ["exam.region_m.x=1", "exam.region_m.2=1", "phantom.lesions.-9=1", "exam.depth_m=[" + "[" * 400]
+)
+def test_a_setting_of_rubbish_is_refused_with_its_words(tmp_path: Path, setting: str) -> None:
+    """Found by fuzzing: ValueError and IndexError came out."""
+    file = tmp_path / "one.yaml"
+    file.write_text("exam: {region_m: [0.06, 0.06]}\nphantom: {lesions: []}\n")
+    with pytest.raises(ScenarioError, match=r"--set"):
+        load_scenario(str(file), [setting])
+
+
+def test_an_input_that_takes_long_is_a_find() -> None:
+    find = attempt(Target("slow", lambda _: None, lambda _: [b""]), b"x", slow_s=-1.0)
+    assert find is not None
+    assert "took" in find.error
