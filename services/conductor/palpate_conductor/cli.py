@@ -28,6 +28,7 @@ from palpate_conductor.evaluate import DEFAULT_CASES
 from palpate_conductor.evaluate import evaluate as run_evaluation
 from palpate_conductor.evaluate import table as evaluation_table
 from palpate_conductor.implementations import chosen_services
+from palpate_conductor.own import OwnServiceError, own_services
 from palpate_conductor.page import write_page
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
@@ -68,6 +69,8 @@ RUN_EXAMPLES = """
 
   palpate run --set exam.pattern=raster --set exam.mode=point
 
+  palpate run --service assessment=mine.py      a service of your own in place of ours
+
   palpate run --secure                          encrypted, and nobody does what is not his
 
   palpate run my.yaml --composed                all services in one process, for sweeps and debugging
@@ -92,6 +95,10 @@ def run(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
     ] = None,
+    services: Annotated[
+        list[str] | None,
+        typer.Option("--service", metavar="ROLE=FILE.py", help="A service of your own in place of ours; may be repeated."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON, and nothing else.")] = False,
 ) -> None:
@@ -101,7 +108,8 @@ def run(
     try:
         chosen = load_scenario(scenario, settings or (), seed)
         chosen_services(chosen)
-    except ScenarioError as error:
+        own = own_services(services or ())
+    except (ScenarioError, OwnServiceError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     if composed and (realtime or wallclock):
         _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
@@ -117,12 +125,14 @@ def run(
         folder.mkdir(parents=True, exist_ok=True)
         with RunDisplay(console, quiet) as display:
             if composed:
-                result = run_composed(chosen, folder.resolve(), display.tell, observers)
+                result = run_composed(chosen, folder.resolve(), display.tell, observers, own)
             else:
                 pace = 1.0 if realtime else None
                 with SecureBus(folder.resolve(), keys) if secure else nullcontext() as bus:
-                    result = run_distributed(chosen, folder.resolve(), display.tell, observers, pace, wallclock, secure=bus)
-    except (ProcessListError, BusConfigError, KeysError, OSError) as error:
+                    result = run_distributed(
+                        chosen, folder.resolve(), display.tell, observers, pace, wallclock, secure=bus, own=own
+                    )
+    except (ProcessListError, OwnServiceError, BusConfigError, KeysError, OSError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     except RunFailed as error:
         _fail(console, EXIT_FAILED, str(error))

@@ -23,6 +23,7 @@ from palpate_models.scenario import Scenario
 from palpate_conductor.collector import Collected, Collector
 from palpate_conductor.conductor import Conductor, Patience, RunFailed
 from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
+from palpate_conductor.own import in_place, load
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
 from palpate_conductor.secure import SecureBus
 from palpate_conductor.tree import FrameTree
@@ -87,8 +88,11 @@ def run_distributed(
     wallclock: bool = False,
     patience: Patience | None = None,
     secure: SecureBus | None = None,
+    own: Mapping[str, Path] | None = None,
 ) -> RunResult:
     """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
+
+    `own` gives the file that plays a role in place of the compose file's command.
 
     Raises ProcessListError when the compose file cannot be used, BusConfigError when the certificates cannot; later failures are
     in the result.
@@ -96,7 +100,7 @@ def run_distributed(
     begin = perf_counter()
     roles = (*WORKERS, *observers)
     files = write_scenario_files(scenario, out)
-    processes = chosen_processes(scenario, read_processes(compose_file(), roles))
+    processes = in_place(chosen_processes(scenario, read_processes(compose_file(), roles)), own or {})
     extra = {
         "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         "PALPATE_RECORD": str(int("recorder" in observers)),
@@ -174,34 +178,43 @@ def _how(code: int) -> str:
     return f"killed by signal {-code}" if code < 0 else f"left with status {code}"
 
 
-def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
-    """The services of `roles` in this process, from the entry points `palpate.services`.
+def load_services(scenario: Scenario, roles: tuple[str, ...], own: Mapping[str, Path] | None = None) -> list[Service]:
+    """The services of `roles` in this process, from the files of `own` and the entry points `palpate.services`.
 
-    Raises RunFailed naming a role that no installed package provides.
+    Raises OwnServiceError for a file without a service, RunFailed naming a role that no installed package provides.
     """
     found = {point.name: point for point in entry_points(group="palpate.services")}
     found.update(chosen_services(scenario))
     exam = redacted(scenario)
     services = []
     for role in roles:
-        if role not in found:
+        path = (own or {}).get(role)
+        if path is None and role not in found:
             raise RunFailed(f"no installed package provides the service {role!r} (entry point palpate.services)")
-        create: Callable[[Scenario], Service] = found[role].load()
+        create: Callable[[Scenario], Service] = found[role].load() if path is None else load(role, path)
         services.append(create(scenario if role in KNOWS_PHANTOM else exam))
     return services
 
 
-def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
-    """Runs all services in this process."""
+def run_composed(
+    scenario: Scenario,
+    out: Path,
+    tell: Tell,
+    observers: tuple[str, ...] = OBSERVERS,
+    own: Mapping[str, Path] | None = None,
+) -> RunResult:
+    """Runs all services in this process; `own` gives the file that plays a role in place of an installed service."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
     os.environ["PALPATE_OUT"] = str(out)
     os.environ.update(chosen_environment(scenario))
     collector = Collector(tree=FrameTree(exam_input(scenario)))
-    observing = load_services(scenario, observers)
+    observing = load_services(scenario, observers, own)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
-    run = Composed([*load_services(scenario, WORKERS), *viewers, collector], taps=[recorder.record for recorder in recorders])
+    run = Composed(
+        [*load_services(scenario, WORKERS, own), *viewers, collector], taps=[recorder.record for recorder in recorders]
+    )
     start = perf_counter()
     failure = None
     last = 0

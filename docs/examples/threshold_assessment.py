@@ -1,0 +1,47 @@
+"""An assessment of one's own: whatever takes more than twice the usual force is stiff."""
+
+import numpy as np
+from palpate_bus.codec import message_type
+from palpate_bus.messages import ExamState, Finding, Findings
+from palpate_bus.run import main
+from palpate_bus.service import Service
+from palpate_bus.stamps import header
+from palpate_models.frames import apply, inverse
+from palpate_models.load import exam_input, load_scenario
+from palpate_models.phantom import quadrant
+
+Point = message_type("geometry_msgs/msg/Point")
+
+
+class Threshold(Service):
+    role = "assessment"
+
+    def __init__(self, exam):
+        self.X_AW, self.spacing, self.places, self.forces = inverse(np.array(exam.X_WA)), exam.exam.spacing_m, [], []
+
+    def step(self, t, inbox):
+        for state in inbox.new("exam/state"):
+            if state.steady:  # in contact, at depth
+                self.places.append((state.surface_point.x, state.surface_point.y, state.surface_point.z))
+                self.forces.append(state.normal_force)
+            if state.phase in (ExamState.PHASE_ASSESS, ExamState.PHASE_ABORTED):
+                return {"assessment/findings": Findings(header(t, "abdomen"), self.findings(), final=True)}
+        return {}
+
+    def findings(self):
+        places, ratio = apply(self.X_AW, np.array(self.places)), np.array(self.forces) / np.median(self.forces)
+        stiff = places[ratio > 2.0]
+        if not len(stiff):
+            return []
+        cells = np.unique(np.round(stiff[:, :2] / self.spacing), axis=0)
+        x, y, z = map(float, stiff.mean(axis=0))
+        level = float(np.median(ratio[ratio > 2.0]))
+        return [Finding(Point(x, y, z), quadrant(x, y), len(cells) * self.spacing**2, level, 2.0, level, 0.5)]
+
+
+def create(scenario):
+    return Threshold(exam_input(scenario))
+
+
+if __name__ == "__main__":
+    main("assessment", create, load_scenario)
