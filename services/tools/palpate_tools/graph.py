@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from time import monotonic
 
-import zenoh
 from palpate_bus.contract import Contract
-from palpate_bus.liveliness import Entity, Kind, entities
+from palpate_bus.liveliness import Entity, GraphWatch, Kind
+
+from palpate_tools.joining import Joined
 
 
 @dataclass
@@ -33,9 +35,26 @@ class LiveNode:
     services: list[str] = field(default_factory=list)
 
 
-def present(session: zenoh.Session, domain: int) -> list[Entity]:
-    """Who is there."""
-    return entities(session, domain, timeout=2.0)
+QUIET_S = 0.3
+"""Everyone's tokens come in one burst; after this long without a new one they are taken to be all."""
+PATIENCE_S = 3.0
+
+
+def present(bus: Joined) -> list[Entity]:
+    """Who is there, sorted by token: waits for the roles that the run is known to have, and until nothing new comes."""
+    expected = set(bus.target.run.endpoints) if bus.target.run is not None else set()
+    watch = GraphWatch(bus.session, bus.domain)
+    try:
+        end = monotonic() + PATIENCE_S
+        quiet = monotonic()
+        while monotonic() < end:
+            if watch.changes(timeout=0.05):
+                quiet = monotonic()
+            if monotonic() - quiet > QUIET_S and watch.alive and expected <= watch.roles():
+                break
+        return [watch.alive[token] for token in sorted(watch.alive)]
+    finally:
+        watch.close()
 
 
 def topics(found: Iterable[Entity]) -> dict[str, LiveTopic]:

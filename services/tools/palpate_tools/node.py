@@ -21,7 +21,7 @@ def _group() -> None:
 def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the nodes on the bus, with what each publishes and subscribes to, and the roles that are missing."""
     with command(), joined(connect, run, domain) as bus:
-        found = graph.present(bus.session, bus.domain)
+        found = graph.present(bus)
         nodes, rules = graph.nodes(found), contract()
         absent = graph.missing(rules, found)
         if as_json:

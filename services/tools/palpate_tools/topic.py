@@ -31,7 +31,7 @@ EVERY_S = 1.0
 def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
     with command(), joined(connect, run, domain) as bus:
-        found = graph.topics(graph.present(bus.session, bus.domain))
+        found = graph.topics(graph.present(bus))
         rules = contract().topics
         if as_json:
             print_json([_topic_facts(topic) for topic in found.values()])
@@ -53,7 +53,7 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
     """Show a topic: its row of the contract, and who publishes and subscribes on the bus with which type hash."""
     with command(), joined(connect, run, domain) as bus:
         name = name.strip("/")
-        found = [e for e in graph.present(bus.session, bus.domain) if e.endpoint is not None and e.endpoint.topic == name]
+        found = [e for e in graph.present(bus) if e.endpoint is not None and e.endpoint.topic == name]
         row = contract().topics.get(name)
         if not found and row is None:
             raise NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
@@ -171,7 +171,7 @@ def _listening(
         name = name.strip("/")
         row = contract().topics.get(name)
         if row is None:
-            live = graph.topics(graph.present(bus.session, bus.domain)).get(name)
+            live = graph.topics(graph.present(bus)).get(name)
             if live is None:
                 raise NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
             types = sorted(kind for kind, _ in live.types)
