@@ -17,10 +17,14 @@ from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.service import Service
 from palpate_bus.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.stamps import nanoseconds
 
 log = logging.getLogger(__name__)
 
 IDLE_S = 0.01
+CLOCK = "clock"
+
+_decode_clock = codec.decoder("rosgraph_msgs/msg/Clock")
 
 
 @runtime_checkable
@@ -44,8 +48,14 @@ class RecorderNode:
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
+        # What observers say (clock, diagnostics, an operator's request) is rare and comes directly; the clock dates the rest.
+        observed = [topic for topic, _ in member.rules.inputs(service.role) if member.rules.roles[topic.producer].observer]
+        observed.sort(key=lambda topic: topic.name != CLOCK)
+        self._observed = [(topic, member.subscription(topic)) for topic in observed]
+        self._clock = 0
         self._lost: set[str] = set()
         self._messages = 0
+        self._garbage = 0
 
     @property
     def covered(self) -> int:
@@ -80,7 +90,7 @@ class RecorderNode:
         detail: dict[str, Any] = {
             "facts": dict(self._service.finish()),
             "messages": self._messages,
-            "garbage": sum(chunk.garbage for chunk in self._chunks.values()),
+            "garbage": self._garbage + sum(chunk.garbage for chunk in self._chunks.values()),
         }
         self._link.report(ServiceReport.FINISHED, max(self._covered.values()), detail=detail)
 
@@ -93,9 +103,31 @@ class RecorderNode:
                     tick, messages = unpack_chunk(sample.payload)
                 except codec.CodecError as error:
                     log.warning("chunk of %s: %s", role, error)
+                    self._garbage += 1
                     continue
                 for name, payload, stamp, sequence in messages:
-                    self._recorder.record(self._topics[name], payload, stamp, sequence)
-                    self._messages += 1
+                    if name in self._topics:
+                        self._record(self._topics[name], payload, stamp, sequence)
+                    else:
+                        self._garbage += 1
                 self._covered[role] = tick
+        return self._drain_observed() or busy
+
+    def _drain_observed(self) -> bool:
+        """Takes what observers said. It carries no simulated stamp, so it is dated by the clock that came before it."""
+        busy = False
+        for topic, subscription in self._observed:
+            while (sample := subscription.get(0)) is not None:
+                busy = True
+                if topic.name == CLOCK:
+                    try:
+                        self._clock = nanoseconds(_decode_clock(sample.payload).clock)
+                    except codec.CodecError:
+                        self._garbage += 1
+                        continue
+                self._record(topic, sample.payload, self._clock, sample.sequence)
         return busy
+
+    def _record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
+        self._recorder.record(topic, payload, stamp, sequence)
+        self._messages += 1

@@ -1,7 +1,7 @@
-"""A rosbag2 folder with one MCAP file, written as a stream in bounded memory: bytes in, bytes out, nothing decoded.
+"""A rosbag2 folder with MCAP files, written as a stream in bounded memory: bytes in, bytes out, nothing decoded.
 
-Layout: rosbag2's `metadata.yaml` (version 9, ROS 2 Jazzy) next to `<folder>_0.mcap`, profile `ros2`, message encoding
-`cdr`, schema encoding `ros2msg`; see the MCAP specification's well-known profiles and rosbag2_storage's metadata.
+Layout: rosbag2's `metadata.yaml` (version 9, ROS 2 Jazzy) next to `<folder>_0.mcap`, `<folder>_1.mcap` and so on, profile `ros2`,
+message encoding `cdr`, schema encoding `ros2msg`; see MCAP's well-known profiles and rosbag2_storage's metadata.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from mcap.writer import CompressionType, Writer
 
 CHUNK_BYTES = 4 * 1024 * 1024
 """A chunk is closed at this size, whatever its age: this bounds the memory."""
+FILE_BYTES = 1 << 30
+"""A file that has grown to this is completed and the next one begun: what is in a completed file no crash can touch."""
 
 _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 """RMW_DURATION_INFINITE, as rosbag2 writes it."""
@@ -67,6 +69,35 @@ class Count:
     last: int | None = field(default=None, repr=False)
 
 
+@dataclass
+class _File:
+    """One MCAP file and the stamps [ns] in it."""
+
+    path: Path
+    messages: int = 0
+    first: int | None = None
+    last: int = 0
+
+    def take(self, stamp: int) -> None:
+        self.messages += 1
+        self.first = stamp if self.first is None else min(self.first, stamp)
+        self.last = max(self.last, stamp)
+
+    @property
+    def extent(self) -> dict[str, Any]:
+        """rosbag2's description of a span of messages."""
+        return _extent(self.first, self.last, self.messages)
+
+
+def _extent(first: int | None, last: int, messages: int) -> dict[str, Any]:
+    start = first or 0
+    return {
+        "starting_time": {"nanoseconds_since_epoch": start},
+        "duration": {"nanoseconds": last - start},
+        "message_count": messages,
+    }
+
+
 class BagWriter:
     """Writes CDR messages into a rosbag2 folder. An old recording in the folder is replaced.
 
@@ -81,22 +112,35 @@ class BagWriter:
         channels: Iterable[Channel],
         *,
         flush_every: int = 1_000_000_000,
+        file_bytes: int = FILE_BYTES,
         compression: CompressionType = CompressionType.ZSTD,
     ) -> None:
         """Opens `folder` (created, parents included) for `channels`. Raises OSError if it cannot be written."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self.path = folder / f"{folder.name}_0.mcap"
         self.metadata_path = folder / "metadata.yaml"
         self.metadata_path.unlink(missing_ok=True)
+        for old in folder.glob(f"{folder.name}_*.mcap"):
+            old.unlink()
         self.channels = {channel.topic: channel for channel in channels}
         self.counts = {topic: Count() for topic in self.channels}
-        self.first_stamp: int | None = None
-        self.last_stamp = 0
+        self._files: list[_File] = []
         self._flush_every = flush_every
         self._flush_at: int | None = None
-        self._stream = self.path.open("wb")
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=compression)
+        self._file_bytes = file_bytes
+        self._compression = compression
+        self._begin_file()
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The files, oldest first."""
+        return tuple(file.path for file in self._files)
+
+    def _begin_file(self) -> None:
+        self._file = _File(self.folder / f"{self.folder.name}_{len(self._files)}.mcap")
+        self._files.append(self._file)
+        self._stream = self._file.path.open("wb")
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=self._compression)
         self._writer.start(profile="ros2", library="palpate-recorder")
         self._ids = self._register()
 
@@ -123,21 +167,23 @@ class BagWriter:
         if count.last is not None and sequence > count.last + 1:
             count.missing += sequence - count.last - 1
         count.last = sequence
-        if self.first_stamp is None or self._flush_at is None:
-            self.first_stamp = self.last_stamp = stamp
+        self._file.take(stamp)
+        if self._flush_at is None:
             self._flush_at = stamp + self._flush_every
-            return
-        if stamp > self.last_stamp:
-            self.last_stamp = stamp
-        elif stamp < self.first_stamp:
-            self.first_stamp = stamp
-        if stamp >= self._flush_at:
+        elif stamp >= self._flush_at:
             self.flush()
             self._flush_at = stamp + self._flush_every
+            if self._stream.tell() >= self._file_bytes:
+                self._end_file()
+                self._begin_file()
 
     def flush(self) -> None:
         """Hands everything written so far to the operating system, so that it survives a crash of this process."""
         self._writer.flush()
+
+    def _end_file(self) -> None:
+        self._writer.finish()
+        self._stream.close()
 
     def close(self) -> None:
         """Completes the file with its index and writes `metadata.yaml`. A second call does nothing."""
@@ -145,8 +191,7 @@ class BagWriter:
             return
         metadata = self.metadata()
         self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(metadata, sort_keys=False)})
-        self._writer.finish()
-        self._stream.close()
+        self._end_file()
         text = yaml.safe_dump({"rosbag2_bagfile_information": metadata}, sort_keys=False)
         temporary = self.metadata_path.with_suffix(".yaml.part")
         temporary.write_text(text, encoding="utf-8")
@@ -154,16 +199,13 @@ class BagWriter:
 
     def metadata(self) -> dict[str, Any]:
         """rosbag2's description of what has been written so far."""
-        start = self.first_stamp or 0
-        extent = {
-            "starting_time": {"nanoseconds_since_epoch": start},
-            "duration": {"nanoseconds": self.last_stamp - start},
-            "message_count": sum(count.messages for count in self.counts.values()),
-        }
+        stamps = [file.first for file in self._files if file.first is not None]
+        total = sum(file.messages for file in self._files)
+        extent = _extent(min(stamps, default=None), max(file.last for file in self._files), total)
         return {
             "version": 9,
             "storage_identifier": "mcap",
-            "relative_file_paths": [self.path.name],
+            "relative_file_paths": [file.path.name for file in self._files],
             **extent,
             "topics_with_message_count": [
                 {
@@ -180,7 +222,7 @@ class BagWriter:
             ],
             "compression_format": "",
             "compression_mode": "",
-            "files": [{"path": self.path.name, **extent}],
+            "files": [{"path": file.path.name, **file.extent} for file in self._files],
             "custom_data": None,
             "ros_distro": "jazzy",
         }

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Iterator
+from itertools import count, takewhile
 from pathlib import Path
 
 import yaml
@@ -42,9 +43,24 @@ def recover(folder: Path) -> Path:
 
     Raises FileNotFoundError if `folder` holds no recording, ValueError if not even its first chunk is complete.
     """
-    path = folder / f"{folder.name}_0.mcap"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no recording there; give the folder that holds the .mcap file")
+    numbered = (folder / f"{folder.name}_{number}.mcap" for number in count())
+    paths = list(takewhile(Path.is_file, numbered))
+    if not paths:
+        raise FileNotFoundError(f"{folder / folder.name}_0.mcap: no recording there; give the folder that holds the .mcap file")
+    names = _channels(paths[0])
+    if not names:
+        raise ValueError(f"{paths[0]}: broken before the end of its first chunk, nothing to recover")
+    bag = BagWriter(folder.with_name(f"{folder.name}_recovered"), names.values())
+    for path in paths:  # every file has the same channels, registered in the same order
+        for record in complete_records(path):
+            if isinstance(record, Message):
+                bag.write(names[record.channel_id].topic, record.data, record.log_time, record.sequence)
+    bag.close()
+    return bag.folder
+
+
+def _channels(path: Path) -> dict[int, Channel]:
+    """The channels of a file by their numbers."""
     schemas: dict[int, Schema] = {}
     names: dict[int, Channel] = {}
     for record in complete_records(path):
@@ -52,14 +68,7 @@ def recover(folder: Path) -> Path:
             schemas[record.id] = record
         elif isinstance(record, ChannelRecord) and record.id not in names:
             names[record.id] = _channel(record, schemas[record.schema_id])
-    if not names:
-        raise ValueError(f"{path}: broken before the end of its first chunk, nothing to recover")
-    bag = BagWriter(folder.with_name(f"{folder.name}_recovered"), names.values())
-    for record in complete_records(path):
-        if isinstance(record, Message):
-            bag.write(names[record.channel_id].topic, record.data, record.log_time, record.sequence)
-    bag.close()
-    return bag.folder
+    return names
 
 
 def _channel(record: ChannelRecord, schema: Schema) -> Channel:

@@ -16,7 +16,7 @@ from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.scenario import Scenario
 
-from palpate_recorder.bag import BagWriter, Channel
+from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
 
 FOLDER = "recording_mcap"
 """Name of the rosbag2 folder within the folder of the run."""
@@ -38,13 +38,13 @@ def channels(rows: Contract) -> list[Channel]:
 
 
 class RecorderService(Service):
-    """Writes every message it is given into `folder`, a rosbag2 folder with one MCAP file."""
+    """Writes every message it is given into `folder`, a rosbag2 folder."""
 
     role = "recorder"
 
-    def __init__(self, folder: Path) -> None:
-        """Opens the recording. Raises OSError if the folder cannot be written."""
-        self._bag = BagWriter(folder, channels(contract()))
+    def __init__(self, folder: Path, file_bytes: int = FILE_BYTES) -> None:
+        """Opens the recording, in files of about `file_bytes`. Raises OSError if the folder cannot be written."""
+        self._bag = BagWriter(folder, channels(contract()), file_bytes=file_bytes)
         self._names = {topic.name: f"/{topic.name}" for topic, _ in contract().inputs(self.role)}
         self._unexpected = 0
 
@@ -70,7 +70,8 @@ class RecorderService(Service):
         counts = self._bag.counts
         return {
             "folder": self._bag.folder.name,
-            "file_bytes": self._bag.path.stat().st_size,
+            "files": len(self._bag.paths),
+            "file_bytes": sum(path.stat().st_size for path in self._bag.paths),
             "messages": sum(count.messages for count in counts.values()),
             "message_bytes": sum(count.bytes for count in counts.values()),
             "missing": {topic: count.missing for topic, count in counts.items() if count.missing},
@@ -82,10 +83,14 @@ class RecorderService(Service):
 def create(scenario: Scenario) -> RecorderService:
     """The recorder of a run; the run's folder is in the environment variable PALPATE_OUT.
 
-    Raises ValueError if that is not set. The scenario does not matter: the recorder writes what the bus carries.
+    PALPATE_RECORD_FILE_MB is the size at which a new file is begun. Raises ValueError if that is no number above zero, or if
+    PALPATE_OUT is not set. The scenario does not matter: the recorder writes what the bus carries.
     """
     del scenario
     out = os.environ.get("PALPATE_OUT")
     if not out:
         raise ValueError(f"PALPATE_OUT is not set; the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder")
-    return RecorderService(Path(out) / FOLDER)
+    size = os.environ.get("PALPATE_RECORD_FILE_MB", "")
+    if size and not (size.isdigit() and int(size) > 0):
+        raise ValueError(f"PALPATE_RECORD_FILE_MB is {size!r}; want a whole number of megabytes above 0")
+    return RecorderService(Path(out) / FOLDER, int(size) * 1_000_000 if size else FILE_BYTES)

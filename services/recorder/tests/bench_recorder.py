@@ -81,7 +81,7 @@ def main() -> None:
                 spent[i] = perf_counter() - start
             bag.close()
             cpu = process_time() - cpu
-            written = bag.path.stat().st_size
+            written = bag.paths[0].stat().st_size
         print(
             f"| {compression.name.lower()} | {1e6 * cpu / len(messages):.1f} | {1e6 * np.quantile(spent, 0.999):.0f} "
             f"| {1e3 * cpu / seconds:.0f} | {written / 1e6 / seconds:.2f} |"

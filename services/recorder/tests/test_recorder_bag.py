@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +165,60 @@ def test_memory_stays_bounded_by_the_chunk(tmp_path: Path) -> None:
     service.finish()
 
 
+def rotated(folder: Path) -> RecorderService:
+    """Four simulated seconds in files of a third of a megabyte or more."""
+    service = RecorderService(folder, file_bytes=300_000)
+    record(service, 3900)
+    return service
+
+
+def test_a_long_recording_is_split_and_reads_as_one(tmp_path: Path) -> None:
+    facts = rotated(tmp_path / FOLDER).finish()
+    assert facts["files"] >= 3
+    metadata = yaml.safe_load((tmp_path / FOLDER / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert len(metadata["relative_file_paths"]) == facts["files"]
+    assert sum(file["message_count"] for file in metadata["files"]) == metadata["message_count"] == facts["messages"]
+    with Reader(tmp_path / FOLDER) as reader:
+        stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
+    assert stamps == [i * MS for i in range(3900)]
+    for path in sorted((tmp_path / FOLDER).glob("*.mcap")):
+        with path.open("rb") as stream:  # each file is complete in itself
+            decoded = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+            assert sum(1 for _ in decoded) > 0, path
+
+
+def test_a_crash_of_a_split_recording_loses_at_most_the_last_second(tmp_path: Path) -> None:
+    rotated(tmp_path / FOLDER)  # its process dies here
+    crashed = tmp_path / "crashed"
+    crashed.mkdir()
+    for number, path in enumerate(sorted((tmp_path / FOLDER).glob("*.mcap"))):
+        (crashed / f"crashed_{number}.mcap").write_bytes(path.read_bytes())
+    with Reader(recover(crashed)) as reader:
+        stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
+    assert stamps == [i * MS for i in range(len(stamps))]
+    assert len(stamps) >= 2900
+
+
+def test_a_shorter_run_in_the_same_folder_leaves_no_file_of_the_longer_one(tmp_path: Path) -> None:
+    rotated(tmp_path / FOLDER).finish()
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 5)
+    service.finish()
+    assert [path.name for path in (tmp_path / FOLDER).glob("*.mcap")] == [f"{FOLDER}_0.mcap"]
+
+
+def test_rerun_opens_the_recording(tmp_path: Path) -> None:
+    """Its own reader decodes joint states and meshes alike; nothing of ours takes part."""
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 200)
+    service.finish()
+    out = tmp_path / "opened.rrd"
+    command = [Path(sys.executable).with_name("rerun"), "mcap", "convert", tmp_path / FOLDER / f"{FOLDER}_0.mcap", "-o", out]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert out.stat().st_size > 10_000
+
+
 def test_an_empty_recording_is_a_valid_bag(tmp_path: Path) -> None:
     service = RecorderService(tmp_path / FOLDER)
     assert service.finish()["messages"] == 0
@@ -198,4 +254,8 @@ def test_create_reads_the_run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (tmp_path / "run" / FOLDER / "metadata.yaml").is_file()
     monkeypatch.delenv("PALPATE_OUT")
     with pytest.raises(ValueError, match="PALPATE_OUT"):
+        create(Scenario())
+    monkeypatch.setenv("PALPATE_OUT", str(tmp_path / "run"))
+    monkeypatch.setenv("PALPATE_RECORD_FILE_MB", "0")
+    with pytest.raises(ValueError, match="PALPATE_RECORD_FILE_MB is '0'"):
         create(Scenario())
