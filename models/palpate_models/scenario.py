@@ -155,6 +155,8 @@ class Exam(_Section):
 class Robot(_Section):
     """Robot, tool and its sensor."""
 
+    implementation: str = "default"
+    """`default`, or the name of another driver that an installed package registers (`lbr`)."""
     indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Mass below the F/T sensor: stand-off and indenter."""

@@ -19,7 +19,7 @@ DEFAULT = "default"
 
 
 def _choices(scenario: Scenario) -> dict[str, str]:
-    return {"tissue": scenario.tissue.implementation}
+    return {"tissue": scenario.tissue.implementation, "robot": scenario.robot.implementation}
 
 
 def chosen_services(scenario: Scenario) -> dict[str, EntryPoint]:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from palpate_bus.codec import Message
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import duration_message, header
@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 VALID_FOR = 250 * MS
 """The contract's expiry of planning/setpoint."""
+SUPERVISOR_AGE = 250 * MS
+"""A supervisor that has said nothing for so long is gone: nothing is pressed that nobody watches."""
 NEEDED = ("robot", "assessment", "supervisor")
 """Roles whose loss ends the exam, whatever its phase."""
 NEEDED_TO_SEE = ("camera", "perception")
@@ -47,7 +49,6 @@ class PlanningService(Service):
         self._surface: Message | None = None
         self._valid = duration_message(VALID_FOR)
         self._peak_force = 0.0
-        self._supervisor_age = (contract().topics["supervisor/state"].max_age_ms or 0) * MS
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One planning period: what is measured, what the exam makes of it, what is to be done."""
@@ -131,7 +132,7 @@ class PlanningService(Service):
         seeing = self._exam.status.phase in (Phase.HOME, Phase.LOOK)
         gone = tuple(role for role in NEEDED + (NEEDED_TO_SEE if seeing else ()) if inbox.lost(role))
         heard = inbox.stamp("supervisor/state")
-        if heard is not None and t - heard > self._supervisor_age:
+        if heard is not None and t - heard > SUPERVISOR_AGE:
             gone += (f"the supervisor, silent for {(t - heard) / MS:.0f} ms",)
         return gone
 

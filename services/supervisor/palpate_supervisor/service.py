@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import MS
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import NS, header
@@ -28,7 +28,11 @@ MOVES = ("control", "planning")
 LISTENS = ("assessment",)
 """Roles without which there is no reason to go on pressing."""
 WATCHED = ("robot/status", "exam/state")
-"""Topics whose age is watched."""
+"""Topics whose age is watched: the arm's, and planning's, whose set-points expire as soon."""
+MAX_AGE = 250 * MS
+"""Set-points expire then [ns]; control and driver watch their own inputs, faster."""
+SETTLE = 1000 * MS
+"""Ages are not judged so long after the start [ns]: processes come up one by one."""
 
 
 class SupervisorService(Service):
@@ -42,8 +46,7 @@ class SupervisorService(Service):
         self._watch = Watch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
         self._latch = Latch()
-        topics = contract().topics
-        self._ages = {name: (topics[name].max_age_ms or 0) * MS for name in WATCHED}
+        self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
         self._depth = NOWHERE
         self._peak_force = self._peak_speed = 0.0
@@ -89,10 +92,11 @@ class SupervisorService(Service):
             for role in roles
             if inbox.lost(role)
         ]
-        for name, limit in self._ages.items():
+        self._began = t if self._began is None else self._began
+        for name in WATCHED if t - self._began > SETTLE else ():
             heard = inbox.stamp(name)
-            if heard is not None and t - heard > limit:
-                words = f"nothing on {name} for {(t - heard) / 1e6:.0f} ms, limit {limit / 1e6:.0f} ms"
+            if heard is not None and t - heard > MAX_AGE:
+                words = f"nothing on {name} for {(t - heard) / 1e6:.0f} ms, limit {MAX_AGE / 1e6:.0f} ms"
                 found.append(Breach(Level.EMERGENCY, Cause.SILENT, words))
         return found
 

@@ -27,8 +27,8 @@ SPEED_MARGIN = 1.3
 """Free motion is planned to reach `speed_mps`; the arm overshoots it by some percent."""
 DEPTH_MARGIN_M = 0.005
 """How wrong the perceived surface may be before depth means anything [A]: planning counts it from the onset of force."""
-CONTACT_N = 3.0
-"""Untared force that is surely contact: more than the sensor's bias."""
+CONTACT_N = 5.0
+"""Untared force that is surely contact: the sensor's bias is up to 1.7 N, the tool's inertia takes 1.4 N at 4 m/s^2."""
 
 
 class Level(IntEnum):

@@ -1,0 +1,103 @@
+"""A ROS 2 node without ROS: topics over zenoh with rmw_zenoh's keys, attachments and liveliness tokens.
+
+It shows in `ros2 node list` and `ros2 topic info` on the ROS side.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import zenoh
+from palpate_bus import codec
+from palpate_bus.contract import Qos, Topic
+from palpate_bus.liveliness import NodeTokens
+from palpate_bus.transport import Publisher
+from palpate_bus.wire import WireError, topic_key, unpack
+from palpate_bus.zenoh_config import BusOptions, close_session, open_session
+
+RING = 16
+"""Messages kept a topic: latest wins, and a few in between are of use."""
+QOS = Qos(
+    name="ros",
+    priority="REAL_TIME",
+    congestion="DROP",
+    express=True,
+    reliability="RELIABLE",
+    depth=1,
+    reason="as ros2_control's controllers subscribe: reliable, the newest alone",
+)
+
+
+class RosPublisher:
+    """Publishes on a ROS topic."""
+
+    def __init__(self, publisher: Publisher, type_name: str) -> None:
+        self._publisher = publisher
+        self._encode = codec.encoder(type_name)
+        self._sequence = 0
+
+    def publish(self, message: Any) -> None:
+        """Sends a message."""
+        self._sequence += 1
+        self._publisher.put(self._encode(message), self._sequence)
+
+
+class RosSubscription:
+    """The newest messages of a ROS topic, from whoever publishes it."""
+
+    def __init__(self, session: zenoh.Session, key: str, type_name: str) -> None:
+        self._decode = codec.decoder(type_name)
+        self._subscriber: Any = session.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+        self._try = self._subscriber.handler.try_recv
+        self.sender = b""
+        """GID of the publisher of the newest message."""
+        self.garbage = 0
+        """Messages that could not be read."""
+
+    def take(self) -> list[Any]:
+        """What came since last time, oldest first; at most `RING`."""
+        messages = []
+        while (sample := self._try()) is not None:
+            try:
+                attachment: Any = sample.attachment
+                _, _, self.sender = unpack(attachment.to_bytes())
+                messages.append(self._decode(sample.payload.to_bytes()))
+            except (WireError, AttributeError, codec.CodecError):
+                self.garbage += 1
+        return messages
+
+    def newest(self) -> Any | None:
+        """The newest message since last time, None without one."""
+        messages = self.take()
+        return messages[-1] if messages else None
+
+
+class RosNode:
+    """A node of a name; topics are absolute, without the leading slash."""
+
+    def __init__(self, name: str, domain: int, options: BusOptions) -> None:
+        """Joins. Raises BusConfigError if a session cannot be opened."""
+        self._session = open_session(options)
+        self._domain = domain
+        self._tokens = NodeTokens(self._session, name, domain)
+
+    def publisher(self, topic: str, type_name: str) -> RosPublisher:
+        """Declares a publisher."""
+        row = _row(topic, type_name)
+        gid = self._tokens.publisher(row, QOS)
+        return RosPublisher(Publisher(self._session, topic_key(row, self._domain), QOS, gid), type_name)
+
+    def subscription(self, topic: str, type_name: str) -> RosSubscription:
+        """Declares a subscription."""
+        row = _row(topic, type_name)
+        self._tokens.subscription(row, QOS)
+        return RosSubscription(self._session, topic_key(row, self._domain), type_name)
+
+    def close(self) -> None:
+        """Leaves."""
+        self._tokens.undeclare()
+        close_session(self._session)
+
+
+def _row(topic: str, type_name: str) -> Topic:
+    return Topic(name=topic, type=type_name, producer="robot", readers={}, qos=QOS.name, doc="of the ROS side")
