@@ -14,12 +14,15 @@ Point = message_type("geometry_msgs/msg/Point")
 
 
 class Threshold(Service):
+    """Force at depth over its median."""
+
     role = "assessment"
 
     def __init__(self, exam):
         self.X_AW, self.spacing, self.places, self.forces = inverse(np.array(exam.X_WA)), exam.exam.spacing_m, [], []
 
     def step(self, t, inbox):
+        """Listens to the examination; once it is over, says what was stiff."""
         for state in inbox.new("exam/state"):
             if state.steady:  # in contact, at depth
                 self.places.append((state.surface_point.x, state.surface_point.y, state.surface_point.z))
@@ -29,6 +32,7 @@ class Threshold(Service):
         return {}
 
     def findings(self):
+        """One finding, of all places that took more than twice the median."""
         places, ratio = apply(self.X_AW, np.array(self.places)), np.array(self.forces) / np.median(self.forces)
         stiff = places[ratio > 2.0]
         if not len(stiff):
@@ -40,6 +44,7 @@ class Threshold(Service):
 
 
 def create(scenario):
+    """The service of a scenario."""
     return Threshold(exam_input(scenario))
 
 

@@ -1,0 +1,80 @@
+"""docs/quick-start.md, as a new user would: its files are the ones that are tried, its commands are understood, and they run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from examination import palpate_run
+from palpate_conductor.own import own_services
+from palpate_models.load import load_scenario
+from palpate_models.phantom import build_phantom
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")
+EXAMPLES = ROOT / "docs" / "examples"
+SMALL = ("exam.region_m=[0.06, 0.06]", "camera.frames=6")
+
+
+def commands() -> list[list[str]]:
+    """The words of every indented `palpate run`."""
+    lines = [line.partition("#")[0] for line in re.findall(r"^    palpate run(.*)$", PAGE, re.MULTILINE)]
+    return [shlex.split(line) for line in lines]
+
+
+def test_the_page_shows_the_files_that_are_tried() -> None:
+    shown = re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE, re.DOTALL)
+    assert shown == [(EXAMPLES / name).read_text(encoding="utf-8") for name in
+                     ("my_patient.yaml", "make_abdomen.py", "threshold_assessment.py")]  # fmt: skip
+    assert len([line for line in shown[-1].splitlines() if line.strip()]) <= 40
+
+
+def test_every_command_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    assert len(commands()) >= 6
+    for words in commands():
+        settings = [value for flag, value in pairwise(words) if flag == "--set"]
+        own_services([value for flag, value in pairwise(words) if flag == "--service"])
+        name = words[0] if words and not words[0].startswith("--") else "rlq_guarding"
+        load_scenario(name, settings)
+
+
+def test_the_mesh_is_an_abdomen(tmp_path: Path) -> None:
+    target = tmp_path / "my_abdomen.stl"
+    subprocess.run([sys.executable, str(EXAMPLES / "make_abdomen.py"), str(target)], check=True, timeout=120)
+    scenario = load_scenario("healthy", ["phantom.kind=mesh", f"phantom.mesh={target}"])
+    phantom = build_phantom(scenario.phantom, scenario.seed)
+    assert phantom.vertices[:, 2].max() == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.slow
+def test_ones_own_assessment_finds_the_lesion(tmp_path: Path) -> None:
+    place = f"assessment={EXAMPLES / 'threshold_assessment.py'}"
+    settings = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.04, -0.04]", "camera.frames=6")
+    ran = palpate_run("rlq_guarding", tmp_path, "--composed", "--no-record", "--service", place, settings=settings)
+    assert ran.status == 0, ran.output
+    assert ran.report["scores"]["matched"] == 1
+    assert ran.report["scores"]["localisation_error_m"] < 0.02
+    assert (tmp_path / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_ones_own_patient_and_mesh_are_examined(tmp_path: Path) -> None:
+    patient = palpate_run(
+        str(EXAMPLES / "my_patient.yaml"), tmp_path / "patient", "--composed", "--no-record",
+        settings=("exam.region_m=[0.08, 0.08]", "exam.centre_m=[-0.05, 0.0]", "camera.frames=6"),
+    )  # fmt: skip
+    assert patient.status == 0, patient.output
+    assert patient.report["scores"]["matched"] == 1
+    mesh = tmp_path / "my_abdomen.stl"
+    subprocess.run([sys.executable, str(EXAMPLES / "make_abdomen.py"), str(mesh)], check=True, timeout=120)
+    ran = palpate_run(
+        "healthy", tmp_path / "mesh", "--composed", "--no-record", settings=("phantom.kind=mesh", f"phantom.mesh={mesh}", *SMALL)
+    )
+    assert ran.status == 0, ran.output
+    assert ran.report["findings"] == []
