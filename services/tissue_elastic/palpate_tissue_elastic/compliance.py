@@ -77,6 +77,13 @@ def compliance(
     return Compliance(_Body(model, free, thickness, poisson, pitch_m).matrix(tuple(lesions)), free)
 
 
+def uniform_compliance(model: PhantomModel, poisson: float = POISSON) -> tuple[Compliance, float]:
+    """That of a uniform body under the same skin, and its foundation modulus [N/m^3]."""
+    free = np.flatnonzero(~model.fixed)
+    body = _Body(model, free, float(np.ptp(model.vertices[:, 2])), poisson, PITCH_M)
+    return Compliance(body.layer().astype(np.float32), free), body.uniform() / YOUNG_OVER_K_W
+
+
 @dataclass(frozen=True)
 class _Body:
     model: PhantomModel
@@ -89,7 +96,7 @@ class _Body:
         """S with these lesions, shape (f, f)."""
         model = self.model
         if not lesions and np.ptp(model.background) <= 1e-9 * model.background.mean():
-            return self._layer().astype(np.float32)
+            return self.layer().astype(np.float32)
         if not math.isfinite(self.thickness):
             raise ValueError("a half-space has to be uniform: give the layer a finite thickness_m")
         arrays = (model.vertices, model.normals, model.areas, model.background, model.fixed)
@@ -107,8 +114,8 @@ class _Body:
             grid = self._grid_about(lesions[-1])
             elements = skin_compliance(grid, before, self.poisson)
         else:
-            base = self._layer()
-            uniform = self._uniform()
+            base = self.layer()
+            uniform = self.uniform()
             scale = np.sqrt(uniform / young)
             grid = self._grid()
             key = content_key("uniform", grid.x, grid.y, grid.depth, self.poisson)
@@ -124,11 +131,11 @@ class _Body:
         base += (weights @ (weights @ difference).T).T
         return base.astype(np.float32)
 
-    def _uniform(self) -> float:
+    def uniform(self) -> float:
         """Young's modulus [Pa] of the uniform layer to begin with."""
         return YOUNG_OVER_K_W * float(np.median(self.model.background))
 
-    def _layer(self) -> Array:
+    def layer(self) -> Array:
         """S of the uniform layer, shape (f, f)."""
         kernel = LayerKernel(self.poisson, self.thickness)
         vertices = self.model.vertices[self.free]
@@ -136,7 +143,7 @@ class _Body:
         np.fill_diagonal(matrix, 1.0)
         matrix = kernel(matrix)
         np.fill_diagonal(matrix, kernel.at_own_place(self.model.areas[self.free]))
-        matrix *= kernel.factor(self._uniform())
+        matrix *= kernel.factor(self.uniform())
         return matrix
 
     def _front(self) -> Array:
@@ -154,7 +161,7 @@ class _Body:
         half = self._front()
         centre = np.clip(np.asarray(lesion.centre_m), -half, half)
         reach = np.asarray(lesion.radii_m) + 0.045 + 0.5 * depth
-        finest = max(0.005, 0.3 * min(lesion.radii_m))
+        finest = max(0.4 * self.pitch, 0.3 * min(lesion.radii_m))
         pitch = min(self.pitch, finest, 0.4 * self.pitch + 0.2 * depth)
         return graded_grid(np.maximum(centre - reach, -half), np.minimum(centre + reach, half), self.thickness, pitch)
 
