@@ -15,7 +15,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import dartpy as dart
 import numpy as np
@@ -24,16 +24,7 @@ from palpate_models.frames import Array
 from palpate_models.scenario import Robot
 from palpate_models.table import boxes
 
-DT: Final = 1e-3
-"""Step [s]."""
-GRAVITY: Final = 9.81
-"""[m/s^2], along -z of world."""
-END_STOP_MARGIN_RAD: Final = 0.03
-"""How far behind the position limit the mechanical end stop is [A]; the driver acts at the limit."""
-STICK_RADPS: Final = 1e-3
-"""Below this speed friction is viscous: a joint under less than its friction creeps slower than this [A]."""
-_FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
-"""Links that stand on or turn over the base and so have no collision shapes."""
+from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY, STICK_RADPS
 
 
 def _isometry(X: Array) -> Any:
@@ -94,7 +85,7 @@ class Plant:
             joint.setLimitEnforcement(True)
             joint.setCoulombFriction(0, 0.0)
         for link, capsules in lbr.capsules(robot).items():
-            for capsule in () if link in _FIXED_LINKS else capsules:
+            for capsule in () if link in FIXED_LINKS else capsules:
                 self._add_capsule(self._arm.getBodyNode(link), capsule)
         self._world = dart.simulation.World()
         self._world.setTimeStep(DT)

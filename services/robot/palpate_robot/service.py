@@ -17,7 +17,7 @@ from palpate_models.scenario import ExamInput, Scenario
 
 from palpate_robot.driver import Cause, Command, Driver, Mode
 from palpate_robot.ft_sensor import FtSensor
-from palpate_robot.plant import DT, GRAVITY, Plant
+from palpate_robot.physics import DT, GRAVITY, Factory
 
 _Time: Any = message_type("builtin_interfaces/msg/Time")
 _Header: Any = message_type("std_msgs/msg/Header")
@@ -52,13 +52,13 @@ class RobotService(Service):
 
     role: ClassVar[str] = "robot"
 
-    def __init__(self, exam: ExamInput) -> None:
-        """Starts at `lbr.HOME`, at rest."""
+    def __init__(self, exam: ExamInput, plant: Factory | None = None) -> None:
+        """Starts at `lbr.HOME`, at rest. `plant` makes the physics behind driver and sensor; DART if there is none."""
         robot = exam.robot
         streams = np.random.SeedSequence([exam.seed, crc32(b"robot")]).spawn(2)
         joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
         self._robot = robot
-        self._plant = Plant(robot)
+        self._plant = (plant or _dart())(robot)
         self._sensor = FtSensor(robot, ft_rng)
         self._driver = Driver(exam.limits.force_emergency_n)
         self._rng = joint_rng
@@ -213,6 +213,13 @@ class RobotService(Service):
             pose = _Transform(_Vector3(*p.tolist()), rotation)
             transforms.append(_TransformStamped(_Header(stamp, "world"), link, pose))
         return _TFMessage(transforms)
+
+
+def _dart() -> Factory:
+    """DART, which is not installed where another physics takes its place."""
+    from palpate_robot.plant import Plant  # noqa: PLC0415
+
+    return Plant
 
 
 def create(scenario: Scenario) -> RobotService:

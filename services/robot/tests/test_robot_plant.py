@@ -6,7 +6,8 @@ import pytest
 from palpate_models import lbr
 from palpate_models.scenario import Robot
 from palpate_robot.driver import HOLD_DAMPING
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, GRAVITY, STICK_RADPS, Plant
+from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, GRAVITY, STICK_RADPS
+from palpate_robot.plant import Plant
 
 NOTHING = np.zeros(3)
 NO_DAMPING = np.zeros(7)

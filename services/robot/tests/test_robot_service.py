@@ -10,7 +10,7 @@ from palpate_bus.contract import contract
 from palpate_bus.stamps import duration_message, header, nanoseconds
 from palpate_models import lbr
 from palpate_models.scenario import Robot, Scenario
-from palpate_robot.plant import GRAVITY
+from palpate_robot.physics import GRAVITY
 from palpate_robot.service import RobotService, create
 
 MS = 1_000_000
