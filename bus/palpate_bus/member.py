@@ -11,6 +11,7 @@ from time import monotonic
 import zenoh
 
 from palpate_bus.contract import Contract, Topic
+from palpate_bus.faults import faulty
 from palpate_bus.liveliness import GraphWatch, NodeTokens, mismatches
 from palpate_bus.transport import Publisher, Subscription
 from palpate_bus.wire import message_key, topic_key
@@ -36,7 +37,10 @@ class Member:
     def publisher(self, topic: Topic) -> Publisher:
         """A publisher of a topic of the contract."""
         qos = self.rules.qos[topic.qos]
-        return Publisher(self.session, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos))
+        publisher: Publisher = faulty(
+            Publisher(self.session, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos)), topic
+        )
+        return publisher
 
     def subscription(self, topic: Topic, history: bool = False) -> Subscription:
         """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
