@@ -22,6 +22,8 @@ class Check:
     high: float | None = None
     against: str = ""
     """What it is measured against."""
+    timed: bool = False
+    """Whether it is a cost: such bounds are printed, but are no tests."""
 
     @property
     def passed(self) -> bool | None:

@@ -16,11 +16,15 @@ EXIT_BAD_INPUT = 2
 EXIT_MISSED = 3
 SECTIONS = {
     "hertz": "hertz",
+    "elastic": "elastic",
     "lumps": "lumps",
     "mesh": "meshes",
     "relaxation": "relaxation",
     "energy": "energy",
     "drop": "drop",
+    "dart": "dart_bodies",
+    "mujoco": "flex",
+    "stability": "stability",
 }
 """Name of each section and the module that measures it, in the order of the report."""
 

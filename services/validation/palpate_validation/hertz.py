@@ -34,6 +34,20 @@ def hertz_force(depth: Array | float, radius: float, young: float = YOUNG_PA, po
     return np.asarray(4 / 3 * young / (1 - poisson**2) * np.sqrt(radius) * np.asarray(depth, dtype=float) ** 1.5)
 
 
+def sneddon_force(depth: float, radius: float, young: float = YOUNG_PA, poisson: float = POISSON) -> float:
+    """Force [N] of a rigid sphere, not a paraboloid, on an elastic half-space at `depth` [m] (Sneddon 1965).
+
+    d = a/2 ln((R + a) / (R - a)),  F = E* [(a^2 + R^2)/2 ln((R + a) / (R - a)) - a R].
+    """
+    low, high = 0.0, radius * (1 - 1e-12)
+    a = 0.0
+    for _ in range(100):
+        a = (low + high) / 2
+        low, high = (a, high) if a * np.arctanh(a / radius) < depth else (low, a)
+    modulus = young / (1 - poisson**2)
+    return float(modulus * ((a**2 + radius**2) * np.arctanh(a / radius) - a * radius))
+
+
 @dataclass(frozen=True)
 class HertzCurves:
     """Static forces of the surface tier and of Hertz, shapes (radii, depths)."""

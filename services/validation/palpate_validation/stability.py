@@ -1,0 +1,135 @@
+"""How much bus delay and jitter the contact of robot, tissue and controller bears: measured, and against linear theory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from palpate_validation.check import Check, Section
+from palpate_validation.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, Delays, Ringing, press
+from palpate_validation.loop_theory import linearise
+from palpate_validation.plots import COLOURS, QUIET
+
+STIFFNESS_NPM = 5000.0
+"""K_z of an examination."""
+CONTRASTS = (1.0, 4.0, 10.0)
+DELAYS_MS = (0, 2, 4, 6, 8, 10)
+PATHS = {"all": EVENTS, "control": CONTROL_PATH, "contact": CONTACT_PATH}
+AGREE_MS = 2
+"""How far a measured margin may be from theory's."""
+WORDS = {"all": "all messages late", "control": "controller and robot", "contact": "robot and tissue"}
+LARGEST_MS = 24
+"""Margins are sought up to here."""
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Largest delay of each message with which the contact stays quiet."""
+
+    path: str
+    contrast: float
+    measured_ms: int
+    """-1: not even without delay."""
+    theory_ms: int
+
+
+@dataclass(frozen=True)
+class Stability:
+    """All that was measured."""
+
+    delay: dict[float, list[Ringing]]
+    """By contrast, one for each of `DELAYS_MS`, on all messages."""
+    jitter: dict[float, list[Ringing]]
+    """The same with jitter from zero to the given milliseconds."""
+    margins: list[Margin]
+
+
+def margin_ms(contrast: float, topics: tuple[str, ...], stiffness: float = STIFFNESS_NPM) -> int:
+    """Largest whole delay [ms] of each message of `topics` with which the contact stays quiet, by bisection up to 24 ms."""
+    if press(contrast, stiffness, Delays(topics, LARGEST_MS * 1e-3)).stable:
+        return LARGEST_MS
+    low, high = -1, LARGEST_MS  # low: quiet, high: not
+    while high - low > 1:
+        middle = (low + high) // 2
+        if press(contrast, stiffness, Delays(topics, middle * 1e-3)).stable:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def measure() -> Stability:
+    """The sweeps, and margins of each path for each contrast."""
+    delay = {c: [press(c, STIFFNESS_NPM, Delays(EVENTS, ms * 1e-3)) for ms in DELAYS_MS] for c in CONTRASTS}
+    jitter = {c: [press(c, STIFFNESS_NPM, Delays(EVENTS, 0.0, ms * 1e-3, seed=1)) for ms in DELAYS_MS] for c in CONTRASTS}
+    margins = []
+    for contrast in CONTRASTS:
+        loop = linearise(contrast, STIFFNESS_NPM)
+        for path, topics in PATHS.items():
+            margins.append(Margin(path, contrast, margin_ms(contrast, topics), loop.margin_ms(topics)))
+    return Stability(delay, jitter, margins)
+
+
+def section(found: Stability | None = None) -> Section:
+    """Sweeps and margins with their bounds."""
+    found = found or measure()
+    checks = []
+    for margin in found.margins:
+        name = f"x{margin.contrast:g} wall, {WORDS[margin.path]}: quiet up to"
+        if margin.path == "contact":
+            checks.append(Check(name, margin.measured_ms, "ms a message", low=LARGEST_MS, against=f"theory: {margin.theory_ms}"))
+            continue
+        low, high = margin.theory_ms - AGREE_MS, margin.theory_ms + AGREE_MS
+        checks.append(Check(name, margin.measured_ms, "ms a message", low, high, f"theory: {margin.theory_ms}"))
+    for contrast in CONTRASTS:
+        quiet = [ms for ms, ringing in zip(DELAYS_MS, found.jitter[contrast], strict=True) if ringing.stable]
+        checks.append(
+            Check(f"x{contrast:g} wall: quiet with jitter up to", max(quiet), "ms", low=8, against=f"of {DELAYS_MS[-1]} tried")
+        )
+    control = [margin.measured_ms for margin in found.margins if margin.path == "control"]
+    text = (
+        "Robot, tissue and controller as a run has them (K_z = 5000 N/m), pressed 10 mm deep in the posture of an "
+        "examination; the "
+        "set-point is nudged by 0.5 mm and the force must be quiet half a second later. Every message of the named topics is "
+        "late by "
+        "the same time, so a loop of two messages by twice that, on top of the millisecond a tick costs. Only the path between "
+        f"controller and robot has a margin, {min(control)} to {max(control)} ms a message, little changed by the wall: the "
+        "controller's own damping turns over, not the contact. The path between robot and tissue, which hardware does not "
+        "have, bears "
+        f"{LARGEST_MS} ms and more, since the wall is softer than the controller and the joints' friction carries the rest. "
+        "Theory: the arm's seven joints, linearised, by Nyquist's criterion. Beyond the margin a ring grows until the driver "
+        "holds."
+    )
+    data = {
+        "delays_ms": DELAYS_MS,
+        "swing_by_delay_n": {f"x{c:g}": [r.swing for r in found.delay[c]] for c in CONTRASTS},
+        "held_by_delay": {f"x{c:g}": [r.held for r in found.delay[c]] for c in CONTRASTS},
+        "swing_by_jitter_n": {f"x{c:g}": [r.swing for r in found.jitter[c]] for c in CONTRASTS},
+        "held_by_jitter": {f"x{c:g}": [r.held for r in found.jitter[c]] for c in CONTRASTS},
+        "margins": [vars(margin) for margin in found.margins],
+    }
+    return Section(
+        "stability", "Contact under bus delay and jitter", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6), data
+    )
+
+
+def draw(figure: Figure, found: Stability) -> None:
+    """Ringing against delay and jitter, and the force over time on either side of the margin."""
+    axes = figure.subplots(2, 2)
+    for sweep, ax, label in ((found.delay, axes[0, 0], "delay of every message [ms]"), (found.jitter, axes[0, 1], "jitter [ms]")):
+        for contrast, colour in zip(CONTRASTS, COLOURS, strict=False):
+            swing = [max(100 * r.swing / max(r.mean_force, 0.1), 1e-2) for r in sweep[contrast]]
+            ax.plot(DELAYS_MS, swing, "o-", color=colour, ms=3, lw=1, label=f"wall x{contrast:g}")
+            held = [(ms, s) for ms, s, r in zip(DELAYS_MS, swing, sweep[contrast], strict=True) if r.held]
+            ax.plot([ms for ms, _ in held], [s for _, s in held], "x", color=colour, ms=7)
+        ax.axhline(5, color=QUIET, lw=0.8, ls="--")
+        ax.set(xlabel=label, ylabel="swing after the nudge [% of the force]", yscale="log")
+        ax.legend()
+    for contrast, ax in ((CONTRASTS[0], axes[1, 0]), (CONTRASTS[-1], axes[1, 1])):
+        for k in (0, 3, 5):
+            ringing = found.delay[contrast][k]
+            colour, label = COLOURS[k // 2], f"delay {DELAYS_MS[k]} ms"
+            ax.plot(ringing.time, ringing.force, color=colour, lw=0.8, zorder=-k, label=label)
+        ax.set(xlabel="time [s]", ylabel=f"force, wall x{contrast:g} [N]", xlim=(0.0, None))
+        ax.legend()
