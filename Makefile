@@ -23,7 +23,8 @@ test-docker: install  ## builds the images and runs a short examination on a Doc
 	$(BIN)/python -m pytest -q -m "docker"
 
 test-browser: install  ## opens the dashboard of live runs in headless Chromium
-	@command -v chromium chromium-browser google-chrome google-chrome-stable >/dev/null || echo "test-browser: no Chromium on the PATH: THE BROWSER TESTS ARE SKIPPED"
+	@for name in chromium chromium-browser google-chrome google-chrome-stable; do command -v $$name >/dev/null && exit 0; done; \
+	echo "test-browser: no Chromium on the PATH: THE BROWSER TESTS ARE SKIPPED"
 	$(BIN)/python -m pytest -q -m "browser"
 
 bench: install  ## figures with ratios, as a table and as bench.json

@@ -49,6 +49,17 @@ def share(image: np.ndarray, color: palette.Rgba, reach: int) -> float:
     return float(np.mean((angle < reach) & (bright > 120)))
 
 
+def wait_for(port: int) -> None:
+    """Until something listens at `port`."""
+    until = monotonic() + PATIENCE_S
+    while monotonic() < until:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        sleep(0.2)
+    pytest.fail(f"nothing listens at {port} after {PATIENCE_S} s")
+
+
 def look(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> None:
     """Opens the page in a headless browser until each colour fills its share: (colour, reach of hue [deg], share)."""
     playwright = pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
@@ -59,6 +70,7 @@ def look(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> None:
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1000, "height": 700}, color_scheme="dark")
+        page.set_default_timeout(1000 * PATIENCE_S)
         page.goto(address(port) + "&renderer=webgl")
         until = monotonic() + PATIENCE_S
         seen: dict[str, float] = {}
@@ -74,6 +86,7 @@ def look(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> None:
 
 
 @pytest.mark.browser
+@pytest.mark.timeout(900)
 def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
     port = free_ports()
     service = DashboardService(Scenario(name="live"), tmp_path / FILE, Live(serve_port=port))
@@ -103,6 +116,7 @@ def test_a_run_that_is_joined_late_is_drawn(tmp_path: Path) -> None:
             assert monotonic() < until, "the run did not start"
             sleep(0.5)
         watching = subprocess.Popen([palpate, "dashboard", "--port", str(port)], env=environment)
+        wait_for(port + 1)
         look(port, SCENE)
     finally:
         for process in (watching, running):

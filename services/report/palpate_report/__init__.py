@@ -1,0 +1,1 @@
+"""The seed paper's figures and claims, from runs of Palpate."""
