@@ -90,7 +90,7 @@ def _check_live(
         typer.echo(f"waiting for {role} at {where}, domain {domain}", err=True)
         rig = LiveRig(bus, role, settings, domain)
         try:
-            with _started(start, role, settings, where, domain):
+            with started(start, role, settings, where, domain):
                 rig.await_implementation(wait, report)
                 check(rig, report)
                 rig.finish(report)
@@ -100,7 +100,7 @@ def _check_live(
 
 
 @contextmanager
-def _started(words: str | None, role: str, settings: Settings, endpoint: str, domain: int) -> Iterator[None]:
+def started(words: str | None, role: str, settings: Settings, endpoint: str, domain: int) -> Iterator[None]:
     """Starts the implementation for the time of the check, if its command was given."""
     if words is None:
         yield

@@ -62,6 +62,8 @@ class Rig(ABC):
         """What it sent that is no message, a sentence each."""
         self.t = 0
         """Now [ns]."""
+        self.memory: dict[str, int] = {}
+        """What a suite keeps from one check to the next."""
 
     @property
     def slack(self) -> int:

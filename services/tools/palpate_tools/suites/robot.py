@@ -10,6 +10,7 @@ from palpate_bus.messages import (
     JointTorqueCommand,
     OperatorRequest,
     RobotStatus,
+    SupervisorState,
     Vector3,
     Wrench,
     WrenchStamped,
@@ -30,22 +31,29 @@ DRIFT_RAD = 0.05
 PRESS_N = 10.0
 
 
-def quiet() -> dict[str, Source]:
-    """No contact, no command."""
+def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
+    """No contact, no command; a supervisor who is content, or not."""
     zero = Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
-    return {"sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), zero)}
+    cause = SupervisorState.CAUSE_NONE if level == SupervisorState.LEVEL_OK else SupervisorState.CAUSE_FORCE
+
+    def supervisor(t: int) -> Any:
+        reason = "conformance check" if cause else ""
+        return SupervisorState(header(t), level, cause, reason, rig.memory.get("releases", 0), 0.0, -1.0, 0.0)
+
+    return {"sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), zero), "supervisor/state": supervisor}
 
 
-def commanding(torque: Any, valid_ns: int = 50 * MS) -> Feed:
+def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> Feed:
     """The same with a torque command [N m], shape (7,), on every tick."""
     values = np.asarray(torque, dtype=float)
-    return {**quiet(), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns))}
+    valid_ns = (rig.rules.topics[COMMAND].expiry_ms or 0) * MS
+    return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns))}
 
 
 def suite(rig: Rig, report: Report) -> None:
     """Signs, gravity, holds, latches, limits."""
     report.section("joints")
-    rest = rig.run(0.5, quiet())
+    rest = rig.run(0.5, quiet(rig))
     _joints(rest["joint_states"], report)
     report.expect("starts idle, without a command", _mode(rig) == RobotStatus.MODE_IDLE, "MODE_IDLE", _mode_name(rig))
     _description(rig, report)
@@ -60,6 +68,7 @@ def suite(rig: Rig, report: Report) -> None:
     _expiry(rig, report)
     _invalid(rig, report)
     _stop(rig, report)
+    _emergency(rig, report)
     report.section("sensor")
     _force(rig, report)
     _twist(rig, report)
@@ -116,7 +125,7 @@ def _description(rig: Rig, report: Report) -> None:
 
 def _gravity(rig: Rig, report: Report) -> None:
     """Commands exclude gravity: with zero torque a compensated arm stays where it is."""
-    moved = rig.run(0.4, commanding(np.zeros(7)))["joint_states"]
+    moved = rig.run(0.4, commanding(rig, np.zeros(7)))["joint_states"]
     report.expect("obeys commands", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
     drift = float(np.max(np.abs(moved[-1].message.position - moved[0].message.position))) if moved else np.inf
     report.expect(
@@ -135,7 +144,7 @@ def _signs(rig: Rig, report: Report) -> None:
         release(rig)
         torque = np.zeros(7)
         torque[joint] = PUSH[joint]
-        heard = rig.run(PUSH_S, commanding(torque))["joint_states"]
+        heard = rig.run(PUSH_S, commanding(rig, torque))["joint_states"]
         settle(rig)
         q = np.array([item.message.position[joint] for item in heard])
         if len(q) < 10 or q[-5:].mean() - q[:5].mean() < MOVED_RAD:
@@ -158,19 +167,19 @@ def _signs(rig: Rig, report: Report) -> None:
 
 def settle(rig: Rig) -> None:
     """Lets the driver hold until the arm rests."""
-    rig.run(0.4, quiet())
+    rig.run(0.4, quiet(rig))
 
 
 def release(rig: Rig) -> None:
-    """An operator's release."""
-    rig.run(0.01, quiet())
-    rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
-    rig.run(0.05 + rig.slack / 1e9, quiet())
+    """A release, as the supervisor grants it."""
+    rig.run(0.02, quiet(rig))
+    rig.memory["releases"] = rig.memory.get("releases", 0) + 1
+    rig.run(0.05 + rig.slack / 1e9, quiet(rig))
 
 
 def _activate(rig: Rig) -> None:
     release(rig)
-    rig.run(0.1 + rig.slack / 1e9, commanding(np.zeros(7)))
+    rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))
 
 
 def _holds(rig: Rig, heard: list[Heard]) -> Heard | None:
@@ -181,7 +190,7 @@ def _expiry(rig: Rig, report: Report) -> None:
     _activate(rig)
     report.expect("a release and a command make it active", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
     ended = rig.t
-    heard = rig.run(0.5 + rig.slack / 1e9, quiet())["robot/status"]
+    heard = rig.run(0.5 + rig.slack / 1e9, quiet(rig))["robot/status"]
     hold = _holds(rig, heard)
     expiry = rig.rules.topics[COMMAND].expiry_ms or 0
     limit = (expiry + rig.rules.topics["robot/status"].period_ms + 2) * MS + rig.slack
@@ -202,15 +211,15 @@ def _expiry(rig: Rig, report: Report) -> None:
     )
     v = np.abs(rig.last("joint_states").velocity).max()
     report.expect("and comes to rest", v < 0.1, "below 0.1 rad/s", f"{v:.3f} rad/s")
-    rig.run(0.3, commanding(np.zeros(7)))
+    rig.run(0.3, commanding(rig, np.zeros(7)))
     latched = _mode(rig) == RobotStatus.MODE_SAFE_HOLD
     report.expect("the hold is latched: new commands do not end it", latched, "MODE_SAFE_HOLD", _mode_name(rig))
 
 
 def _provoke(rig: Rig, report: Report, what: str, torque: Any, cause: int) -> None:
     _activate(rig)
-    heard = rig.run(0.1, commanding(torque))["robot/status"]
-    heard += rig.run(0.05 + rig.slack / 1e9, quiet())["robot/status"]
+    heard = rig.run(0.1, commanding(rig, torque))["robot/status"]
+    heard += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
     hold = _holds(rig, heard)
     got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
     report.expect(
@@ -230,16 +239,24 @@ def _invalid(rig: Rig, report: Report) -> None:
 def _stop(rig: Rig, report: Report) -> None:
     _activate(rig)
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
-    heard = rig.run(0.1 + rig.slack / 1e9, commanding(np.zeros(7)))["robot/status"]
+    heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))["robot/status"]
     hold = _holds(rig, heard)
     got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
     ok = hold is not None and hold.message.cause == RobotStatus.CAUSE_STOP_REQUESTED
     report.expect("an operator's stop makes it hold", ok, "MODE_SAFE_HOLD, CAUSE_STOP_REQUESTED", got)
 
 
-def _pressing(force_W: Any) -> Feed:
+def _emergency(rig: Rig, report: Report) -> None:
+    _activate(rig)
+    heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
+    hold = _holds(rig, heard)
+    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    report.expect("the supervisor's emergency stop makes it hold", hold is not None, "MODE_SAFE_HOLD", got)
+
+
+def _pressing(rig: Rig, force_W: Any) -> Feed:
     wrench = Wrench(Vector3(*map(float, force_W)), Vector3(0.0, 0.0, 0.0))
-    return {"sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), wrench)}
+    return {**quiet(rig), "sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), wrench)}
 
 
 def _force(rig: Rig, report: Report) -> None:
@@ -248,14 +265,14 @@ def _force(rig: Rig, report: Report) -> None:
         report.skip("the F/T sensor's sign", "no sim/tool_state: no simulated arm; press the tool by hand and look at ft/wrench")
         return
     _activate(rig)
-    rig.run(0.4, quiet())
-    before = _mean_force(rig.run(0.1, quiet())["ft/wrench"])
+    rig.run(0.4, quiet(rig))
+    before = _mean_force(rig.run(0.1, quiet(rig))["ft/wrench"])
     force_W = np.array([0.0, 0.0, PRESS_N])
-    pressed = _mean_force(rig.run(0.1, _pressing(force_W))["ft/wrench"])
+    pressed = _mean_force(rig.run(0.1, _pressing(rig, force_W))["ft/wrench"])
     o = rig.last("sim/tool_state").pose.orientation
     expected = Rotation.from_quat((o.x, o.y, o.z, o.w)).inv().apply(force_W)
     got = pressed - before
-    rig.run(0.3, quiet())
+    rig.run(0.3, quiet(rig))
     ok = bool(np.linalg.norm(got - expected) < 0.3 * PRESS_N)
     report.expect(
         "ft/wrench shows a push of 10 N with its sign", ok, f"{expected.round(1)} N in the sensor's axes", f"{got.round(1)} N"
@@ -291,7 +308,7 @@ def _twist(rig: Rig, report: Report) -> None:
 def _lost(rig: Rig, report: Report) -> None:
     _activate(rig)
     rig.lose("control")
-    heard = rig.run(0.1 + rig.slack / 1e9, quiet())["robot/status"]
+    heard = rig.run(0.1 + rig.slack / 1e9, quiet(rig))["robot/status"]
     hold = _holds(rig, heard)
     got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
     causes = (RobotStatus.CAUSE_COMMANDER_LOST, RobotStatus.CAUSE_COMMAND_EXPIRED)
