@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import platform
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -41,26 +41,33 @@ def _load(point: EntryPoint) -> Callable[[], dict[str, float]]:
     return loaded
 
 
-def measure(scenario: Scenario, console: Console) -> dict[str, Any]:
-    """All figures, by name. Takes a few minutes."""
-    figures: dict[str, Any] = {"platform": fingerprint()}
-    with console.status("bus round trip against raw zenoh"):
-        figures["bus"] = measure_bus()
-    parts: dict[str, Any] = {}
-    for point in sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name):
+GROUPS = ("bus", "parts", "runs")
+"""What `measure` can measure."""
+
+
+Save = Callable[[dict[str, Any]], None]
+
+
+def measure(scenario: Scenario, console: Console, groups: Sequence[str], save: Save) -> dict[str, Any]:
+    """The figures of some of `GROUPS`, by name. `save` gets what there is after each: an interrupted call leaves its part."""
+    figures: dict[str, Any] = {"platform": fingerprint(), "bus": {}, "parts": {}, "runs": {}}
+    if "bus" in groups:
+        with console.status("bus round trip against raw zenoh"):
+            figures["bus"] = measure_bus()
+        save(figures)
+    for point in sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name) if "parts" in groups else ():
         with console.status(f"{point.name}: cost of a step"):
-            parts[point.name] = _load(point)()
-    figures["parts"] = parts
-    runs: dict[str, Any] = {}
+            figures["parts"][point.name] = _load(point)()
+        save(figures)
     cases: tuple[tuple[str, Callable[[Path], RunResult]], ...] = (
         ("composed", lambda out: run_composed(scenario, out, lambda _: None, ())),
         ("distributed", lambda out: run_distributed(scenario, out, lambda _: None, ())),
         ("distributed, recorder and viewer", lambda out: run_distributed(scenario, out, lambda _: None, OBSERVERS)),
     )
-    for name, case in cases:
+    for name, case in cases if "runs" in groups else ():
         with console.status(f"{scenario.name}, {name}"), tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
-            runs[name] = _figures(case(Path(folder)))
-    figures["runs"] = runs
+            figures["runs"][name] = _figures(case(Path(folder)))
+        save(figures)
     return figures
 
 
@@ -96,13 +103,16 @@ def tables(figures: dict[str, Any]) -> list[Table]:
     for group, values in (("bus", figures["bus"]), *figures["parts"].items()):
         for figure, value in values.items():
             small.add_row(group, figure, f"{value:.4g}" if isinstance(value, int | float) else str(value))
-    return [runs, blame, small]
+    return [table for table in (runs, blame, small) if table.row_count]
 
 
-def bench(scenario: str, out: Path, console: Console) -> None:
+def bench(scenario: str, out: Path, console: Console, groups: Sequence[str] = GROUPS) -> None:
     """Measures, prints the tables and writes bench.json."""
-    figures = measure(load_scenario(scenario), Console(stderr=True))
+
+    def save(figures: dict[str, Any]) -> None:
+        out.write_text(json.dumps(figures, indent=2), encoding="utf-8")
+
+    figures = measure(load_scenario(scenario), Console(stderr=True), groups, save)
     for table in tables(figures):
         console.print(table)
     console.print(f"{platform.platform()}, written to {out}", highlight=False)
-    out.write_text(json.dumps(figures, indent=2), encoding="utf-8")

@@ -21,6 +21,7 @@ from palpate_models.scenario import Scenario
 from rich.console import Console
 from rich.table import Table
 
+from palpate_conductor.bench import GROUPS
 from palpate_conductor.bench import bench as run_bench
 from palpate_conductor.case_display import CaseDisplay
 from palpate_conductor.conductor import RunFailed
@@ -234,9 +235,13 @@ def topics() -> None:
 def bench(
     scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "rlq_guarding",
     out: Annotated[Path, typer.Option(help="File for the figures.")] = Path("bench.json"),
+    only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
 ) -> None:
     """Measure the bus, the parts of a tick and whole runs; print tables and write bench.json."""
-    run_bench(scenario, out, Console(width=max(WIDE, Console().width)))
+    for group in only or ():
+        if group not in GROUPS:
+            raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
+    run_bench(scenario, out, Console(width=max(WIDE, Console().width)), only or GROUPS)
 
 
 @app.command()
