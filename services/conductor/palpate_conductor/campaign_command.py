@@ -1,0 +1,110 @@
+"""`palpate faults`: the fault campaign, its table, and docs/faults.md."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from palpate_conductor.campaign import FORCE_LIMIT_N, MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, run_case
+
+EXIT_BAD_INPUT = 2
+EXIT_FAILED = 3
+KINDS = (*PROCESS_KINDS, *MESSAGE_KINDS)
+WIDE = 200
+HEAD = f"""\
+# Faults, and what comes of them
+
+Written by `palpate faults --doc docs/faults.md`; do not edit. One short examination a row, the fault while the indenter slides
+at depth (for camera and perception: while the camera looks). *After*: from the fault to its first sign, by wall clock, read every
+10 ms. *Force*: the highest true force before and after. A row is bad (**!**) when the run hung, the force went above
+{FORCE_LIMIT_N:g} N, or it ended without naming who or what was at fault.
+
+"""
+
+Listed = Annotated[list[str] | None, typer.Option("--only", help="Keep these roles and topics; may be repeated.")]
+
+
+def faults(
+    mode: Annotated[list[str] | None, typer.Option(help="lockstep, wallclock; both by default.")] = None,
+    kind: Annotated[list[str] | None, typer.Option(help=f"Out of {', '.join(KINDS)}; all by default.")] = None,
+    only: Listed = None,
+    out: Annotated[Path, typer.Option(help="File for the findings; those already there are kept, and not run again.")] = Path(
+        "faults.json"
+    ),
+    doc: Annotated[Path | None, typer.Option(help="Write the table as Markdown too.")] = None,
+    again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
+    limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
+) -> None:
+    """Kill, freeze, delay, drop, corrupt...: every service and topic in turn, in contact; print what came of each."""
+    console = Console(stderr=True, width=max(WIDE, Console().width))
+    wanted_modes, wanted_kinds = mode or ["lockstep", "wallclock"], kind or list(KINDS)
+    for name, given, known in (("--mode", wanted_modes, ("lockstep", "wallclock")), ("--kind", wanted_kinds, KINDS)):
+        for value in given:
+            if value not in known:
+                console.print(f"[bold red]palpate:[/] {name} {value}: allowed are {', '.join(known)}")
+                raise typer.Exit(EXIT_BAD_INPUT)
+    found = _load(out)
+    todo = list(cases(wanted_modes, wanted_kinds, only or ()))
+    if not todo:
+        console.print(f"[bold red]palpate:[/] nothing to do: {', '.join(only or ())} is no role or topic of these kinds")
+        raise typer.Exit(EXIT_BAD_INPUT)
+    if not again:
+        done = {(f.kind, f.where, f.mode) for f in found}
+        todo = [case for case in todo if (case.kind, case.where, "wall clock" if case.wallclock else "lockstep") not in done]
+    with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder:
+        for number, case in enumerate(todo[:limit], 1):
+            finding = run_case(case, Path(folder))
+            found = [f for f in found if (f.kind, f.where, f.mode) != (finding.kind, finding.where, finding.mode)] + [finding]
+            out.write_text(json.dumps(as_json(found), indent=1) + "\n", encoding="utf-8")
+            mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
+            console.print(f"{number}/{len(todo[:limit])} {mark} {case.name}: {finding.sign or finding.ended}", highlight=False)
+    Console(width=max(WIDE, Console().width)).print(table(found))
+    if doc is not None:
+        doc.write_text(HEAD + markdown(found), encoding="utf-8")
+    if any(not finding.good for finding in found):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _load(path: Path) -> list[Finding]:
+    if not path.exists():
+        return []
+    rows = json.loads(path.read_text(encoding="utf-8"))
+    return [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
+
+
+def _row(finding: Finding) -> tuple[str, ...]:
+    after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
+    force = f"{finding.peak_force_before_n:.1f}, {finding.peak_force_n:.1f} N"
+    return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
+
+
+COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
+
+
+def table(findings: Sequence[Finding]) -> Table:
+    """For a terminal."""
+    shown = Table(*COLUMNS, box=None)
+    for finding in _sorted(findings):
+        shown.add_row(*_row(finding), style=None if finding.good else "bold red")
+    return shown
+
+
+def markdown(findings: Sequence[Finding]) -> str:
+    """For the documentation."""
+    lines = [f"{sum(f.good for f in findings)} of {len(findings)} as they should be.", ""]
+    lines += ["| | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+    for finding in _sorted(findings):
+        cells = [cell.replace("|", "/").replace("\n", " ") for cell in _row(finding)]
+        lines.append(f"| {'' if finding.good else '**!**'} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _sorted(findings: Sequence[Finding]) -> list[Finding]:
+    return sorted(findings, key=lambda f: (f.mode, KINDS.index(f.kind), f.where))
