@@ -13,11 +13,13 @@ from palpate_validation.plots import COLOURS, QUIET
 
 STIFFNESS_NPM = 5000.0
 """K_z of an examination."""
+SOFTER_NPM = (2500.0, 1000.0)
+"""Others, on the default wall."""
 CONTRASTS = (1.0, 4.0, 10.0)
 DELAYS_MS = (0, 2, 4, 6, 8, 10)
 PATHS = {"all": EVENTS, "control": CONTROL_PATH, "contact": CONTACT_PATH}
-AGREE_MS = 2
-"""How far a measured margin may be from theory's."""
+AGREE_MS = 3
+"""How far a measured margin may be from theory: near the margin a ring takes longer to die than the run watches."""
 WORDS = {"all": "all messages late", "control": "controller and robot", "contact": "robot and tissue"}
 LARGEST_MS = 24
 """Margins are sought up to here."""
@@ -29,6 +31,8 @@ class Margin:
 
     path: str
     contrast: float
+    stiffness: float
+    """K_z of the controller [N/m]."""
     measured_ms: int
     """-1: not even without delay."""
     theory_ms: int
@@ -67,7 +71,10 @@ def measure() -> Stability:
     for contrast in CONTRASTS:
         loop = linearise(contrast, STIFFNESS_NPM)
         for path, topics in PATHS.items():
-            margins.append(Margin(path, contrast, margin_ms(contrast, topics), loop.margin_ms(topics)))
+            margins.append(Margin(path, contrast, STIFFNESS_NPM, margin_ms(contrast, topics), loop.margin_ms(topics)))
+    for stiffness in SOFTER_NPM:
+        theory = linearise(1.0, stiffness).margin_ms(CONTROL_PATH)
+        margins.append(Margin("control", 1.0, stiffness, margin_ms(1.0, CONTROL_PATH, stiffness), theory))
     return Stability(delay, jitter, margins)
 
 
@@ -76,30 +83,28 @@ def section(found: Stability | None = None) -> Section:
     found = found or measure()
     checks = []
     for margin in found.margins:
-        name = f"x{margin.contrast:g} wall, {WORDS[margin.path]}: quiet up to"
+        name = f"x{margin.contrast:g} wall, K_z = {margin.stiffness:g} N/m, {WORDS[margin.path]}: quiet up to"
         if margin.path == "contact":
             checks.append(Check(name, margin.measured_ms, "ms a message", low=LARGEST_MS, against=f"theory: {margin.theory_ms}"))
             continue
-        low, high = margin.theory_ms - AGREE_MS, margin.theory_ms + AGREE_MS
+        low, high = margin.theory_ms - AGREE_MS, min(margin.theory_ms, LARGEST_MS) + AGREE_MS
         checks.append(Check(name, margin.measured_ms, "ms a message", low, high, f"theory: {margin.theory_ms}"))
     for contrast in CONTRASTS:
         quiet = [ms for ms, ringing in zip(DELAYS_MS, found.jitter[contrast], strict=True) if ringing.stable]
         checks.append(
             Check(f"x{contrast:g} wall: quiet with jitter up to", max(quiet), "ms", low=8, against=f"of {DELAYS_MS[-1]} tried")
         )
-    control = [margin.measured_ms for margin in found.margins if margin.path == "control"]
+    control = [m.measured_ms for m in found.margins if m.path == "control" and m.stiffness == STIFFNESS_NPM]
+    softest = next(m.measured_ms for m in found.margins if m.stiffness == SOFTER_NPM[-1])
     text = (
-        "Robot, tissue and controller as a run has them (K_z = 5000 N/m), pressed 10 mm deep in the posture of an "
-        "examination; the "
-        "set-point is nudged by 0.5 mm and the force must be quiet half a second later. Every message of the named topics is "
-        "late by "
-        "the same time, so a loop of two messages by twice that, on top of the millisecond a tick costs. Only the path between "
-        f"controller and robot has a margin, {min(control)} to {max(control)} ms a message, little changed by the wall: the "
-        "controller's own damping turns over, not the contact. The path between robot and tissue, which hardware does not "
-        "have, bears "
-        f"{LARGEST_MS} ms and more, since the wall is softer than the controller and the joints' friction carries the rest. "
+        "Robot, tissue and controller as a run has them (K_z = 5000 N/m), pressed 10 mm deep in the posture of an examination; "
+        "the set-point is nudged by 0.5 mm and the force must be quiet half a second later. Every message of the named topics "
+        "is late by the same time, so a loop of two messages by twice that, on top of the millisecond that a tick costs. The "
+        f"path between controller and robot bears {min(control)} to {max(control)} ms a message, little changed by the wall: it "
+        f"is the controller's own loop that turns over, not the contact, and K_z = {SOFTER_NPM[-1]:g} N/m bears {softest} ms. "
+        f"The path between robot and tissue, which hardware does not have, bears {LARGEST_MS} ms and more (no more was tried). "
         "Theory: the arm's seven joints, linearised, by Nyquist's criterion. Beyond the margin a ring grows until the driver "
-        "holds."
+        "holds (crosses)."
     )
     data = {
         "delays_ms": DELAYS_MS,
