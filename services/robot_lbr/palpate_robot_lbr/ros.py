@@ -31,8 +31,10 @@ QOS = Qos(
 class RosPublisher:
     """Publishes on a ROS topic."""
 
-    def __init__(self, publisher: Publisher, type_name: str) -> None:
+    def __init__(self, publisher: Publisher, type_name: str, gid: bytes) -> None:
         self._publisher = publisher
+        self.gid = gid
+        """By which subscribers know it."""
         self._encode = codec.encoder(type_name)
         self._sequence = 0
 
@@ -85,7 +87,7 @@ class RosNode:
         """Declares a publisher."""
         row = _row(topic, type_name)
         gid = self._tokens.publisher(row, QOS)
-        return RosPublisher(Publisher(self._session, topic_key(row, self._domain), QOS, gid), type_name)
+        return RosPublisher(Publisher(self._session, topic_key(row, self._domain), QOS, gid), type_name, gid)
 
     def subscription(self, topic: str, type_name: str) -> RosSubscription:
         """Declares a subscription."""
