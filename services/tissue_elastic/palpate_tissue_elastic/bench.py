@@ -1,7 +1,7 @@
 """What a step costs: `python -m palpate_tissue_elastic.bench`; with `--sizes` against the number of vertices, for both tiers.
 
-`measure()` is for a benchmark table. Median, 99th percentile and maximum are wall time; mean and real-time factor are of processor
-time, so that they can be read on a busy machine too.
+`measure()` is for a benchmark table. Median, 99th percentile and maximum are wall time; mean and real-time factor are of
+processor time, so that they can be read on a busy machine too.
 """
 
 from __future__ import annotations
