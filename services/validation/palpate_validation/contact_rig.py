@@ -28,6 +28,7 @@ from palpate_planning.kinematics import Kinematics
 from palpate_planning.messages import setpoint_message
 from palpate_planning.poses import least_twist, pose
 from palpate_planning.setpoint import ControlMode, Setpoint
+from palpate_robot.plant import Plant
 from palpate_robot.service import RobotService
 from palpate_tissue.service import TissueService
 from palpate_tissue.service import create as create_tissue
@@ -152,14 +153,6 @@ class _Script:
         return {"planning/setpoint": message}
 
 
-class _RobotAt(RobotService):
-    """The robot, at other joint positions [rad] than home."""
-
-    def __init__(self, chosen: Scenario, q: Array) -> None:
-        super().__init__(exam_input(chosen))
-        self._plant.reset(q)
-
-
 def _smooth(t: float) -> float:
     t = min(max(t, 0.0), 1.0)
     return t * t * t * (10 - 15 * t + 6 * t * t)
@@ -179,14 +172,18 @@ def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
         time.append(t / NS)
         force.append(outbox["sim/contact_wrench"].wrench.force.z)
 
+    def see_status(_: int, outbox: Mapping[str, Any]) -> None:
+        if "robot/status" in outbox:
+            modes.append(outbox["robot/status"].mode)
+
     script = _Script(contrast, stiffness)
+    robot = RobotService(exam_input(chosen), lambda robot: Plant(robot, script.ready))
     run = Composed(
         [
-            Delayed(_RobotAt(chosen, script.ready), delays.on("control/joint_torque", "sim/contact_wrench"),
-                    lambda _, outbox: modes.append(outbox["robot/status"].mode) if "robot/status" in outbox else None),
+            Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_status),
             Delayed(deepcopy(_tissue(contrast)), delays.on("sim/tool_state"), see_wrench),
             Delayed(create_control(chosen), delays.on("joint_states"), script=script),
         ]
-    )  # fmt: skip
+    )
     run.run(lambda: None, round(END_S * NS))
     return Ringing(np.array(time), np.array(force), 2 in modes)
