@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from palpate_supervisor.watch import Breach, Cause, Level
 
-HEED = 200_000_000
-"""A soft stop whose cause is still there so much later [ns] has not been heeded: emergency stop."""
 GRACE = 50_000_000
 """Within this time of a release [ns] the driver's old hold is passed over: the word has to reach it."""
 RECOVERABLE = frozenset({Cause.DEPTH, Cause.WORKSPACE})
@@ -50,10 +48,10 @@ class Latch:
             standing = self._release(t, standing)
         for breach in sorted(standing, key=lambda breach: -breach.level):
             self._take(t, breach)
-        same = any(breach.cause is self.cause for breach in standing)
-        if self.level is Level.SOFT_STOP and same and t - self._since > HEED:
-            words = f"soft stop not heeded within {HEED / 1e6:.0f} ms: {self.reason}"
-            self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, words))
+        for breach in standing:
+            if self.level is Level.SOFT_STOP and breach.cause is self.cause and t - self._since > breach.heed:
+                words = f"soft stop not heeded within {breach.heed / 1e6:.0f} ms: {breach.reason}"
+                self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, words))
 
     def _take(self, t: int, breach: Breach) -> None:
         if breach.level > self.level:

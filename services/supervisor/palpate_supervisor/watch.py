@@ -15,8 +15,13 @@ from palpate_supervisor.tool import Tool
 Array = NDArray[np.float64]
 
 PERIOD_S = 0.01
-LOOKAHEAD_S = 0.05
-"""A force that will be over its limit so much later counts as over it: a retreat begins 20 to 30 ms after the stop."""
+LOOKAHEAD_S = 0.1
+"""A force that will be over its limit so much later counts as over it: a retreat takes 30 to 50 ms to begin, a hold that follows
+a retreat that nobody began as much again."""
+HEED = 200_000_000
+"""A soft stop whose cause is still there so much later [ns] has not been heeded ..."""
+HEED_RISING = 40_000_000
+"""... and one for a force that is still rising fast so much later."""
 FAST_NPS = 30.0
 """Only a force that rises faster than this is judged by where it will be [N/s]; slower ones planning can deal with."""
 RATE_SAMPLES = 3
@@ -62,6 +67,8 @@ class Breach:
     level: Level
     cause: Cause
     reason: str
+    heed: int = HEED
+    """How long a soft stop for it may take to help [ns]."""
 
 
 class Watch:
@@ -90,8 +97,10 @@ class Watch:
         words = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
         if soon > limits.force_emergency_n:
             return [Breach(Level.EMERGENCY, Cause.FORCE, f"{words}, emergency limit {limits.force_emergency_n:g} N")]
-        if self._over_s > PATIENCE_S or soon > limits.force_soft_stop_n >= force:
-            return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{words}, soft-stop limit {limits.force_soft_stop_n:g} N")]
+        rising = soon > limits.force_soft_stop_n and rate > FAST_NPS
+        if self._over_s > PATIENCE_S or rising:
+            heed = HEED_RISING if rising else HEED
+            return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{words}, soft-stop limit {limits.force_soft_stop_n:g} N", heed)]
         return []
 
     def _depth(self, depth: float, force: float) -> list[Breach]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from palpate_supervisor.latch import GRACE, HEED, Latch
-from palpate_supervisor.watch import Breach, Cause, Level
+from palpate_supervisor.latch import GRACE, Latch
+from palpate_supervisor.watch import HEED, HEED_RISING, Breach, Cause, Level
 
 MS = 1_000_000
 SOFT = Breach(Level.SOFT_STOP, Cause.FORCE, "26 N")
@@ -38,6 +38,14 @@ def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop() -> None:
     latch.update(HEED + 10 * MS, [SOFT], False)
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
     assert "26 N" in latch.reason
+
+
+def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
+    latch = Latch()
+    rising = Breach(Level.SOFT_STOP, Cause.FORCE, "20 N, rising", HEED_RISING)
+    for t in range(0, HEED_RISING + 20 * MS, 10 * MS):
+        latch.update(t, [rising], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
 
 
 def test_a_soft_stop_that_helps_stays_one() -> None:

@@ -57,12 +57,12 @@ def test_a_force_that_rises_fast_is_stopped_before_the_limit() -> None:
     watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     forces = 100.0 * 0.01 * np.arange(60)  # 100 N/s, as on something rigid
     first = next(f for f in forces if watch.judge(Tool(ABOVE, 0.0, f), None))
-    assert 19.0 < first <= 21.0
+    assert 14.0 < first <= 16.0
 
 
 def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
     watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
-    for force in (*np.linspace(10.0, 24.9, 150), 25.3, 25.4, 25.2, 24.0, 21.0):
+    for force in (*np.linspace(10.0, 24.9, 100), 25.3, 25.4, 25.2, 24.0, 21.0):
         assert watch.judge(Tool(ABOVE, 0.0, float(force)), None) == []
 
 
