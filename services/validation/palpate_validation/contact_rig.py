@@ -163,8 +163,12 @@ def start_posture(contrast: float = 1.0) -> Array:
     return _Script(contrast, 0.0).ready
 
 
+@cache
 def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
-    """Presses a wall `contrast` times as stiff as the default, with a controller of `stiffness` [N/m] along the tool."""
+    """Presses a wall `contrast` times as stiff as the default, with a controller of `stiffness` [N/m] along the tool.
+
+    Runs repeat exactly, so one that has been made is remembered.
+    """
     chosen = scenario(contrast)
     time, force, modes = [], [], []
 
