@@ -1,0 +1,1 @@
+"""LBR iiwa 7 R800 simulated in MuJoCo: an independent plant for the role robot."""
