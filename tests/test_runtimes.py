@@ -157,6 +157,8 @@ def test_garbage_and_strangers_are_counted_and_change_nothing() -> None:
                 running.session.put(key, b"\xff" * 40)
                 running.session.put(key, b"\xff" * 40, attachment=b"not an attachment")
                 running.session.put(key, b"\xff" * 40, attachment=bytes(16) + b"\x10" + bytes(16))
+                numbered = (9).to_bytes(8, "little") + bytes(8) + b"\x10" + bytes(16)
+                running.session.put(key, b"\xff" * 40, attachment=numbered)
 
     outcome = run_toys(shout)
     assert outcome.failure is None

@@ -136,7 +136,7 @@ class _Ear:
                 why = "no attachment" if attachment is None else str(error)
                 monitor.garbage(self.topic.name, why, now)
                 continue
-            if sequence == HELLO:
+            if sequence == HELLO and not (self.topic.open and len(sample.payload)):
                 continue
             try:
                 key = parse_key(str(sample.key_expr))

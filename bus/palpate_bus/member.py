@@ -10,6 +10,7 @@ from time import monotonic
 
 import zenoh
 
+from palpate_bus import codec
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.faults import faulty
 from palpate_bus.liveliness import GraphWatch, NodeTokens, mismatches
@@ -45,7 +46,8 @@ class Member:
     def subscription(self, topic: Topic, history: bool = False) -> Subscription:
         """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
         self._tokens.subscription(topic, self.rules.qos[topic.qos])
-        return Subscription(self.session, topic_key(topic, self.domain), history, topic.open)
+        decode = codec.decoder(topic.type) if topic.open else None
+        return Subscription(self.session, topic_key(topic, self.domain), history, decode)
 
     def observed(self, topic: Topic) -> str:
         """Declares a subscription that the caller makes; returns the key."""

@@ -11,13 +11,14 @@ from typing import Any
 
 import zenoh
 
+from palpate_bus import codec
 from palpate_bus.contract import Topic
 from palpate_bus.distributed import Link, RunAborted
 from palpate_bus.lockstep import NEVER, Received, Stepper
 from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.service import Service
-from palpate_bus.transport import HELLO
+from palpate_bus.transport import HELLO, decodes
 from palpate_bus.wire import WireError, unpack
 
 log = logging.getLogger(__name__)
@@ -42,6 +43,7 @@ class _Feed:
         else:
             self._subscriber = member.session.declare_subscriber(key, channel)
         self._try = self._subscriber.handler.try_recv
+        self._decode = codec.decoder(topic.type)
         self.sequence = 0
         self.missed = 0
         self.garbage = 0
@@ -56,13 +58,17 @@ class _Feed:
             except (WireError, AttributeError):
                 self.garbage += 1
                 continue
-            if sequence == HELLO:
+            payload = sample.payload.to_bytes()
+            if sequence == HELLO and not (payload and self.topic.open):
                 self.heard = True
                 continue
-            if sequence > self.sequence + 1:
+            if not decodes(self._decode, payload):  # an observer knows no rightful sender, and must not end with what it gets
+                self.garbage += 1
+                continue
+            if sequence > self.sequence + 1 and not self.topic.open:
                 self.missed += sequence - self.sequence - 1
             self.sequence = max(self.sequence, sequence)
-            received.append((sequence, sample.payload.to_bytes()))
+            received.append((sequence, payload))
         return received
 
 

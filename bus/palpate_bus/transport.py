@@ -5,12 +5,14 @@ No callback computes: a received sample goes into a queue of its own, which the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from time import time_ns
 from typing import Any, NamedTuple
 
 import zenoh
 
+from palpate_bus.codec import CodecError
 from palpate_bus.contract import Qos
 from palpate_bus.wire import AttachmentWriter, WireError, unpack
 
@@ -63,13 +65,15 @@ class Subscription:
     """Receives on one key.
 
     After its hello only the first sender's messages count: bytes without a valid attachment are counted in `garbage`, those of
-    another sender in `foreign`; with `open_to_all` every sender's messages count.
+    another sender in `foreign`. A topic that is open to all takes every sender's messages, if they can be decoded.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, history: bool = False, open_to_all: bool = False) -> None:
-        """Subscribes. With `history`, what a latched topic sent before is delivered too."""
+    def __init__(
+        self, session: zenoh.Session, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None
+    ) -> None:
+        """Subscribes. With `history`, what a latched topic sent before is delivered too; `decode` opens the topic to all."""
         self.key = key
-        self._open = open_to_all
+        self._decode = decode
         self.garbage = 0
         self.foreign = 0
         self.heard = False
@@ -97,15 +101,29 @@ class Subscription:
                 self.garbage += 1
                 continue
             if gid != self._gid:
-                if self._gid is not None and not self._open:
+                if self._gid is not None and self._decode is None:
                     self.foreign += 1
                     continue
                 self._gid = gid
-            if sequence == HELLO:
+            payload = raw.payload.to_bytes()
+            # Some clients of rmw_zenoh's wire number their messages from 0.
+            if sequence == HELLO and not (payload and self._decode is not None):
                 self.heard = True
                 continue
-            return Sample(sequence, sent, raw.payload.to_bytes())
+            if self._decode is not None and not decodes(self._decode, payload):
+                self.garbage += 1
+                continue
+            return Sample(sequence, sent, payload)
 
     def close(self) -> None:
         """Undeclares the subscriber."""
         self._subscriber.undeclare()
+
+
+def decodes(decode: Callable[[bytes], object], payload: bytes) -> bool:
+    """Whether bytes are a message: asked where anyone may send, so that no stranger can end a service."""
+    try:
+        decode(payload)
+    except CodecError:
+        return False
+    return True

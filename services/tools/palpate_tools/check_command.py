@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import os
-import shlex
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from palpate_bus.zenoh_config import BusOptions, session
-from palpate_models.load import ScenarioError, dump_scenario, load_scenario, redacted
+from palpate_models.load import ScenarioError, load_scenario
 
 from palpate_tools.console import EXIT_TROUBLE, command, console, print_json, table
 from palpate_tools.joining import Connect, NoBus
 from palpate_tools.live_rig import LiveRig
 from palpate_tools.report import Report, Verdict
 from palpate_tools.rig import ServiceRig, Settings
+from palpate_tools.starting import started
 from palpate_tools.suites import SUITES, check
 
 LISTEN = "tcp/127.0.0.1:7447"
@@ -97,33 +91,6 @@ def _check_live(
         finally:
             rig.close()
     return report
-
-
-@contextmanager
-def started(words: str | None, role: str, settings: Settings, endpoint: str, domain: int) -> Iterator[None]:
-    """Starts the implementation for the time of the check, if its command was given."""
-    if words is None:
-        yield
-        return
-    with tempfile.TemporaryDirectory(prefix="palpate-check-") as folder:
-        file = Path(folder) / "scenario.yaml"
-        shown = settings.scenario if role == "tissue" else redacted(settings.scenario)
-        file.write_text(dump_scenario(shown), encoding="utf-8")
-        environment = {
-            **os.environ, "PALPATE_ROUTER": endpoint, "PALPATE_RUNTIME": "wallclock", "PALPATE_SCENARIO": str(file),
-            "PALPATE_OUT": folder, "PALPATE_RECORD": "0", "ROS_DOMAIN_ID": str(domain),
-        }  # fmt: skip
-        split = shlex.split(words)
-        child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)
-        try:
-            yield
-            child.wait(timeout=5)
-        except subprocess.TimeoutExpired:
-            pass
-        finally:
-            if child.poll() is None:
-                child.terminate()
-                child.wait()
 
 
 def _print(report: Report, failures: bool) -> None:

@@ -34,6 +34,7 @@ class Listener:
     def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
         self.garbage = 0
+        self._open = topic.open
         key = topic_key(topic, domain)
         handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
         if topic.latched:
@@ -56,7 +57,7 @@ class Listener:
             except (WireError, AttributeError):
                 self.garbage += 1
                 continue
-            if sequence != HELLO:
+            if sequence != HELLO or (self._open and len(sample.payload)):
                 return Heard(sequence, sent, gid, sample.payload.to_bytes())
 
     def take(self) -> Heard | None:

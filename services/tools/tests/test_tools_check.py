@@ -14,10 +14,10 @@ from palpate_bus.messages import JointTorqueCommand
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.zenoh_config import BusOptions, session
 from palpate_models.load import load_scenario
-from palpate_tools.check_command import started
 from palpate_tools.live_rig import LiveRig
 from palpate_tools.report import Report
 from palpate_tools.rig import ServiceRig, Settings
+from palpate_tools.starting import started
 from palpate_tools.suites import SUITES, check
 
 SCENARIO = load_scenario("rlq_guarding")
