@@ -10,7 +10,7 @@ from typing import Self
 
 from palpate_bus import codec
 from palpate_bus.contract import MS, Contract, contract
-from palpate_bus.liveliness import Kind, entities
+from palpate_bus.liveliness import GraphWatch, Kind
 from palpate_bus.member import Member
 from palpate_bus.messages import Clock
 from palpate_bus.stamps import NS, time_message
@@ -21,6 +21,8 @@ from palpate_replay.recording import Recording
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 """Where a replay is to be found when the environment names no endpoint: where ROS 2's rmw_zenoh looks for its router."""
+LOOK_NS = NS
+"""How long the bus is looked at before anything is played, and how often while it plays."""
 CLOCK = "clock"
 CLOCK_PERIOD = 10 * MS
 
@@ -46,6 +48,8 @@ class Player:
         """
         self._recording = recording
         self._rate = rate
+        self._drive = drive
+        self._looked = 0
         rules = contract()
         self.topics = _chosen(recording, rules, topics)
         recording.check(rules, self.topics)
@@ -54,7 +58,11 @@ class Player:
         self._session = open_session(options)
         try:
             domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
-            self._refuse(rules, domain, drive)
+            self._graph = GraphWatch(self._session, domain)
+            begin = monotonic_ns()
+            while monotonic_ns() - begin < LOOK_NS:  # peers that are there find us within retries of a tenth of a second
+                self._look()
+                sleep(0.05)
             clock = [CLOCK] if CLOCK not in recording.types and topics is None else []
             members: dict[str, Member] = {}
             self._publishers: dict[str, Publisher] = {}
@@ -75,20 +83,27 @@ class Player:
         self.lag_ms = 0.0
         """How late a message left, at worst."""
 
-    def _refuse(self, rules: Contract, domain: int, drive: bool) -> None:
-        alive = {entity.node for entity in entities(self._session, domain) if entity.kind is Kind.NODE}
-        for name in self.topics:
+    def _look(self) -> None:
+        """Raises PlayError when a living service of someone else forbids what is played."""
+        self._graph.changes()
+        own = str(self._session.zid())
+        alive = {e.node for e in self._graph.alive.values() if e.kind is Kind.NODE and e.zid != own}
+        rules = contract()
+        for name in self.topics if alive else ():
             row = rules.topics[name]
             if row.producer in alive:
                 raise PlayError(
                     f"{row.producer} lives on this bus and sends {name} itself; play on another bus (--listen) or other topics"
                 )
-            acting = sorted(role for role, edge in row.readers.items() if role in alive and not rules.roles[role].observer)
-            if acting and not drive:
+            acting = sorted(role for role in row.readers if role in alive and not rules.roles[role].observer)
+            if acting and not self._drive:
                 raise PlayError(f"{', '.join(acting)} would act on {name}; --drive if that is meant")
 
     def play(self, start: int = 0, until: int | None = None) -> None:
-        """Plays from `start` to `until` [ns]. Latched messages and what was last said before `start` come first."""
+        """Plays from `start` to `until` [ns]. Latched messages and what was last said before `start` come first.
+
+        Raises PlayError when a service comes alive that must not meet what is played.
+        """
         self.now = start
         self._next_clock = start
         if start > 0:
@@ -119,7 +134,11 @@ class Player:
         self._next_clock += CLOCK_PERIOD
 
     def _wait(self, due: int) -> None:
-        left = due - monotonic_ns()
+        now = monotonic_ns()
+        if now - self._looked > LOOK_NS:
+            self._looked = now
+            self._look()
+        left = due - now
         if left > 0:
             sleep(left / NS)
         else:

@@ -64,10 +64,7 @@ class Recording:
             return
         with ExitStack() as stack:
             streams = [stack.enter_context(file.open("rb")) for file in self.files]
-            readers = [
-                make_reader(stream).iter_messages(topics=names, start_time=begin, end_time=None if end is None else end + 1)
-                for stream in streams
-            ]
+            readers = [make_reader(stream).iter_messages(topics=names, starting_at=begin, ending_at=end) for stream in streams]
             each = [
                 (Recorded(m.log_time, channel.topic[1:], m.data, m.sequence) for _, channel, m in reader) for reader in readers
             ]
