@@ -25,7 +25,7 @@ from palpate_report.scene import Moment, Stage
 DPI: Final = 100
 COLOURS: Final = 192
 """Of the palette that large pictures are reduced to, to keep them small."""
-ROOM: Final = View((1.55, -1.45, 1.75), (0.42, 0.02, 1.08), 36.0)
+ROOM: Final = View((1.60, -1.50, 1.95), (0.36, 0.02, 1.22), 40.0)
 CLOSE: Final = View((1.10, -0.62, 1.32), (0.54, -0.02, 0.96), 30.0)
 
 
@@ -56,11 +56,12 @@ def transients(path: Path) -> Section:
 
 
 _PLACES: Final = {
-    "conductor": (0.0, 4.0), "recorder": (4.2, 4.0), "dashboard": (8.4, 4.0),
-    "camera": (0.0, 2.6), "perception": (2.1, 2.6), "planning": (4.2, 2.6), "assessment": (8.4, 2.6),
-    "tissue": (0.0, 0.6), "robot": (4.2, 0.6), "control": (8.4, 0.6), "supervisor": (6.3, 1.6),
+    "conductor": (0.0, 6.2), "recorder": (3.2, 6.2), "dashboard": (6.4, 6.2),
+    "camera": (0.0, 4.4), "perception": (4.6, 4.4), "planning": (9.2, 4.4), "assessment": (13.4, 4.4),
+    "supervisor": (12.4, 2.2), "tissue": (0.0, 0.0), "robot": (6.6, 0.0), "control": (13.4, 0.0),
 }  # fmt: skip
 """Where each node stands; one that is not named here stands in a row below."""
+_BEND: Final = 0.13
 
 
 def graph(path: Path, rows: Sequence[dict[str, str]], watching: Sequence[str]) -> tuple[int, int]:
@@ -74,29 +75,30 @@ def graph(path: Path, rows: Sequence[dict[str, str]], watching: Sequence[str]) -
         if row["kind"] == "MS" and row["topic"] in topics and source and row["node"] not in watching and source not in watching:
             arrows.setdefault((source, row["node"]), []).append(row["topic"])
     beyond = [name for name in nodes if name not in _PLACES]
-    places = _PLACES | {name: (2.1 * i, -0.8) for i, name in enumerate(beyond)}
-    figure = _figure(13.0, 7.2)
+    places = _PLACES | {name: (3.2 * i, -1.6) for i, name in enumerate(beyond)}
+    figure = _figure(13.0, 6.4)
     axes = figure.subplots()
-    axes.set(xlim=(-1.0, 9.4), ylim=(-1.2 if beyond else -0.1, 4.6))
+    axes.set(xlim=(-1.2, 14.6), ylim=(-2.0 if beyond else -0.9, 6.6))
     axes.set_axis_off()
-    for (source, target), names in arrows.items():
-        a, b = np.array(places[source]), np.array(places[target])
-        both = (target, source) in arrows
-        bend = 0.16 if both else 0.08
-        style = {"arrowstyle": "-|>", "color": "#64748b", "lw": 1.1, "shrinkA": 30, "shrinkB": 30}
-        axes.annotate("", (b[0], b[1]), (a[0], a[1]), arrowprops={**style, "connectionstyle": f"arc3,rad={bend}"})
-        side = np.array((b[1] - a[1], a[0] - b[0])) / max(float(np.linalg.norm(b - a)), 1e-9)
-        middle = (a + b) / 2 + side * bend * 0.5 * float(np.linalg.norm(b - a))
-        box = {"boxstyle": "round,pad=0.12", "fc": "white", "ec": "none", "alpha": 0.85}
-        axes.text(middle[0], middle[1], "\n".join(sorted(names)), fontsize=6.4, color=INK, ha="center", va="center", bbox=box)
+    patches = {}
     for name in nodes:
         x, y = places[name]
         color = "#e2e8f0" if name in watching else "#ccfbf1"
-        patch = FancyBboxPatch((x - 0.62, y - 0.17), 1.24, 0.34, boxstyle="round,pad=0.05", fc=color, ec=INK, lw=1.0, zorder=3)
+        patch = FancyBboxPatch((x - 0.85, y - 0.2), 1.7, 0.4, boxstyle="round,pad=0.08", fc=color, ec=INK, lw=1.0, zorder=3)
         axes.add_patch(patch)
-        axes.text(x, y, f"/{name}", ha="center", va="center", fontsize=10, weight="bold", color=INK, zorder=4)
-    note = f"{', '.join('/' + name for name in nodes if name in watching)} read nearly everything: their arrows are left out"
-    axes.text(4.2, 4.45, note, ha="center", fontsize=8.5, color=QUIET)
+        patches[name] = patch
+        axes.text(x, y, f"/{name}", ha="center", va="center", fontsize=9.5, weight="bold", color=INK, zorder=4)
+    for (source, target), names in arrows.items():
+        a, b = np.array(places[source]), np.array(places[target])
+        style = {"arrowstyle": "-|>", "color": "#64748b", "lw": 1.1, "connectionstyle": f"arc3,rad={_BEND}"}
+        ends = {"patchA": patches[source], "patchB": patches[target], "shrinkA": 2, "shrinkB": 2}
+        axes.annotate("", (b[0], b[1]), (a[0], a[1]), arrowprops={**style, **ends}, zorder=1)
+        middle = (a + b) / 2 + np.array((b[1] - a[1], a[0] - b[0])) * _BEND / 2
+        box = {"boxstyle": "round,pad=0.12", "fc": "white", "ec": "none", "alpha": 0.85}
+        words = "\n".join(sorted(names))
+        axes.text(middle[0], middle[1], words, fontsize=7.2, color=INK, ha="center", va="center", bbox=box, zorder=2.5)
+    readers = ", ".join("/" + name for name in nodes if name in watching)
+    axes.text(7.8, 6.2, f"{readers} read nearly\neverything: their arrows are left out", va="center", fontsize=9, color=QUIET)
     _save(figure, path)
     return len(nodes), len(topics)
 

@@ -44,8 +44,8 @@ def limits(report: Report, deformation_mm: float, peak_ratio: float) -> list[Lim
         ),
         Limit(
             "the rigid part is the body scaled down: protruding parts displace the bone",
-            "nothing is scaled: each vertex rests on a foundation along its own normal; a layer over a rigid body can be chosen",
-            "`phantom.kind=mesh` takes any mesh (quick start); services/tissue, services/tissue_elastic",
+            "nothing is scaled: each vertex rests on a foundation along its own normal; or an elastic layer over a rigid back",
+            "`phantom.kind=mesh` takes any mesh (quick start); `tissue.implementation=elastic`",
         ),
         Limit(
             "deformation is not shown",
