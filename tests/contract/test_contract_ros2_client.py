@@ -71,9 +71,10 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
         bus = stack.enter_context(session(BusOptions(mode="router", listen=(where,))))
         rigs = {}
         for role in ("camera", "robot"):
-            rigs[role] = rig = LiveRig(bus, role, settings)
+            rig = rigs[role] = LiveRig(bus, role, settings)
             stack.callback(rig.close)
             stack.enter_context(started(shlex.join([sys.executable, "-m", f"palpate_{role}"]), role, settings, where, 0))
+        for role, rig in rigs.items():
             rig.await_implementation(120, Report(role))
         words = [sys.executable, str(CLIENT), str(port), str(tmp_path / "definitions"), "--seconds", "150"]
         client = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

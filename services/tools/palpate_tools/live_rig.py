@@ -74,7 +74,8 @@ class LiveRig(Rig):
         while self.role.name not in self._others():
             if monotonic() > end:
                 raise NoBus(f"no node {self.role.name!r} came within {seconds:.0f} s; it needs a liveliness token of that name")
-            sleep(0.05)
+            self._say(RunControl.HELLO)
+            sleep(HELLO_S)
         report.expect("joins as a node of its role", True, self.role.name, self.role.name)
         self._greet(report)
         self._check_graph(report)
