@@ -183,6 +183,10 @@ class Robot(_Section):
 class Camera(_Section):
     """Kinect-like depth camera on a tripod (Nguyen 2012)."""
 
+    implementation: str = "default"
+    """`default`, or the name of another camera that an installed package registers (`replay`, `ros`)."""
+    recording: str | None = None
+    """A run's folder, a rosbag2 folder or an MCAP file whose frames `implementation: replay` shows."""
     position_m: Vec3 = (0.95, -0.45, 1.85)
     """Optical centre in world."""
     look_at_m: Vec3 = (0.56, 0.0, 0.90)
@@ -195,6 +199,12 @@ class Camera(_Section):
     """Error of the calibrated camera pose, in the camera frame."""
     frames: Annotated[int, Field(ge=1, le=200)] = 20
     """Frames fused for a perceived surface."""
+
+    @model_validator(mode="after")
+    def _recording(self) -> Camera:
+        if (self.implementation == "replay") != (self.recording is not None):
+            raise ValueError("camera.implementation: replay needs camera.recording: FILE, and camera.recording needs it")
+        return self
 
 
 class Limits(_Section):

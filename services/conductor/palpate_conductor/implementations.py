@@ -19,7 +19,11 @@ DEFAULT = "default"
 
 
 def _choices(scenario: Scenario) -> dict[str, str]:
-    return {"tissue": scenario.tissue.implementation, "robot": scenario.robot.implementation}
+    return {
+        "tissue": scenario.tissue.implementation,
+        "robot": scenario.robot.implementation,
+        "camera": scenario.camera.implementation,
+    }
 
 
 def chosen_services(scenario: Scenario) -> dict[str, EntryPoint]:
