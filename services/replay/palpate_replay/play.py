@@ -65,6 +65,7 @@ class Player:
                 sleep(0.05)
             clock = [CLOCK] if CLOCK not in recording.types and topics is None else []
             members: dict[str, Member] = {}
+            self._members = members  # a member that is let go takes its tokens along
             self._publishers: dict[str, Publisher] = {}
             for name in (*self.topics, *clock):
                 row = rules.topics[name]

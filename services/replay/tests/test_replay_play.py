@@ -9,7 +9,7 @@ import pytest
 import zenoh
 from palpate_bus import codec
 from palpate_bus.contract import contract
-from palpate_bus.liveliness import NodeTokens, entities
+from palpate_bus.liveliness import GraphWatch, NodeTokens
 from palpate_bus.stamps import nanoseconds
 from palpate_bus.wire import topic_key, unpack
 from palpate_bus.zenoh_config import BusOptions, session
@@ -48,21 +48,21 @@ def test_every_message_arrives_as_it_was_recorded(endpoint: str, listener: zenoh
     clocks: SimpleQueue[zenoh.Sample] = SimpleQueue()
     listener.declare_subscriber(topic_key(RULES.topics["joint_states"], 0), zenoh.handlers.Callback(queue.put, indirect=False))
     listener.declare_subscriber(topic_key(RULES.topics["clock"], 0), zenoh.handlers.Callback(clocks.put, indirect=False))
+    watch = GraphWatch(listener, 0)
     with Player(recording, rate=0.5, listen=endpoint) as player:
         deadline = time.monotonic() + 20
         while not listener.info.peers_zid() and time.monotonic() < deadline:
             time.sleep(0.02)
         time.sleep(0.3)  # the subscriptions reach the player
-        nodes: set[str] = set()
-        while not nodes >= {"robot", "planning", "control", "conductor"} and time.monotonic() < deadline:
-            nodes = {entity.node for entity in entities(listener, 0)}
+        while not watch.roles() >= {"robot", "planning", "control", "conductor"} and time.monotonic() < deadline:
+            watch.changes(0.1)
         begin = time.monotonic()
         player.play()
         assert time.monotonic() - begin >= 2 * recording.last / 1e9
         samples = heard(queue, len(recorded))
         assert [s.payload.to_bytes() for s in samples] == [m.payload for m in recorded]
         assert [unpack(s.attachment.to_bytes())[0] for s in samples] == [m.sequence for m in recorded]
-        assert {"robot", "planning", "control", "conductor"} <= nodes
+        assert {"robot", "planning", "control", "conductor"} <= watch.roles()
         times = [nanoseconds(codec.decode(s.payload.to_bytes(), RULES.topics["clock"].type).clock) for s in heard(clocks, 10)]
         assert times == [i * 10_000_000 for i in range(10)]
         assert player.sent == sum(recording.counts.values())
