@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
-import sys
 import tempfile
 import webbrowser
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 from time import sleep
 from typing import Annotated, NoReturn
@@ -136,12 +137,30 @@ def _view(recording: Path, port: int, native: bool, show: bool, console: Console
     console.print(f"{recording}: {address(port)}  (Ctrl+C ends it)", highlight=False, soft_wrap=True)
     if show:
         webbrowser.open(address(port))
-    ports = ["--port", str(port), "--web-viewer-port", str(port + 1), "--server-memory-limit", MEMORY_LIMIT]
-    status = subprocess.run([*_rerun(str(recording)), "--serve-web", *ports], check=False).returncode
-    if status not in (0, -2, 130):
+    ports = [
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        str(port),
+        "--web-viewer-port",
+        str(port + 1),
+        "--server-memory-limit",
+        MEMORY_LIMIT,
+    ]
+    server = subprocess.Popen([*_rerun(str(recording)), "--serve-web", *ports, "--server-memory-limit", MEMORY_LIMIT])
+    try:
+        status = server.wait()
+    finally:
+        if server.poll() is None:
+            server.terminate()
+            server.wait()
+    if status:
         raise OSError(f"rerun left with status {status}: are ports {port} and {port + 1} free? (--port)")
 
 
 def _rerun(*words: str) -> list[str]:
     """The words that start rerun's own command."""
-    return [sys.executable, "-m", "rerun_cli", *words]
+    found = find_spec("rerun_cli")
+    if found is None or found.origin is None:
+        raise NothingToShow("rerun's own command is not installed: pip install rerun-sdk")
+    return [str(Path(found.origin).with_name("rerun.exe" if os.name == "nt" else "rerun")), *words]
