@@ -49,6 +49,7 @@ class PlanningService(Service):
         self._surface: Message | None = None
         self._valid = duration_message(VALID_FOR)
         self._peak_force = 0.0
+        self._unreadable = 0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One planning period: what is measured, what the exam makes of it, what is to be done."""
@@ -88,6 +89,7 @@ class PlanningService(Service):
             "targets": status.target_count,
             "skipped_targets": {str(i): why for i, why in sorted(self._exam.skipped.items())},
             "peak_force_N": self._peak_force,
+            "unreadable_statuses": self._unreadable,
             "surface_offset_m": self._exam.surface_offset,
         }
 
@@ -98,6 +100,9 @@ class PlanningService(Service):
             return
         force, moment = status.wrench.force, status.wrench.torque
         wrench = np.array((force.x, force.y, force.z, moment.x, moment.y, moment.z))
+        if not np.isfinite(np.concatenate((status.position, status.velocity, wrench))).all():
+            self._unreadable += 1  # nothing to go by: the supervisor stops the arm, the last reading stands until then
+            return
         self._reading = Reading(np.array(status.position), wrench, np.array(status.velocity))
 
     def _perceived(self, inbox: Inbox) -> Seen | Unseen | None:

@@ -218,6 +218,19 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
         assert state.end_tick == -1
 
 
+def test_values_that_are_none_are_passed_over() -> None:
+    service = create(Scenario(robot=BASE))
+    inbox = FakeInbox()
+    q = np.array(lbr.HOME)
+    inbox.put("robot/status", status(0, q, np.zeros(6)))
+    service.step(0, inbox)
+    for broken in (status(10_000_000, np.full(7, np.nan), np.zeros(6)), status(10_000_000, q, np.full(6, np.inf))):
+        inbox.put("robot/status", broken)
+        out = sent(service.step(10_000_000, inbox))
+        assert np.isfinite(np.array(out["planning/setpoint"].joint_position)).all()
+    assert service.finish()["unreadable_statuses"] == 2
+
+
 def test_pose_message_round_trip() -> None:
     X = np.eye(4)
     X[:3, :3] = Rotation.from_rotvec((0.1, -2.0, 0.7)).as_matrix()

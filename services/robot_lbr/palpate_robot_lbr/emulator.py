@@ -31,6 +31,7 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
 )
+from palpate_bus.ros_node import RosNode
 from palpate_bus.stamps import header
 from palpate_bus.zenoh_config import BusOptions
 from palpate_models import lbr
@@ -43,7 +44,6 @@ from palpate_robot.plant import Plant
 from palpate_robot_lbr.fri import Drive, Session
 from palpate_robot_lbr.idl import STATE, TORQUE_COMMAND, ClientCommandMode, ControlMode, LBRState, SafetyState, SessionState
 from palpate_robot_lbr.port import CONTACT_TOPIC, LINKS, LINKS_TOPIC, TOOL_STATE, TOOL_TOPIC, WRENCH
-from palpate_robot_lbr.ros import RosNode
 
 log = logging.getLogger("emulator")
 

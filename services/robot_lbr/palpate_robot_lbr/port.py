@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
+from palpate_bus.ros_node import RosNode
 from palpate_bus.zenoh_config import BusOptions
 from palpate_models.frames import Array
 
 from palpate_robot_lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand
-from palpate_robot_lbr.ros import RosNode
 from palpate_robot_lbr.settings import Settings
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"

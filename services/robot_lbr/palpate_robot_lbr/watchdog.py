@@ -17,12 +17,12 @@ from types import FrameType
 from typing import Any, Final
 
 import numpy as np
+from palpate_bus.ros_node import RosNode
 from palpate_bus.zenoh_config import BusOptions
 from palpate_models.frames import Array
 
 from palpate_robot_lbr.arm import Arm
 from palpate_robot_lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
-from palpate_robot_lbr.ros import RosNode
 from palpate_robot_lbr.settings import Settings
 
 log = logging.getLogger("watchdog")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import zenoh
+
 from palpate_bus import codec
 from palpate_bus.contract import Qos, Topic
 from palpate_bus.liveliness import NodeTokens
@@ -26,6 +27,7 @@ QOS = Qos(
     depth=1,
     reason="as ros2_control's controllers subscribe: reliable, the newest alone",
 )
+LATCHED = QOS.model_copy(update={"transient_local": True, "congestion": "BLOCK", "priority": "DATA"})
 
 
 class RosPublisher:
@@ -47,9 +49,15 @@ class RosPublisher:
 class RosSubscription:
     """The newest messages of a ROS topic, from whoever publishes it."""
 
-    def __init__(self, session: zenoh.Session, key: str, type_name: str) -> None:
+    def __init__(self, session: zenoh.Session, key: str, type_name: str, *, latched: bool = False) -> None:
         self._decode = codec.decoder(type_name)
-        self._subscriber: Any = session.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+        channel: Any = zenoh.handlers.RingChannel(RING)
+        self._subscriber: Any
+        if latched:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key, channel, history=history)
+        else:
+            self._subscriber = session.declare_subscriber(key, channel)
         self._try = self._subscriber.handler.try_recv
         self.sender = b""
         """GID of the publisher of the newest message."""
@@ -83,17 +91,18 @@ class RosNode:
         self._domain = domain
         self._tokens = NodeTokens(self._session, name, domain)
 
-    def publisher(self, topic: str, type_name: str) -> RosPublisher:
-        """Declares a publisher."""
+    def publisher(self, topic: str, type_name: str, *, latched: bool = False) -> RosPublisher:
+        """Declares a publisher; `latched` (transient local) serves late subscribers, too."""
         row = _row(topic, type_name)
-        gid = self._tokens.publisher(row, QOS)
-        return RosPublisher(Publisher(self._session, topic_key(row, self._domain), QOS, gid), type_name, gid)
+        qos = LATCHED if latched else QOS
+        gid = self._tokens.publisher(row, qos)
+        return RosPublisher(Publisher(self._session, topic_key(row, self._domain), qos, gid), type_name, gid)
 
-    def subscription(self, topic: str, type_name: str) -> RosSubscription:
-        """Declares a subscription."""
+    def subscription(self, topic: str, type_name: str, *, latched: bool = False) -> RosSubscription:
+        """Declares a subscription; `latched` (transient local) gets what was sent before, too."""
         row = _row(topic, type_name)
         self._tokens.subscription(row, QOS)
-        return RosSubscription(self._session, topic_key(row, self._domain), type_name)
+        return RosSubscription(self._session, topic_key(row, self._domain), type_name, latched=latched)
 
     def close(self) -> None:
         """Leaves."""

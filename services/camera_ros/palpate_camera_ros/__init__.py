@@ -1,0 +1,1 @@
+"""A depth camera of a ROS 2 system in the role camera."""

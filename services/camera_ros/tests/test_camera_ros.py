@@ -1,0 +1,167 @@
+"""A ROS camera's images, intrinsics and transforms through the bridge, and over zenoh."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from palpate_bus.conformance import violations
+from palpate_bus.contract import contract
+from palpate_bus.messages import (
+    CameraInfo,
+    CameraTrigger,
+    Image,
+    Quaternion,
+    RegionOfInterest,
+    TFMessage,
+    Transform,
+    TransformStamped,
+    Vector3,
+)
+from palpate_bus.ros_node import RosNode
+from palpate_bus.stamps import header
+from palpate_bus.zenoh_config import BusOptions
+from palpate_camera_ros.convert import CameraError, depth_metres
+from palpate_camera_ros.service import CameraPort, RosCameraService, ZenohCamera
+
+METRES = np.array([[1.0, np.nan, 0.731], [0.5, 2.25, 1.125]], dtype=np.float32)
+
+
+def ros_image(encoding: str = "16UC1", big_endian: bool = False) -> Any:
+    order = ">" if big_endian else "<"
+    millimetres = np.nan_to_num(METRES * 1000).round().astype(f"{order}u2")
+    pixels = millimetres if encoding == "16UC1" else METRES.astype(f"{order}f4")
+    padded = np.zeros((2, 3 * pixels.itemsize + 5), np.uint8)  # drivers may pad their rows
+    padded[:, : 3 * pixels.itemsize] = pixels.view(np.uint8).reshape(2, -1)
+    return Image(header(5, "d435"), 2, 3, encoding, int(big_endian), padded.shape[1], padded.ravel())
+
+
+def ros_info(d: float = 0.0) -> Any:
+    K = np.array([600.0, 0, 1.0, 0, 610.0, 0.5, 0, 0, 1])
+    P = np.hstack((K.reshape(3, 3), np.zeros((3, 1)))).ravel()
+    roi = RegionOfInterest(0, 0, 0, 0, False)
+    return CameraInfo(header(5, "d435"), 2, 3, "plumb_bob", np.full(5, d), K, np.eye(3).ravel(), P, 0, 0, roi)
+
+
+def link(parent: str, child: str, x: float, z_turn: float = 0.0) -> Any:
+    rotation = Quaternion(0.0, 0.0, np.sin(z_turn / 2), np.cos(z_turn / 2))
+    return TransformStamped(header(0, parent), child, Transform(Vector3(x, 0.0, 0.0), rotation))
+
+
+TREE = [link("world", "stand", 1.0, np.pi / 2), link("stand", "camera_depth_optical_frame", 0.5)]
+
+
+class Port(CameraPort):
+    def __init__(self, tree: list[Any] = TREE) -> None:
+        self.tree, self.waiting, self.intrinsics = list(tree), [], ros_info()
+
+    def images(self) -> list[Any]:
+        waiting, self.waiting = self.waiting, []
+        return waiting
+
+    def info(self) -> Any:
+        return self.intrinsics
+
+    def transforms(self) -> list[Any]:
+        tree, self.tree = self.tree, []
+        return tree
+
+
+class Inbox:
+    def __init__(self, frames: int = 0) -> None:
+        self.frames = frames
+
+    def new(self, topic: str) -> Iterable[Any]:
+        frames, self.frames = self.frames, 0
+        return [CameraTrigger(header(0), frames)] if frames else []
+
+    def latest(self, topic: str) -> Any | None:
+        return None
+
+    def stamp(self, topic: str) -> int | None:
+        return None
+
+    def lost(self, role: str) -> bool:
+        return False
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_depth_is_in_metres_with_nan_where_there_is_none(encoding: str, big_endian: bool) -> None:
+    image = ros_image(encoding, big_endian)
+    found = depth_metres(encoding, 2, 3, image.step, big_endian, image.data)
+    np.testing.assert_allclose(found, METRES, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "step", "words"), [("rgb8", 11, "16UC1"), ("16UC1", 4, "too few"), ("32FC1", 12, "too few")]
+)
+def test_what_is_no_depth_image_is_named(encoding: str, step: int, words: str) -> None:
+    with pytest.raises(CameraError, match=words):
+        depth_metres(encoding, 2, 3, step, False, np.zeros(11, np.uint8))
+
+
+def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
+    port = Port()
+    service = RosCameraService(port)
+    inbox = Inbox(frames=2)
+    port.waiting = [ros_image()]
+    assert service.step(0, inbox) == {}, "taken before the trigger"
+    for k in (1, 2):
+        t = k * 100_000_000
+        port.waiting = [ros_image(), ros_image()]
+        out = service.step(t, inbox)
+        for name, message in out.items():
+            assert violations(contract().topics[name], message, t) == []
+        assert set(out) == {"camera/depth/image_raw", "camera/depth/camera_info"}
+    port.waiting = [ros_image()]
+    assert service.step(300_000_000, inbox) == {}
+    assert service.finish() == {"bursts": 1, "frames": 2, "frames_rejected": 0, "problem": ""}
+
+
+def test_the_pose_is_the_whole_chain() -> None:
+    (pose,) = RosCameraService(Port()).start()["tf_static"].transforms
+    p = pose.transform.translation
+    assert (p.x, p.y, p.z) == pytest.approx((1.0, 0.5, 0.0), abs=1e-12)
+    assert violations(contract().topics["tf_static"], TFMessage([pose]), 0) == []
+
+
+def test_a_pose_that_nobody_publishes_is_named_with_what_there_is() -> None:
+    with pytest.raises(CameraError, match=r"no way from 'world'.*world -> stand"):
+        RosCameraService(Port(TREE[:1]), wait_s=0.0)
+
+
+def test_a_distorted_image_is_refused_and_said_so() -> None:
+    port = Port()
+    port.intrinsics = ros_info(d=0.1)
+    service = RosCameraService(port)
+    inbox = Inbox(frames=1)
+    service.step(0, inbox)
+    port.waiting = [ros_image()]
+    assert service.step(100_000_000, inbox) == {}
+    assert "rectified" in str(service.finish()["problem"])
+
+
+def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path}/ros.sock"
+    node = RosNode("realsense", 0, BusOptions(listen=(endpoint,)))
+    tf = node.publisher("tf_static", "tf2_msgs/msg/TFMessage", latched=True)
+    tf.publish(TFMessage(TREE))  # long before anybody listens
+    images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
+    infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
+    service = RosCameraService(ZenohCamera({"PALPATE_CAMERA_ROUTER": endpoint}))
+    inbox = Inbox(frames=1)
+    service.step(0, inbox)
+    out: Any = {}
+    for k in range(1, 200):
+        infos.publish(ros_info())
+        images.publish(ros_image())
+        out = service.step(k * 100_000_000, inbox)
+        if out:
+            break
+    image = out["camera/depth/image_raw"]
+    np.testing.assert_allclose(np.asarray(image.data).view("<f4").reshape(2, 3), METRES, atol=1e-3)
+    node.close()
