@@ -36,7 +36,7 @@ class Curve:
     force: Array
     """[N], shape (depths,)"""
     step_us: float
-    """Median over the held steps at 10 mm [us]."""
+    """Fastest tenth of the held steps at 10 mm [us]: what a busy machine disturbs least."""
 
 
 def press_dart(flesh: Flesh, friction: float, depths: Array = DEPTHS_M) -> Curve:
@@ -55,7 +55,7 @@ def press_dart(flesh: Flesh, friction: float, depths: Array = DEPTHS_M) -> Curve
             if k * DT >= SETTLE_S:
                 held.append(scene.force())
         forces.append(float(np.mean(held)))
-    return Curve(np.array(forces) / flesh.at_rest(DT), 1e6 * float(np.median(costs)))
+    return Curve(np.array(forces) / flesh.at_rest(DT), 1e6 * float(np.percentile(costs, 10)))
 
 
 def press_ours(flesh: Flesh, depths: Array = DEPTHS_M) -> Curve:
@@ -71,7 +71,7 @@ def press_ours(flesh: Flesh, depths: Array = DEPTHS_M) -> Curve:
             force, _ = tissue.step(0.0, p, STILL, RADIUS_M)
             costs.append(time.perf_counter() - begin)
         forces.append(float(force[2]))
-    return Curve(np.array(forces), 1e6 * float(np.median(costs)))
+    return Curve(np.array(forces), 1e6 * float(np.percentile(costs, 10)))
 
 
 def sliding_vertices(flesh: Flesh, depths: Array = DEPTHS_M) -> Array:

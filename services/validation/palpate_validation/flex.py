@@ -19,7 +19,7 @@ from palpate_tissue.tissue import Tissue
 from palpate_validation.check import Check, Section
 from palpate_validation.hertz import POISSON, YOUNG_PA, hertz_force
 from palpate_validation.plots import COLOURS, QUIET
-from palpate_validation.probing import ELASTIC, hold, static_curve
+from palpate_validation.probing import ELASTIC, STILL, hold, static_curve
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class FlexBlock:
         return int(self.model.nflexvert)
 
     def press(self, depth: float) -> tuple[float, float]:
-        """Moves to `depth` [m], holds, and returns the force [N] and the median cost of a held step [us]."""
+        """Moves to `depth` [m], holds, and returns the force [N] and the cost of a held step, fastest tenth [us]."""
         while self.depth < depth:
             self.depth = min(self.depth + SPEED_MPS * DT, depth)
             self._step()
@@ -84,7 +84,7 @@ class FlexBlock:
             begin = time.perf_counter()
             self._step()
             costs.append(time.perf_counter() - begin)
-        return self._force(), 1e6 * float(np.median(costs))
+        return self._force(), 1e6 * float(np.percentile(costs, 10))
 
     def _step(self) -> None:
         self.data.mocap_pos[0, 2] = self._top - self.depth
@@ -127,15 +127,17 @@ def measure() -> FlexCurves:
     model = flat_phantom(0.12)
     tissue = Tissue(model, ELASTIC)
     hold(tissue, 0.010, RADIUS_M)
-    begin = time.perf_counter()
-    hold(tissue, 0.010, RADIUS_M)
-    ours_us = 1e6 * (time.perf_counter() - begin) / 300
+    costs, p = [], np.array((0.0, 0.0, RADIUS_M - 0.010))
+    for _ in range(300):
+        begin = time.perf_counter()
+        tissue.step(0.0, p, STILL, RADIUS_M)
+        costs.append(time.perf_counter() - begin)
     return FlexCurves(
         flex=np.array([force for force, _ in pressed]),
         ours=static_curve(model, DEPTHS_M, RADIUS_M),
         hertz=hertz_force(DEPTHS_M, RADIUS_M),
         flex_us=pressed[-1][1],
-        ours_us=ours_us,
+        ours_us=1e6 * float(np.percentile(costs, 10)),
         vertices=block.vertices,
         our_vertices=len(model.vertices),
     )
@@ -175,5 +177,6 @@ def draw(figure: Figure, c: FlexCurves) -> None:
     axes.plot(mm, c.flex, "o-", color=COLOURS[1], ms=4, lw=0.8, label="MuJoCo flex")
     axes.set(xlabel="depth [mm]", ylabel="force [N]", xscale="log", yscale="log")
     axes.set_xticks((2, 5, 10), ("2", "5", "10"))
+    axes.set_yticks((0.3, 1, 3), ("0.3", "1", "3"))
     axes.minorticks_off()
     axes.legend()

@@ -93,12 +93,16 @@ class Loop:
         return MOST_MS
 
 
-def linearise(contrast: float, stiffness: float) -> Loop:
-    """The loop about a contact 10 mm deep on a wall `contrast` times the default's, `stiffness` [N/m] asked for."""
+def linearise(contrast: float, stiffness: float, across: float = 1.0) -> Loop:
+    """The loop about a contact 10 mm deep on a wall `contrast` times the default's, `stiffness` [N/m] asked for along the tool.
+
+    `across` multiplies what an examination asks for across the tool.
+    """
     q = start_posture(contrast)
     model = ArmModel(urdf(scenario(contrast).robot))
     model.update(q, np.zeros(7))
     asked = CARTESIAN_STIFFNESS.copy()
+    asked[:2] *= across
     asked[2] = stiffness
     setpoint = Setpoint(
         mode=Mode.CARTESIAN, stamp=0, R_WD=model.R_WI.copy(), p_WD=model.p_WI.copy(), V_WD=np.zeros(6), F_W=np.zeros(6),
