@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -39,12 +39,17 @@ class ServiceProcess:
     environment: Mapping[str, str]
 
 
+def override_files() -> tuple[Path, ...]:
+    """The overrides that PALPATE_COMPOSE names after the compose file, separated as in a PATH."""
+    return tuple(map(Path, os.environ.get("PALPATE_COMPOSE", "").split(os.pathsep)[1:]))
+
+
 def compose_file() -> Path:
     """The compose file: PALPATE_COMPOSE, else in the current folder, else in the checkout that holds this package.
 
     Raises ProcessListError when there is none.
     """
-    named = os.environ.get("PALPATE_COMPOSE")
+    named = os.environ.get("PALPATE_COMPOSE", "").partition(os.pathsep)[0]
     candidates = [Path(named)] if named else [Path.cwd() / COMPOSE, *(p / COMPOSE for p in Path(__file__).resolve().parents)]
     for path in candidates:
         if path.is_file():
@@ -52,23 +57,44 @@ def compose_file() -> Path:
     raise ProcessListError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates[:2]))}. Set PALPATE_COMPOSE")
 
 
-def read_processes(path: Path, roles: tuple[str, ...]) -> dict[str, ServiceProcess]:
-    """The processes of `roles`, in that order. Raises ProcessListError naming what is missing or malformed."""
-    document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    services: dict[str, Any] = document.get("services", {})
-    found = {}
-    for role in roles:
-        service = services.get(role)
-        if service is None:
-            raise ProcessListError(f"{path}: no service {role!r}; it has {', '.join(services)}")
-        command = service.get("command")
-        if not isinstance(command, list) or not all(isinstance(word, str) for word in command):
-            raise ProcessListError(f"{path}: services.{role}.command = {command!r}: want a list of words")
-        environment = service.get("environment") or {}
-        if not isinstance(environment, dict):
-            raise ProcessListError(f"{path}: services.{role}.environment: want a mapping")
-        found[role] = ServiceProcess(role, tuple(command), {k: str(v) for k, v in environment.items()})
+def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path] = ()) -> dict[str, ServiceProcess]:
+    """The processes of `roles`, in that order, from a compose file and overrides, merged as `docker compose -f -f` merges them:
+    a later file's command stands in place of the earlier one, its environment is added.
+
+    Raises ProcessListError naming what is missing or malformed.
+    """
+    found: dict[str, ServiceProcess] = {}
+    for file in (path, *overrides):
+        services = _services(file)
+        for role in roles:
+            service = services.get(role)
+            if service is None and role not in found:
+                raise ProcessListError(f"{file}: no service {role!r}; it has {', '.join(services)}")
+            if service is not None:
+                found[role] = _merged(file, role, service, found.get(role))
     return found
+
+
+def _services(path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ProcessListError(f"{path}: cannot be read: {error}") from error
+    services = document.get("services") if isinstance(document, dict) else None
+    if not isinstance(services, dict):
+        raise ProcessListError(f"{path}: services: want a mapping")
+    return services
+
+
+def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceProcess | None) -> ServiceProcess:
+    command = service.get("command", None if earlier is None else list(earlier.command))
+    if not isinstance(command, list) or not all(isinstance(word, str) for word in command):
+        raise ProcessListError(f"{path}: services.{role}.command = {command!r}: want a list of words")
+    environment = service.get("environment") or {}
+    if not isinstance(environment, dict):
+        raise ProcessListError(f"{path}: services.{role}.environment: want a mapping")
+    before = {} if earlier is None else earlier.environment
+    return ServiceProcess(role, tuple(command), {**before, **{k: str(v) for k, v in environment.items()}})
 
 
 class LocalProcesses:

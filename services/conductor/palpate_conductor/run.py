@@ -24,7 +24,7 @@ from palpate_conductor.collector import Collected, Collector
 from palpate_conductor.conductor import Conductor, Patience, RunFailed
 from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
 from palpate_conductor.own import in_place, load
-from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
+from palpate_conductor.processes import LocalProcesses, compose_file, override_files, read_processes
 from palpate_conductor.secure import SecureBus
 from palpate_conductor.tree import FrameTree
 
@@ -100,7 +100,8 @@ def run_distributed(
     begin = perf_counter()
     roles = (*WORKERS, *observers)
     files = write_scenario_files(scenario, out)
-    processes = in_place(chosen_processes(scenario, read_processes(compose_file(), roles)), own or {})
+    listed = read_processes(compose_file(), roles, override_files())
+    processes = in_place(chosen_processes(scenario, listed), own or {})
     extra = {
         "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         "PALPATE_RECORD": str(int("recorder" in observers)),

@@ -1,10 +1,13 @@
 """The process list."""
 
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
-from palpate_conductor.processes import ProcessListError, compose_file, read_processes
+import yaml
+from palpate_conductor.processes import ProcessListError, compose_file, override_files, read_processes
 from palpate_conductor.run import OBSERVERS, WORKERS
+from palpate_conductor.swaps import read_swaps
 
 
 def test_every_role_of_a_run_is_in_the_compose_file() -> None:
@@ -34,3 +37,43 @@ def test_a_missing_compose_file_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv("PALPATE_COMPOSE", "no/such/file.yml")
     with pytest.raises(ProcessListError, match=r"no/such/file\.yml"):
         compose_file()
+
+
+def test_overrides_are_merged_as_docker_compose_merges_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    base, one, two = (tmp_path / name for name in ("base.yml", "one.yml", "two.yml"))
+    base.write_text("services: {robot: {command: [a], environment: {B: 1, C: 2}}, tissue: {command: [t]}}")
+    one.write_text("services: {robot: {environment: {C: 3}}}")
+    two.write_text("services: {robot: {command: [python, -m, x], environment: {D: 4}}, prepare: {environment: {E: 5}}}")
+    monkeypatch.setenv("PALPATE_COMPOSE", f"{base}:{one}:{two}")
+    processes = read_processes(compose_file(), ("robot", "tissue"), override_files())
+    assert processes["robot"].command == ("python", "-m", "x")
+    assert processes["robot"].environment == {"B": "1", "C": "3", "D": "4"}
+    assert processes["tissue"].command == ("t",)
+
+
+def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs() -> None:
+    root = compose_file().parent
+    swaps = read_swaps(root / "swap")
+    assert {"tissue-fmu", "tissue-elastic", "robot-mujoco", "camera-replay", "planning-raster", "planning-point"} <= swaps.keys()
+    registered = {point.name: point.module.partition(".")[0] for point in entry_points(group="palpate.implementations")}
+    for name, swap in swaps.items():
+        role = name.partition("-")[0]
+        file = root / "swap" / f"{name}.yml"
+        document = yaml.safe_load(file.read_text(encoding="utf-8"))
+        settings = dict(setting.split("=", 1) for setting in swap.settings)
+        chosen = settings.get(f"{role}.implementation")
+        if role == "planning":
+            assert chosen is None
+            continue
+        assert name == f"{role}-{chosen}"
+        service = document["services"][role]
+        processes = read_processes(compose_file(), (role,), (file,))
+        assert processes[role].command == ("python", "-m", registered[f"{role}.{chosen}"])
+        assert (root / service["build"]["dockerfile"]).is_file()
+        assert service["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
+
+
+def test_a_swap_without_settings_is_named(tmp_path: Path) -> None:
+    (tmp_path / "robot-x.yml").write_text("x-swap: words\nservices: {robot: {command: [a]}}")
+    with pytest.raises(ProcessListError, match=r"robot-x\.yml.*PALPATE_SETTINGS"):
+        read_swaps(tmp_path)

@@ -1,0 +1,43 @@
+"""`palpate swaps`: every swap examined, and the table of docs/swaps.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from palpate_conductor.processes import ProcessListError, compose_file
+from palpate_conductor.swaps import measure, read_swaps, table
+
+BEGIN, END = "<!-- palpate swaps: begin -->\n", "<!-- palpate swaps: end -->\n"
+
+
+def swaps(
+    scenario: Annotated[str, typer.Argument(help="The examination.")] = "rlq_guarding",
+    only: Annotated[list[str] | None, typer.Option(help="A swap; may be repeated. All by default.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field in every run; may be repeated.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the runs.")] = Path("out/swaps"),
+    keep: Annotated[bool, typer.Option("--keep", help="Do not run again what is in the folder.")] = False,
+    doc: Annotated[Path | None, typer.Option(help="A Markdown file whose marked table is replaced.")] = None,
+) -> None:
+    """Measure what each swap of `swap/` changes in the findings; print the table. A minute or two a swap."""
+    console = Console(stderr=True)
+    try:
+        known = read_swaps(compose_file().parent / "swap")
+        unknown = [name for name in only or () if name not in known]
+        if unknown:
+            raise ProcessListError(f"--only {', '.join(unknown)}: there are {', '.join(known)}")
+        chosen = [known[name] for name in only or known]
+        reports = measure(scenario, settings or (), chosen, out, keep, lambda name: console.print(f"examining: {name}"))
+    except (ProcessListError, RuntimeError) as error:
+        console.print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
+        raise typer.Exit(2 if isinstance(error, ProcessListError) else 3) from error
+    text = table(chosen, reports)
+    typer.echo(text)
+    if doc is not None:
+        before, _, rest = doc.read_text(encoding="utf-8").partition(BEGIN)
+        doc.write_text(f"{before}{BEGIN}{text}{END}{rest.partition(END)[2]}", encoding="utf-8")
