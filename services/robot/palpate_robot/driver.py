@@ -118,8 +118,11 @@ class Driver:
             self.hold(t, Cause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
         else:
             self._check_joints(t, q, v)
-        if command is not None and command.stamp > self._since and not self.held:
-            self._take(t, command, gravity)
+        if command is not None and not self.held:
+            if command.stamp > self._since:
+                self._take(t, command, gravity)
+            elif self.mode is Mode.ACTIVE:  # it has not been judged, so it must not be obeyed
+                self.hold(t, Cause.COMMAND_EXPIRED, f"the newest command is stamped {(t - command.stamp) / 1e6:.0f} ms ago")
         return command.torque if command is not None and self.mode is Mode.ACTIVE else _ZERO
 
     def damping(self, v: Array, gravity: Array) -> Array:

@@ -140,3 +140,10 @@ def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
     fast = np.array([1.7, -1.7, 1.7, 2.2, -2.4, 3.1, 3.1])
     total = np.abs(active.damping(fast, GRAVITY) * fast) + np.abs(GRAVITY)
     assert np.all(total <= lbr.TORQUE_LIMIT + 1e-9)
+
+
+@pytest.mark.parametrize("torque", [np.full(7, 2.0), np.full(7, np.nan)])
+def test_a_command_stamped_before_all_others_is_not_obeyed_unjudged(active: Driver, torque: np.ndarray) -> None:
+    """`palpate faults` found it: a sender whose stamps are an hour behind was obeyed, without expiry and without limits."""
+    assert not _update(active, 10 * MS, _command(-3600 * 1000 * MS, torque)).any()
+    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, Cause.COMMAND_EXPIRED)
