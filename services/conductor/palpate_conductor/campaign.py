@@ -32,7 +32,7 @@ SETTINGS: Final = (
     "limits.release_patience_s=1.0",
 )
 """A small region on the lesion of rlq_guarding, so that a case takes seconds, and nobody waits long for an operator."""
-PATIENCE: Final = Patience(start=90.0, soft=1.0, hard=8.0)
+PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=8.0)
 HANG_S: Final = 90.0
 """A case that takes longer after its fault has hung."""
 CONTACT_S: Final = 0.3
@@ -89,8 +89,13 @@ class Finding:
 
     @property
     def good(self) -> bool:
-        """No hang, no force above the limit; and if the run did not simply go on, its cause named."""
-        return not self.hung and self.peak_force_n <= FORCE_LIMIT_N and (self.ended == "complete" or self.named)
+        """Done, no hang, no force above the limit; and if the run did not simply go on, its cause named."""
+        return (
+            self.injected_s is not None
+            and not self.hung
+            and self.peak_force_n <= FORCE_LIMIT_N
+            and (self.ended == "complete" or self.named)
+        )
 
 
 def cases(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[Case]:

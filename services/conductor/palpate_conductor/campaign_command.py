@@ -76,7 +76,8 @@ def _load(path: Path) -> list[Finding]:
     if not path.exists():
         return []
     rows = json.loads(path.read_text(encoding="utf-8"))
-    return [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
+    found = [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
+    return [finding for finding in found if finding.injected_s is not None]  # those that never began are tried again
 
 
 def _row(finding: Finding) -> tuple[str, ...]:
