@@ -7,6 +7,7 @@ the run ended. Times are of the wall clock, read every 10 ms.
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -238,7 +239,8 @@ def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
     if finding.injected_s is None:
         finding.ended = f"the fault was never done: {finding.ended}"
     finding.reaction = _reaction(collected)
-    words = " ".join([finding.sign, finding.ended, *watch.signs])
+    said = [finding.sign, finding.ended, *watch.signs]
+    words = " ".join(re.sub(r"^(supervisor|driver|planning): ", "", sentence) for sentence in said)  # not who said it
     producer = contract().topics[finding.where].producer if finding.where in contract().topics else finding.where
     readers = contract().topics[finding.where].readers if finding.where in contract().topics else {}
     finding.named = any(name in words for name in (finding.where, producer, *readers))
