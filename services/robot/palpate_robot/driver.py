@@ -122,7 +122,8 @@ class Driver:
             if command.stamp > self._since:
                 self._take(t, command, gravity)
             elif self.mode is Mode.ACTIVE:  # it has not been judged, so it must not be obeyed
-                self.hold(t, Cause.COMMAND_EXPIRED, f"the newest command of control is stamped {(t - command.stamp) / 1e6:.0f} ms ago")
+                age = (t - command.stamp) / 1e6
+                self.hold(t, Cause.COMMAND_EXPIRED, f"the newest command of control is stamped {age:.0f} ms ago")
         return command.torque if command is not None and self.mode is Mode.ACTIVE else _ZERO
 
     def damping(self, v: Array, gravity: Array) -> Array:
