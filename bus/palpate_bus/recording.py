@@ -78,6 +78,8 @@ class RecorderNode:
                     self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
                 elif message.command == RunControl.LOST:
                     self._lost.add(message.role)
+                elif message.command == RunControl.HANDOVER and message.role in self._chunks:
+                    self._chunks[message.role].hand_over()
                 elif message.command == RunControl.END:
                     break
             while self._drain():

@@ -78,6 +78,7 @@ class Subscription:
         self.foreign = 0
         self.heard = False
         self._gid: bytes | None = None
+        self._retired: bytes | None = None
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
         handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
         if history:
@@ -101,7 +102,7 @@ class Subscription:
                 self.garbage += 1
                 continue
             if gid != self._gid:
-                if self._gid is not None and self._decode is None:
+                if (self._gid is not None or gid == self._retired) and self._decode is None:
                     self.foreign += 1
                     continue
                 self._gid = gid
@@ -114,6 +115,11 @@ class Subscription:
                 self.garbage += 1
                 continue
             return Sample(sequence, sent, payload)
+
+    def hand_over(self) -> None:
+        """Forgets the sender: the next one that is another counts from now on, and nothing that still comes from this one."""
+        if self._gid is not None:
+            self._retired, self._gid = self._gid, None
 
     def close(self) -> None:
         """Undeclares the subscriber."""

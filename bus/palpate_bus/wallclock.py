@@ -65,7 +65,10 @@ class WallClockNode:
             raise
 
     def _await_start(self) -> int:
-        """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns]."""
+        """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns].
+
+        The conductor repeats the start, so that who takes a place over in the middle of a run hears it too.
+        """
         while True:
             message = self._link.poll(HANDSHAKE_POLL_S)
             self._receive(0)  # a quicker service may have sent its latched topics already
@@ -77,6 +80,8 @@ class WallClockNode:
                     name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
                 ]
                 self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
+            elif message.command == RunControl.GRANT and message.last:
+                raise RunAborted("the run is already ending")
             elif message.command == RunControl.GRANT:
                 return monotonic_ns() + int(message.tick) - time_ns()
 
@@ -84,6 +89,12 @@ class WallClockNode:
         if message.command == RunControl.LOST:
             log.warning("%s lost: %s", message.role, message.reason)
             self._stepper.inbox.lost_roles.add(message.role)
+        elif message.command == RunControl.HANDOVER:
+            log.warning("%s changes hands: %s", message.role, message.reason)
+            for name, buffer in self._stepper.buffers.items():
+                if buffer.topic.producer == message.role:
+                    self._data[name].hand_over()
+                    self._sequences[name] = 0
         elif message.command == RunControl.GRANT and message.last:
             self._end = int(message.tick)
 

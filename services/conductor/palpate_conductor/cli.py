@@ -88,6 +88,9 @@ def run(
     composed: Annotated[bool, typer.Option("--composed", help="All services in this process.")] = False,
     realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
     wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer, as with hardware.")] = False,
+    handover: Annotated[
+        float, typer.Option(min=0, help="With --wallclock: seconds for which a stopped service's place is kept; see takeover.")
+    ] = 0.0,
     record: Annotated[bool, typer.Option(help="Write recording.rrd and the MCAP recording.")] = True,
     secure: Annotated[bool, typer.Option("--secure", help="Mutual TLS, and each role may do what its row allows.")] = False,
     keys: Annotated[
@@ -114,6 +117,8 @@ def run(
         _fail(console, EXIT_BAD_INPUT, str(error))
     if composed and (realtime or wallclock):
         _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
+    if handover and not wallclock:
+        _fail(console, EXIT_BAD_INPUT, "--handover is for --wallclock: in lockstep every message of a service is awaited")
     if (composed and secure) or (keys and not secure):
         _fail(console, EXIT_BAD_INPUT, "--secure is for processes, so it goes without --composed; --keys goes with --secure")
     folder = out or Path("out") / f"{chosen.name}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -131,7 +136,7 @@ def run(
                 pace = 1.0 if realtime else None
                 with SecureBus(folder.resolve(), keys) if secure else nullcontext() as bus:
                     result = run_distributed(
-                        chosen, folder.resolve(), display.tell, observers, pace, wallclock, secure=bus, own=own
+                        chosen, folder.resolve(), display.tell, observers, pace, wallclock, None, bus, own, handover
                     )
     except (ProcessListError, OwnServiceError, BusConfigError, KeysError, OSError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))

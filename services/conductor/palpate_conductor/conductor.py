@@ -24,6 +24,7 @@ from palpate_bus.observer import ObservedService
 from palpate_bus.stamps import NS, header
 
 from palpate_conductor.collector import Collector, Health
+from palpate_conductor.handover import Places
 from palpate_conductor.operator import OperatorDesk
 from palpate_conductor.watchdog import Watchdog
 
@@ -94,11 +95,13 @@ class Conductor:
         realtime: float | None = None,
         limit: int | None = None,
         wallclock: bool = False,
+        handover_s: float = 0.0,
     ) -> None:
         """Prepares a run.
 
         `realtime` paces it at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends.
-        With `wallclock` the services run on their own timers, and nothing is granted but the common start and the end.
+        With `wallclock` the services run on their own timers, and nothing is granted but the common start and the end; the place
+        of a service that goes is kept for `handover_s`, if the run can do without it for that time (see `handover`).
         """
         member = Member(session, collector.role, rules, domain)
         self._member = member
@@ -113,6 +116,7 @@ class Conductor:
         self._realtime = realtime
         self._limit = limit
         self._wallclock = wallclock
+        self._places = Places(handover_s if wallclock else 0.0)
         self._epoch = 0
         self._control = member.internal_publisher("palpate/control", "palpation_msgs/msg/RunControl", "event")
         self._encode = codec.encoder("palpation_msgs/msg/RunControl")
@@ -245,14 +249,18 @@ class Conductor:
         while not finished >= set(self._workers) - self.outcome.lost.keys():
             self._observed.drain_and_step()
             for role, message, detail in self._heard():
+                if self._places.take(role):
+                    self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
                 if message.state == ServiceReport.FINISHED:
                     finished.add(role)
                     self._close(role, detail)
                 elif message.state == ServiceReport.FAILED:
-                    self._lose(role, detail.get("error", "unknown error"))
-            for role, how in {**dict.fromkeys(self._member.gone(), "its connection is gone"), **died()}.items():
+                    self._miss(role, detail.get("error", "unknown error"))
+            for role, how in self._missing(died).items():
                 if role in self._roles and role not in finished:
-                    self._lose(role, how)
+                    self._miss(role, how)
+            for role, how in self._places.expired().items():
+                self._lose(role, f"{how}; nobody took its place within {self._places.patience_s:.0f} s")
             for complaint in self._member.complaints():
                 log.error("%s", complaint)
                 self.outcome.trouble.append(complaint)
@@ -310,6 +318,27 @@ class Conductor:
         if stalled > self._patience.soft and not self._complained:
             log.warning("no tick for %.0f s: %s", stalled, self.watchdog.culprit()[1])
         self._complained = stalled > self._patience.soft
+
+    def _missing(self, died: Callable[[], Mapping[str, str]]) -> dict[str, str]:
+        """Roles that are not there, with how they went."""
+        ended = {role: how for role, how in died().items() if role not in self._places.taken}
+        return {**dict.fromkeys(self._member.gone(), "its connection is gone"), **ended}
+
+    def _miss(self, role: str, how: str) -> None:
+        """Keeps the place of a role that is gone, or marks it lost."""
+        if not self._places.keeps(role) or role in self.outcome.lost:
+            self._lose(role, how)
+            return
+        self.watchdog.progress[role].moved = monotonic()  # an empty place blocks nobody
+        if self._places.leave(role, how):
+            tick = max(self.watchdog.progress[role].tick, 0) / NS
+            self._tell(f"{role} left at {tick:.3f} s: {how}; its place is kept for {self._places.patience_s:.0f} s")
+            self._reports[role].hand_over()
+            self._say(RunControl.HANDOVER, role=role, reason=how)
+
+    def _tell(self, sentence: str) -> None:
+        log.warning("%s", sentence)
+        self.outcome.trouble.append(sentence)
 
     def _lose(self, role: str, how: str) -> None:
         """Marks a role lost at its last reported tick, and lets the others react."""

@@ -89,10 +89,12 @@ def run_distributed(
     patience: Patience | None = None,
     secure: SecureBus | None = None,
     own: Mapping[str, Path] | None = None,
+    handover_s: float = 0.0,
 ) -> RunResult:
     """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
 
-    `own` gives the file that plays a role in place of the compose file's command.
+    `own` gives the file that plays a role in place of the compose file's command. In a wall-clock run the place of a service that
+    goes is kept for `handover_s`.
 
     Raises ProcessListError when the compose file cannot be used, BusConfigError when the certificates cannot; later failures are
     in the result.
@@ -118,7 +120,7 @@ def run_distributed(
 
         try:
             tree = FrameTree(exam_input(scenario))
-            return conduct(session, roles, tell, died, realtime, wallclock, patience, begin, tree)
+            return conduct(session, roles, tell, died, realtime, wallclock, patience, begin, tree, handover_s)
         finally:
             close_session(session)
     finally:
@@ -135,6 +137,7 @@ def conduct(
     patience: Patience | None = None,
     begin: float | None = None,
     tree: FrameTree | None = None,
+    handover_s: float = 0.0,
 ) -> RunResult:
     """Conducts services that somebody else has started on the bus of `session`, to the end.
 
@@ -144,7 +147,8 @@ def conduct(
     begin = perf_counter() if begin is None else begin
     collector = Collector(tree=tree)
     domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
-    conductor = Conductor(session, contract(), domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock=wallclock)
+    rules = contract()
+    conductor = Conductor(session, rules, domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock, handover_s)
 
     def report(c: Conductor) -> None:
         wall = max(c.elapsed_s, 1e-9)
