@@ -11,6 +11,7 @@ import logging
 from time import monotonic_ns, perf_counter_ns, sleep, time_ns
 from typing import Any
 
+from palpate_bus.ages import Ages
 from palpate_bus.codec import CodecError
 from palpate_bus.contract import MS, Edge
 from palpate_bus.distributed import Link, RunAborted
@@ -44,7 +45,7 @@ class WallClockNode:
         self.undecodable = 0
         self.overruns = 0
         self.resyncs = 0
-        self._ages: dict[str, list[int]] = {name: [0, 0, 0] for name in self._data}
+        self._ages = {name: Ages() for name in self._data}
         self._end: int | None = None
         self._tick = NEVER
 
@@ -149,10 +150,7 @@ class WallClockNode:
                 if sample.sequence > last + 1 and not buffer.topic.open:
                     self.gaps += sample.sequence - last - 1
                 self._sequences[name] = sample.sequence
-                age = self._ages[name]
-                age[0] += 1
-                age[1] += now - sample.sent
-                age[2] = max(age[2], now - sample.sent)
+                self._ages[name].add(now - sample.sent)
                 received = Received(sample.payload, t - buffer.delay, sample.sequence)
                 try:
                     # Now, not when the service looks: broken bytes must not end a driver whose arm is in contact.
@@ -176,11 +174,7 @@ class WallClockNode:
             "undecodable": self.undecodable,
             "overruns": self.overruns,
             "resyncs": self.resyncs,
-            "age_ms": {
-                name: {"mean": round(total / count / 1e6, 3), "max": round(worst / 1e6, 3)}
-                for name, (count, total, worst) in self._ages.items()
-                if count
-            },
+            "age_ms": {name: ages.as_ms() for name, ages in self._ages.items() if ages.count},
             "facts": facts,
         }
         self._link.report(ServiceReport.FINISHED, self._tick, detail=detail)

@@ -337,7 +337,6 @@ class Conductor:
             self._say(RunControl.HANDOVER, role=role, reason=how)
 
     def _tell(self, sentence: str) -> None:
-        log.warning("%s", sentence)
         self.outcome.trouble.append(sentence)
 
     def _lose(self, role: str, how: str) -> None:
