@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,50 +16,67 @@ from rich.console import Console
 from palpate_conductor.swaps import read_report
 
 FAST = ("robot", "tissue", "control")
-LEGS = (("state to controller", "control", "joint_states"), ("command to robot", "robot", "control/joint_torque"),
-        ("state to tissue", "tissue", "sim/tool_state"), ("contact force to robot", "robot", "sim/contact_wrench"))  # fmt: skip
+LEGS = (("state to controller", "control", "joint_states"), ("command to robot", "robot", "control/joint_torque"))
 """Ways of a message: what it is, who looks at it, topic."""
+PARTS = ("p50", "p99", "max")
+BEGIN, END = "<!-- palpate wallclock: begin -->\n", "<!-- palpate wallclock: end -->\n"
 
 
-def _run(scenario: str, settings: list[str], folder: Path, *options: str) -> dict[str, Any]:
+def _run(scenario: str, settings: list[str], folder: Path, rate: int, *options: str) -> dict[str, Any]:
+    """The report of a run with the controller at `rate` [Hz]. Raises RuntimeError when it did not complete."""
     words = [word for setting in settings for word in ("--set", setting)]
     command = [sys.executable, "-m", "palpate_conductor", "run", scenario, "--quiet", "--no-record", "--out", str(folder)]
-    done = subprocess.run([*command, *options, *words], capture_output=True, text=True, check=False)
+    environment = {**os.environ, "PALPATE_PERIODS": f"control={1000 // rate}"}
+    done = subprocess.run([*command, *options, *words], capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
-        raise RuntimeError(f"{' '.join(options)}: status {done.returncode}\n{done.stderr}")
-    return read_report(folder)
+        raise RuntimeError(f"{rate} Hz {' '.join(options)}: status {done.returncode}\n{done.stderr}")
+    report = read_report(folder)
+    planning = report["services"]["planning"]["facts"]
+    if planning["phase"] != "DONE":
+        raise RuntimeError(f"{rate} Hz {' '.join(options)}: {planning['message']} (load {os.getloadavg()[0]:.1f})")
+    return report
 
 
 def _row(*cells: object) -> str:
     return f"| {' | '.join(str(cell) for cell in cells)} |\n"
 
 
-def latencies(report: dict[str, Any]) -> str:
-    """A Markdown table of how old messages were when they were looked at, transport and the reader's own tick included."""
-    text = _row("way", "p50 [ms]", "p99 [ms]", "largest [ms]") + _row(*["---"] * 4)
-    sums = [0.0, 0.0, 0.0]
-    for what, role, topic in LEGS:
-        age = report["services"][role]["age_ms"][topic]
-        figures = [age["p50"], age["p99"], age["max"]]
-        text += _row(what, *(f"{value:.2f}" for value in figures))
-        if topic in ("joint_states", "control/joint_torque"):
-            sums = [total + value for total, value in zip(sums, figures, strict=True)]
-    computing = report["blame"]["control"]["compute"] / 1e3
-    sums = [total + computing for total in sums]
-    return text + _row("state to command acted on (both, and the controller's mean step)", *(f"{value:.2f}" for value in sums))
+def latencies(reports: Mapping[int, dict[str, Any]]) -> str:
+    """A Markdown table, one row a rate [Hz]: from a state to the command that acts, and how much of that is which way.
 
-
-def ticks(report: dict[str, Any]) -> str:
-    """A Markdown table of ticks that came late in the fast loop."""
-    text = _row("role", "ticks", "late by more than a period", "clock set anew", "mean step [ms]") + _row(*["---"] * 5)
-    for role in FAST:
-        counters, blame = report["services"][role], report["blame"][role]
-        late = f"{counters['overruns']} ({100 * counters['overruns'] / max(blame['steps'], 1):.2f} %)"
-        text += _row(role, blame["steps"], late, counters["resyncs"], f"{blame['compute'] / 1e3:.2f}")
+    A way is a message's age when its reader takes it up: transport, and waiting for the reader's next tick.
+    """
+    text = _row("control rate", *(f"{what}: p50, p99, largest [ms]" for what, _, _ in LEGS), "mean step of control [ms]",
+                "state to command acted on: p50, p99, largest at most [ms]")  # fmt: skip
+    text += _row(*["---"] * 5)
+    for rate, report in reports.items():
+        ways = [[report["services"][role]["age_ms"][topic][part] for part in PARTS] for _, role, topic in LEGS]
+        computing = report["blame"]["control"]["compute"] / 1e3
+        sums = [sum(part) + computing for part in zip(*ways, strict=True)]
+        text += _row(f"{rate} Hz", *map(_three, ways), f"{computing:.2f}", _three(sums))
     return text
 
 
-def comparison(reports: dict[str, dict[str, Any]]) -> str:
+def _three(figures: Sequence[float]) -> str:
+    return ", ".join(f"{value:.2f}" for value in figures)
+
+
+def ticks(reports: Mapping[int, dict[str, Any]]) -> str:
+    """A Markdown table of ticks that came late by more than a period in the fast loop, one row a rate [Hz]."""
+    text = _row("control rate", *(f"{role}: late ticks, clock set anew" for role in FAST)) + _row(*["---"] * (1 + len(FAST)))
+    for rate, report in reports.items():
+        cells = []
+        for role in FAST:
+            counters, steps = report["services"][role], report["blame"][role]["steps"]
+            late = counters["overruns"]
+            cells.append(f"{late} of {steps} ({100 * late / max(steps, 1):.2f} %), {counters['resyncs']}")
+                f"{counters['overruns']} of {steps} ({100 * counters['overruns'] / max(steps, 1):.2f} %), {counters['resyncs']}"
+            )
+        text += _row(f"{rate} Hz", *cells)
+    return text
+
+
+def comparison(reports: Mapping[str, dict[str, Any]]) -> str:
     """A Markdown table of what was found, and how hard and how deep it pressed, one row a runtime."""
     text = _row("runtime", "found, missed, false", "centre off [mm]", "Dice", "stiffness", "largest force [N]",
                 "depth RMS [mm]", "exam [s]", "wall [s]")  # fmt: skip
@@ -81,26 +99,37 @@ def comparison(reports: dict[str, dict[str, Any]]) -> str:
 
 def wallclock(
     scenario: Annotated[str, typer.Argument(help="The examination.")] = "rlq_guarding",
+    rate: Annotated[list[int] | None, typer.Option(help="Of the controller [Hz]; may be repeated. 200, 500 and 1000.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the two runs; by default they are thrown away.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the runs; by default they are thrown away.")] = None,
+    doc: Annotated[Path | None, typer.Option(help="A Markdown file whose marked tables are replaced.")] = None,
 ) -> None:
-    """Measure an examination in real time: ages of states and commands, late ticks, and its findings beside those in lockstep."""
+    """Measure an examination in real time: age of states and commands, late ticks, and its findings beside lockstep's."""
     console = Console(stderr=True)
+    rates = rate or [200, 500, 1000]
+    if wrong := [value for value in rates if value < 1 or 1000 % value]:
+        raise typer.BadParameter(f"--rate {wrong[0]}: a period must be a whole number of milliseconds")
+    real, found = {}, {}
+    load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory(prefix="palpate-wallclock-") as scratch:
         folder = out or Path(scratch)
-        before = os.getloadavg()[0]
         try:
-            console.print("in real time")
-            real = _run(scenario, settings or [], folder / "wallclock", "--wallclock")
-            console.print("in lockstep")
-            lockstep = _run(scenario, settings or [], folder / "lockstep", "--composed")
+            for value in rates:
+                console.print(f"{value} Hz, in real time")
+                real[value] = _run(scenario, settings or [], folder / f"wallclock_{value}", value, "--wallclock")
+                found[f"wall clock, {value} Hz"] = real[value]
+            for value in rates:
+                console.print(f"{value} Hz, in lockstep")
+                found[f"lockstep, {value} Hz"] = _run(scenario, settings or [], folder / f"lockstep_{value}", value, "--composed")
         except RuntimeError as error:
             console.print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
             raise typer.Exit(3) from error
-    machine = real["platform"]
-    typer.echo(f"{machine['cpu']}, {machine['cores']} cores, load before the run {before:.1f}\n")
-    typer.echo(latencies(real))
-    typer.echo(ticks(real))
-    typer.echo(comparison({"wall clock": real, "lockstep": lockstep}))
+    machine = real[rates[0]]["platform"]
+    text = f"{machine['cpu']}, {machine['cores']} cores, load before the first run {load:.1f}\n\n"
+    text += "\n".join((latencies(real), ticks(real), comparison(found)))
+    typer.echo(text)
+    if doc is not None:
+        before, _, rest = doc.read_text(encoding="utf-8").partition(BEGIN)
+        doc.write_text(f"{before}{BEGIN}{text}{END}{rest.partition(END)[2]}", encoding="utf-8")
