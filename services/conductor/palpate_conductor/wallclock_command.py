@@ -70,8 +70,6 @@ def ticks(reports: Mapping[int, dict[str, Any]]) -> str:
             counters, steps = report["services"][role], report["blame"][role]["steps"]
             late = counters["overruns"]
             cells.append(f"{late} of {steps} ({100 * late / max(steps, 1):.2f} %), {counters['resyncs']}")
-                f"{counters['overruns']} of {steps} ({100 * counters['overruns'] / max(steps, 1):.2f} %), {counters['resyncs']}"
-            )
         text += _row(f"{rate} Hz", *cells)
     return text
 
