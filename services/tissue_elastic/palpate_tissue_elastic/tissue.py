@@ -172,7 +172,7 @@ class ElasticTissue:
             positions=positions[keep],
             normals=normals[keep],
             breathing=self._breathing[index],
-            compliance=self.compliance.matrix[index][:, index].astype(np.float64),
+            compliance=self.compliance.matrix[np.ix_(index, index)].astype(np.float64),
             feed=float(self._feed[0]),
             state=self._state[:, index].copy(),
         )

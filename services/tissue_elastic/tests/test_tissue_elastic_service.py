@@ -49,7 +49,7 @@ def tool_state(t, p, radius=0.015):
 
 def test_the_scenario_chooses_it_for_process_and_composition():
     scenario = load_scenario("deep_lesion")
-    assert scenario.phantom.lesions[0].depth_m == 0.010
+    assert scenario.phantom.lesions[0].depth_m == 0.008
     assert chosen_services(scenario)["tissue"].load() is create
     processes = {"tissue": ServiceProcess("tissue", ("python", "-m", "palpate_tissue"), {})}
     assert chosen_processes(scenario, processes)["tissue"].command == ("python", "-m", "palpate_tissue_elastic")
