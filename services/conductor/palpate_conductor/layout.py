@@ -1,0 +1,24 @@
+"""Services of one run at the same virtual addresses: a third more speed in lockstep on two cores.
+
+Seven Python processes take turns on a core every few hundred microseconds. With address-space randomisation each has the same
+interpreter and libraries at other addresses, so none finds the branch predictor as the one before it left it. Measured in
+alternating runs: real-time factor 1.66 and 1.68 without randomisation, 1.28 and 1.25 with it. It is left on in secure mode.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+_ADDR_NO_RANDOMIZE = 0x0040000
+_QUERY = 0xFFFFFFFF
+
+
+def share_addresses() -> bool:
+    """Starts this process's future children without address-space randomisation; whether the system lets it (personality(2))."""
+    if not sys.platform.startswith("linux"):
+        return False
+    personality = ctypes.CDLL(None).personality
+    personality.argtypes, personality.restype = (ctypes.c_ulong,), ctypes.c_int
+    current = personality(_QUERY)
+    return current >= 0 and personality(current | _ADDR_NO_RANDOMIZE) >= 0
