@@ -21,4 +21,4 @@ def share_addresses() -> bool:
     personality = ctypes.CDLL(None).personality
     personality.argtypes, personality.restype = (ctypes.c_ulong,), ctypes.c_int
     current = personality(_QUERY)
-    return current >= 0 and personality(current | _ADDR_NO_RANDOMIZE) >= 0
+    return bool(current >= 0 and personality(current | _ADDR_NO_RANDOMIZE) >= 0)
