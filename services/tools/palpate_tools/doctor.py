@@ -11,7 +11,9 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
+import zenoh
 from palpate_bus.contract import Contract
+from palpate_bus.guard import denials
 from palpate_bus.live import LiveMonitor
 from palpate_bus.liveliness import mismatches
 from palpate_bus.monitor import TopicHealth, Violation
@@ -94,6 +96,7 @@ def diagnose(bus: Joined, rules: Contract, live: LiveMonitor) -> Diagnosis:
     found = list(live.graph.alive.values())
     findings = [
         *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(rules, live), *_waiting(live),
+        *turned_away(bus.session),
     ]  # fmt: skip
     differing = mismatches(found)
     findings += [Finding("types", Level.BAD, sentence) for sentence in differing]
@@ -131,6 +134,16 @@ def _endpoints(bus: Joined, live: LiveMonitor) -> list[Finding]:
     findings.append(Finding("endpoints", Level.WARN if deaf else Level.OK, text))
     findings += [Finding("endpoints", Level.WARN, f"{role} does not answer at {run.endpoints[role]}") for role in deaf]
     return findings
+
+
+def turned_away(session: zenoh.Session) -> list[Finding]:
+    """Whom a secure router denied something, one finding an attempt's kind; nothing where no router tells."""
+    attempts = denials(session)
+    if attempts is None:
+        return []
+    if not attempts:
+        return [Finding("access", Level.OK, "the router turned nobody away")]
+    return [Finding("access", Level.BAD, denial.sentence) for denial in attempts]
 
 
 def _shared_memory(bus: Joined) -> list[Finding]:
