@@ -130,7 +130,12 @@ def test_doctor_finds_what_is_wrong(robot: SmallRobot) -> None:
 
 def test_ctrl_c_ends_a_tool_with_status_0_and_whole_lines(robot: SmallRobot) -> None:
     words = [sys.executable, "-c", "from palpate_tools.topic import app; app()", "echo", "joint_states", "--json"]
-    tool = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    # A shell lets what it starts in the background ignore SIGINT, and that is inherited.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        tool = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert tool.stdout is not None
     first = tool.stdout.readline()
     tool.send_signal(signal.SIGINT)
