@@ -61,10 +61,6 @@ LOCKSTEP_DROP_WAIT_US = 1_000_000
 WALL_CLOCK_DROP_WAIT_US = 1_000
 
 
-RUNTIME = "(rx: (worker_threads: 1))"
-"""zenoh's own thread pools. Its two receiving threads wake each other for every message, which costs a fifth of a round trip."""
-
-
 class BusConfigError(ValueError):
     """A bus configuration that cannot work. Names the variable or field, its value and what is allowed."""
 
@@ -249,7 +245,6 @@ def open_session(options: BusOptions | None = None) -> zenoh.Session:
     Raises BusConfigError if a session cannot be opened, for instance because an endpoint is in use.
     """
     options = options or BusOptions.from_env()
-    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)  # read once, by the first session of a process
     try:
         opened = zenoh.open(zenoh_config(options))
     except zenoh.ZError as error:
