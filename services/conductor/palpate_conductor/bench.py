@@ -1,4 +1,4 @@
-"""`palpate bench`: what the bus, the parts and whole runs cost, as a table and as bench.json.
+"""`palpate bench`: what the parts (the bus is one) and whole runs cost, as a table and as bench.json.
 
 Machines differ and are noisy, so what counts are ratios within one call: simulated over wall time, our bus over raw zenoh, the
 parts of a tick.
@@ -14,7 +14,6 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from palpate_bus.bench import measure as measure_bus
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
 from rich.console import Console
@@ -41,7 +40,7 @@ def _load(point: EntryPoint) -> Callable[[], dict[str, float]]:
     return loaded
 
 
-GROUPS = ("bus", "parts", "runs")
+GROUPS = ("parts", "runs")
 """What `measure` can measure."""
 
 
@@ -50,11 +49,7 @@ Save = Callable[[dict[str, Any]], None]
 
 def measure(scenario: Scenario, console: Console, groups: Sequence[str], save: Save) -> dict[str, Any]:
     """The figures of some of `GROUPS`, by name. `save` gets what there is after each: an interrupted call leaves its part."""
-    figures: dict[str, Any] = {"platform": fingerprint(), "bus": {}, "parts": {}, "runs": {}}
-    if "bus" in groups:
-        with console.status("bus round trip against raw zenoh"):
-            figures["bus"] = measure_bus()
-        save(figures)
+    figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
     for point in sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name) if "parts" in groups else ():
         with console.status(f"{point.name}: cost of a step"):
             figures["parts"][point.name] = _load(point)()
@@ -99,8 +94,8 @@ def tables(figures: dict[str, Any]) -> list[Table]:
             if row:
                 most = next(iter(row["waited_for"]), "")
                 blame.add_row(name, role, *(f"{row[column]:.0f}" for column in columns), most)
-    small = Table("what", "figure", "value", title="Bus and parts", title_justify="left")
-    for group, values in (("bus", figures["bus"]), *figures["parts"].items()):
+    small = Table("what", "figure", "value", title="Parts", title_justify="left")
+    for group, values in figures["parts"].items():
         for figure, value in values.items():
             small.add_row(group, figure, f"{value:.4g}" if isinstance(value, int | float) else str(value))
     return [table for table in (runs, blame, small) if table.row_count]

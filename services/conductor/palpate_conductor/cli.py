@@ -242,7 +242,7 @@ def bench(
     out: Annotated[Path, typer.Option(help="File for the figures.")] = Path("bench.json"),
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
 ) -> None:
-    """Measure the bus, the parts of a tick and whole runs; print tables and write bench.json."""
+    """Measure the parts, the bus among them, and whole runs; print tables and write bench.json."""
     for group in only or ():
         if group not in GROUPS:
             raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
