@@ -26,14 +26,14 @@ def least_twist(z_W: Array, R_ref: Array) -> Array:
     any path and comes back to itself round a loop. Opposite to z_ref it is not defined; there it turns about R_ref's x.
     """
     z = z_W / np.linalg.norm(z_W, axis=-1, keepdims=True)
-    x_ref, y_ref, z_ref = R_ref.T
+    x_ref, _, z_ref = R_ref.T
     c = z @ z_ref
     flipped = c < -1.0 + 1e-9
     along = (z + z_ref) / np.where(flipped, 1.0, 1.0 + c)[..., None]  # v turned: v - along (z.v), for v across z_ref
-    x = x_ref - along * (z @ x_ref)[..., None]
-    y = y_ref - along * (z @ y_ref)[..., None]
-    x, y = np.where(flipped[..., None], x_ref, x), np.where(flipped[..., None], -y_ref, y)
-    return np.stack((x, y, z), axis=-1)
+    x = np.where(flipped[..., None], x_ref, x_ref - along * (z @ x_ref)[..., None])
+    x = x - z * np.sum(x * z, axis=-1, keepdims=True)  # near the opposite 1 + c has lost digits: across z all the same
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack((x, np.cross(z, x), z), axis=-1)
 
 
 def frame(x_near: Array, z: Array) -> Array:
