@@ -17,5 +17,5 @@ for folder in sys.argv[1:]:
         name, extras = re.fullmatch(r"([\w.-]+)(?:\[([\w, -]+)\])?.*", requirement).groups()
         if not name.startswith("palpate-"):
             print(requirement)
-        for extra in (extras or "").split(",") if name in BY_NAME else ():
-            print("\n".join(BY_NAME[name]["optional-dependencies"].get(extra.strip(), ())))
+        for extra in extras.split(",") if extras and name in BY_NAME else ():
+            print("\n".join(BY_NAME[name]["optional-dependencies"][extra.strip()]))

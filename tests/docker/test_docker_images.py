@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,20 @@ def test_an_image_is_pinned_and_runs_as_no_root(dockerfile: Path) -> None:
     for line in text.splitlines():
         if "pip install" in line and "--no-index" not in line and not line.endswith("hatchling"):
             assert "-c constraints.txt" in line, line
+
+
+@pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.parent.name)
+def test_what_an_image_installs_can_be_named(dockerfile: Path, tmp_path: Path) -> None:
+    """With the files that the Dockerfile copies, and no others, as in the image."""
+    lines = dockerfile.read_text(encoding="utf-8").splitlines()
+    for name in {word for line in lines if line.startswith("COPY") for word in line.split() if word.endswith("pyproject.toml")}:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    for folders in [line.split(" >")[0].split()[3:] for line in lines if "third_party.py" in line]:
+        words = [sys.executable, str(ROOT / "bus/docker/third_party.py"), *folders]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "palpate-" not in done.stdout
 
 
 def test_every_role_has_a_service_an_image_and_shared_memory_by_override() -> None:
