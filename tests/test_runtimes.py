@@ -11,17 +11,26 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
+from palpate_bus import codec
 from palpate_bus.composed import Composed
 from palpate_bus.contract import contract
 from palpate_bus.liveliness import NodeTokens
+from palpate_bus.messages import DiagnosticStatus
 from palpate_bus.stamps import NS
+from palpate_bus.transport import Subscription
 from palpate_bus.wire import topic_key
 from palpate_bus.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor, Outcome, Patience, RunFailed
+from palpate_dashboard.replay import draw
+from palpate_dashboard.service import DashboardService
+from palpate_dashboard.sinks import Live
+from palpate_models.scenario import Scenario
+from rerun.chunk import RrdReader
 
 TOYS = Path(__file__).parents[1] / "bus" / "tests" / "toy_services.py"
 sys.path.insert(0, str(TOYS.parent))
@@ -165,6 +174,43 @@ def test_garbage_and_strangers_are_counted_and_change_nothing() -> None:
     assert outcome.run_hash == composed_hash()
     assert sum(report["garbage"] for report in outcome.reports.values()) >= 2
     assert sum(report["foreign"] for report in outcome.reports.values()) >= 1
+
+
+def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -> None:
+    topic = contract().topics["diagnostics"]
+    ears: list[Subscription] = []
+    heard: list[tuple[int, bytes]] = []
+
+    def listen(running: Running) -> None:
+        if not ears:
+            ears.append(Subscription(running.session, topic_key(topic, 0)))
+        while (sample := ears[0].get(0)) is not None:
+            heard.append((sample.sequence, sample.payload))
+
+    fault = {"PALPATE_FAULT": "robot/status:nan", "PALPATE_FAULT_AT": "1", "PALPATE_FAULT_COUNT": "0", "TOY_END_S": "8"}
+    outcome = run_toys(listen, fault)
+    assert outcome.failure is None
+    statuses = {status.name: status for status in codec.decode(heard[-1][1], topic.type).status}
+    for name in ("palpate/topic/robot/status", "palpate/robot"):
+        assert statuses[name].level == DiagnosticStatus.ERROR
+        assert "robot/status" in statuses[name].message
+        assert "from robot: not finite" in statuses[name].message
+        assert statuses[name].hardware_id == "robot"
+    assert statuses["palpate/topic/supervisor/state"].level == DiagnosticStatus.OK
+
+    dashboard = DashboardService(Scenario(), tmp_path / "drawn.rrd", Live())
+    draw(((sequence * NS, topic.name, payload) for sequence, payload in heard), dashboard)
+    dashboard.finish()
+    drawn: dict[str, list[Any]] = {}
+    for chunk in RrdReader(tmp_path / "drawn.rrd").stream():
+        if not chunk.is_static:
+            for name, column in chunk.to_record_batch().to_pydict().items():
+                if ":" in name:
+                    drawn.setdefault(chunk.entity_path, []).extend(column)
+    assert ["ERROR"] in drawn["/health/topics/robot/status"]
+    assert ["ERROR"] in drawn["/health/services/robot"]
+    assert any("from robot: not finite" in str(text) for text in drawn["/log/health/topics/robot/status"])
+    assert "| robot/status | ERROR |" in str(drawn["/text/services"][-1])
 
 
 def test_a_service_that_never_comes_is_named() -> None:

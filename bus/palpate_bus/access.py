@@ -26,6 +26,8 @@ VIEWER = "viewer"
 """A member who may read every public topic and send nothing: a guest's RViz or Foxglove, or `palpate doctor`."""
 OPERATOR = "operator"
 """A viewer who may also stop and release: `palpate stop` asks the conductor, who alone passes it on."""
+WATCHER = "conductor"
+"""The role that watches over the contract in a run: it hears every public topic, as a viewer does."""
 ROUTER = "router"
 """The router's own certificate; it may tell whom it turned away, and nothing else."""
 DENIALS = "palpate/denials"
@@ -81,7 +83,8 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
         made.allow(role, "sends", sends, True, data)
         made.allow(role, "gets", gets, False, data)
         made.allow(role, "lives", _tokens(role), True, presence)
-    public = [topic.name for topic in rules.topics.values() if topic.visibility is Visibility.PUBLIC]
+    public = _public(rules)
+    made.allow(WATCHER, "watches", [key for name in public for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
         made.allow(guest, "gets", [key for name in (*public, *_VIEWED) for key in _keys(name)], False, data)
     made.allow("conductor", "serves", [OPERATOR_DESK], True, data)
@@ -97,6 +100,17 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
         "subjects": [{"id": member, by: [member]} for member in made.policies],
         "policies": [{"rules": names, "subjects": [member]} for member, names in made.policies.items()],
     }
+
+
+def watched(rules: Contract) -> list[str]:
+    """Topics that the contract's monitor of a run may hear, in the contract's order."""
+    own = {topic.name for topic, _ in rules.inputs(WATCHER)}
+    public = set(_public(rules))
+    return [name for name in rules.topics if name in own or name in public]
+
+
+def _public(rules: Contract) -> list[str]:
+    return [topic.name for topic in rules.topics.values() if topic.visibility is Visibility.PUBLIC]
 
 
 def _keys(topic: str) -> list[str]:

@@ -22,9 +22,10 @@ import zenoh
 
 from palpate_bus import codec
 from palpate_bus.contract import Contract, Topic
+from palpate_bus.health import Violation
 from palpate_bus.liveliness import GraphWatch
 from palpate_bus.messages import RunControl, ServiceReport
-from palpate_bus.monitor import Monitor, Violation
+from palpate_bus.monitor import Monitor
 from palpate_bus.transport import HELLO
 from palpate_bus.wire import WireError, any_type_key, message_key, parse_key, unpack
 
@@ -47,7 +48,7 @@ class RoleReport:
 
 
 class LiveMonitor:
-    """A `Monitor` with ears. `topics` limits it to some; by default it hears all."""
+    """A `Monitor` with ears. `topics` limits it to some; by default it hears all. See `listen`."""
 
     def __init__(
         self, session: zenoh.Session, rules: Contract, domain: int, topics: Iterable[str] | None = None, wallclock: bool = False
@@ -57,8 +58,9 @@ class LiveMonitor:
         self.reports: dict[str, RoleReport] = {}
         self.offsets: dict[str, float] = {}
         """Smallest age [ms] of a message by topic: negative when the sender's clock is ahead of ours."""
-        chosen = rules.topics if topics is None else topics
-        self._ears = [_Ear(session, rules.topics[name], domain) for name in chosen]
+        self._session, self._domain = session, domain
+        self._ears: dict[str, _Ear] = {}
+        self.listen(rules.topics if topics is None else topics)
         report, control = "palpation_msgs/msg/ServiceReport", "palpation_msgs/msg/RunControl"
         self._reports: Any = session.declare_subscriber(
             message_key("palpate/report/*", report, domain), zenoh.handlers.FifoChannel(ROOM)
@@ -68,6 +70,15 @@ class LiveMonitor:
         )
         self._decode_report, self._decode_control = codec.decoder(report), codec.decoder(control)
 
+    def listen(self, topics: Iterable[str]) -> None:
+        """Listens to `topics` and no others from now on."""
+        chosen = set(topics)
+        for name in self._ears.keys() - chosen:
+            self._ears.pop(name).close()
+        for name in chosen - self._ears.keys():
+            self._ears[name] = _Ear(self._session, self.monitor.rules.topics[name], self._domain)
+        self.monitor.listen(chosen, monotonic())
+
     def poll(self) -> list[Violation]:
         """Takes in what has come, judges, and returns what is newly wrong."""
         now = monotonic()
@@ -75,7 +86,7 @@ class LiveMonitor:
         self.monitor.see(self.graph.alive.values(), now)
         self._hear_control()
         self._hear_reports(now)
-        for ear in self._ears:
+        for ear in self._ears.values():
             for sent, sequence, gid, payload in ear.drain(self.monitor, now):
                 self.monitor.hear(ear.topic.name, sent, sequence, gid, payload, now)
                 age = (time_ns() - sent) / 1e6
@@ -85,7 +96,7 @@ class LiveMonitor:
     def close(self) -> None:
         """Stops listening."""
         self.graph.close()
-        for ear in self._ears:
+        for ear in self._ears.values():
             ear.close()
         self._reports.undeclare()
         self._control.undeclare()

@@ -14,10 +14,12 @@ from palpate_bus import codec
 from palpate_bus.checker import Checker, Kind
 from palpate_bus.conformance import violations
 from palpate_bus.contract import MS, contract
+from palpate_bus.diagnostics import RECENT_S, diagnostics
+from palpate_bus.health import Violation
 from palpate_bus.liveliness import Endpoint, Entity, qos_token
 from palpate_bus.liveliness import Kind as EntityKind
 from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueCommand, Vector3, Wrench, WrenchStamped
-from palpate_bus.monitor import Monitor, Violation, diagnostics
+from palpate_bus.monitor import Monitor
 from palpate_bus.stamps import duration_message, header
 from palpate_bus.strategies import messages
 
@@ -41,7 +43,7 @@ def wrench(t: int) -> Any:
 
 
 def torque(t: int) -> Any:
-    return JointTorqueCommand(header(t), np.zeros(7), duration_message(50 * MS))
+    return JointTorqueCommand(header(t), np.zeros(7), duration_message(50 * MS), "")
 
 
 MAKE = {"joint_states": joint_state, "ft/wrench": wrench, "control/joint_torque": torque}
@@ -70,7 +72,8 @@ class Bus:
                 for item in sent if isinstance(sent, list) else [sent] if sent is not None else []:
                     self.sequences[name] += 1
                     payload = item if isinstance(item, bytes) else codec.encode(item, RULES.topics[name].type)
-                    self.monitor.hear(name, round(wall * 1e9), self.sequences[name], self.entities[i].gid, payload, wall)
+                    if name in self.monitor.listening:
+                        self.monitor.hear(name, round(wall * 1e9), self.sequences[name], self.entities[i].gid, payload, wall)
             self.tick += 1
             if self.tick % LOOK_MS == 0:
                 self.monitor.see(self.entities, wall)
@@ -227,13 +230,31 @@ def test_diagnostics_say_it_to_ros_tools() -> None:
     bus.run(1000)
     bus.run(1, spoiled("joint_states", set_nan))
     bus.run(LOOK_MS)
-    array = diagnostics(bus.monitor.health(), bus.monitor.active.values(), 7)
+    now = bus.factor * bus.tick / 1000
+    array = diagnostics(bus.monitor.health(), bus.monitor.active.values(), 7, now)
     by_name = {status.name: status for status in array.status}
     bad, good = by_name["palpate/topic/joint_states"], by_name["palpate/topic/ft/wrench"]
     assert bad.level == DiagnosticStatus.ERROR
     assert "nan" in bad.message
+    assert bad.hardware_id == "robot"
     assert good.level == DiagnosticStatus.OK
+    assert by_name["palpate/topic/exam/state"].level == DiagnosticStatus.STALE
+    later = diagnostics(bus.monitor.health(), bus.monitor.active.values(), 7, now + RECENT_S + 1)
+    over = next(status for status in later.status if status.name == bad.name)
+    assert over.level == DiagnosticStatus.WARN
+    assert "was" in over.message
     codec.decode(codec.encode(array, "diagnostic_msgs/msg/DiagnosticArray"), "diagnostic_msgs/msg/DiagnosticArray")
+
+
+def test_a_topic_that_is_listened_to_now_and_then_is_no_gap_and_no_silence() -> None:
+    bus = Bus(factor=1.0)
+    for listens in (True, False, True, False):
+        bus.monitor.listen(MAKE if listens else MAKE.keys() - {"ft/wrench"}, bus.tick / 1000)
+        bus.run(1500)
+        wrench = next(row for row in bus.monitor.health() if row.topic.name == "ft/wrench")
+        assert wrench.alive
+        assert wrench.bus_rate_hz == pytest.approx(1000, rel=0.05)
+    assert bus.named == {}
 
 
 @pytest.mark.parametrize("name", ["ft/wrench", "sim/link_poses", "planning/setpoint", "sim/surface", "robot/status"])

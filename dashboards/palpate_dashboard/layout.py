@@ -93,6 +93,7 @@ def blueprint(
         rrb.Tabs(
             rrb.TextDocumentView(name="Status", origin="/text/status"),
             rrb.TextDocumentView(name="Services", origin="/text/services"),
+            rrb.StateTimelineView(name="Health", origin="/health"),
             rrb.TextLogView(name="Log", origin="/log"),
             rrb.TextDocumentView(name="Legend", origin="/text/legend"),
         ),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from palpate_bus.contract import contract
 
 from palpate_dashboard.columns import TIMELINE, Columns, scalars
+from palpate_dashboard.words import LEVELS, Health
 
 PHASES: Final = (
     ("home", (120, 130, 145)),
@@ -31,6 +32,10 @@ PHASES: Final = (
 
 MODES: Final = (("idle", (120, 130, 145)), ("active", (70, 190, 90)), ("safe hold", (220, 40, 40)))
 """Driver modes by number (RobotStatus.MODE_*)."""
+
+LEVEL_COLORS: Final = ((70, 190, 90), (240, 200, 60), (220, 40, 40), (120, 130, 145))
+"""Of `words.LEVELS`."""
+_LOG_LEVELS: Final = {"warning": "WARN", "ERROR": "ERROR"}
 
 JOINT_COLORS: Final = (
     (230, 80, 80),
@@ -74,6 +79,7 @@ class Plots:
         for path, states in (("state/phase", PHASES), ("state/driver", MODES)):
             shown = rr.StateConfiguration(values=[name for name, _ in states], colors=[color for _, color in states])
             recording.log(path, shown, static=True)
+        self._health_lines: set[str] = set()
 
     def _series(self, path: str, series: Sequence[Series], width: float = 1.5) -> None:
         names = [name for name, _ in series]
@@ -123,6 +129,17 @@ class Plots:
         self._at(t)
         self._recording.log(path, rr.StateChange(state=name))
         return True
+
+    def health(self, t: int, row: Health) -> None:
+        """The line of a service or topic, coloured by its level, and in the log what is wrong with it."""
+        path = f"health/{'topics' if row.is_topic else 'services'}/{row.name}"
+        if path not in self._health_lines:
+            self._health_lines.add(path)
+            shown = rr.StateConfiguration(values=list(LEVELS), colors=list(LEVEL_COLORS))
+            self._recording.log(path, shown, static=True)
+        self.state(t, path, row.word)
+        if row.word in _LOG_LEVELS:
+            self.say(t, f"log/{path}", row.message, _LOG_LEVELS[row.word])
 
     def say(self, t: int, path: str, text: str, level: str = "INFO") -> None:
         """A line of the log, written when it differs from the one before on this path."""

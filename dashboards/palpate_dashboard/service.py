@@ -302,12 +302,10 @@ class DashboardService(Service):
             self._plots.say(t, "log/findings", "; ".join(lines) or "no stiff area found", "WARN" if lines else "INFO")
 
     def _diagnostics(self, t: int, message: Message) -> None:
-        rows = []
-        for status in message.status:
-            level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
-            values = [(item.key, item.value) for item in status.values]
-            rows.append((status.name, level, status.message, values))
-            self._count_wait(dict(values).get("waiting_for", ""))
+        rows = [words.Health.of(status) for status in message.status]
+        for row in rows:
+            self._count_wait(row.values.get("waiting_for", ""))
+            self._plots.health(t, row)
         share = self._waits / max(1.0, self._waits.sum())
         self._plots.blame(t, share)
         self._plots.document(t, "text/services", words.services(rows, zip(plots.BLAMED, share, strict=True)))

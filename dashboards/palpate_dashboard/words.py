@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from palpate_bus.codec import Message
 
 LEVELS = ("ok", "warning", "ERROR", "stale")
 """diagnostic_msgs/DiagnosticStatus levels."""
+SEVERITY = {"ok": 0, "stale": 1, "warning": 2, "ERROR": 3}
+"""Of each of them: the worst is shown first."""
 
 LEGEND = """
 | in the scene | |
@@ -25,6 +30,7 @@ LEGEND = """
 | uncertainty | half width of the 90 % band over the mean |
 | force over depth | red: the last second; blue: all before; grey line: wanted depth |
 | joint torque | applied, gravity excluded, in percent of each joint's limit |
+| health | a line each for every service, and for every topic as the contract's monitor sees it; why is in the log |
 | blame | of the waits seen since the start of the run, the part that each service was waited for |
 | time | simulated |
 """
@@ -51,18 +57,47 @@ def status(
     ))  # fmt: skip
 
 
-def services(rows: Iterable[tuple[str, int, str, Sequence[tuple[str, str]]]], blame: Iterable[tuple[str, float]] = ()) -> str:
-    """Health of every service: name, level, message, and further values by key; then who was waited for, as parts [1]."""
+@dataclass(frozen=True)
+class Health:
+    """One line of `diagnostics`: a service, or a topic as the contract's monitor sees it."""
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, str]
+    is_topic: bool = False
+
+    @classmethod
+    def of(cls, status: Message) -> Health:
+        """From a diagnostic_msgs/DiagnosticStatus."""
+        level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
+        values = {item.key: item.value for item in status.values}
+        name = status.name.removeprefix("palpate/")
+        return cls(name.removeprefix("topic/"), level, status.message, values, name.startswith("topic/"))
+
+    @property
+    def word(self) -> str:
+        """The level in a word."""
+        return LEVELS[self.level] if 0 <= self.level < len(LEVELS) else str(self.level)
+
+
+def services(rows: Sequence[Health], blame: Iterable[tuple[str, float]] = ()) -> str:
+    """Health of every service, then who was waited for, as parts [1], then every topic against its contract, the worst first."""
     lines = ["| service | state | | at | silent for |", "|---|---|---|---|---|"]
-    for name, level, message, values in rows:
-        word = LEVELS[level] if 0 <= level < len(LEVELS) else str(level)
-        known = dict(values)
-        tick = f"{known['tick_s']} s" if "tick_s" in known else ""
-        age = f"{known['report_age_s']} s" if "report_age_s" in known else ""
-        lines.append(f"| {name.removeprefix('palpate/')} | {word} | {message} | {tick} | {age} |")
+    for row in rows:
+        if not row.is_topic:
+            tick = f"{row.values['tick_s']} s" if "tick_s" in row.values else ""
+            age = f"{row.values['report_age_s']} s" if "report_age_s" in row.values else ""
+            lines.append(f"| {row.name} | {row.word} | {row.message} | {tick} | {age} |")
     waited = [f"{role} {100 * share:.0f} %" for role, share in blame if share > 0]
     if waited:
         lines += ["", f"**Waited for**: {', '.join(waited)}"]
+    topics = sorted((row for row in rows if row.is_topic), key=lambda row: -SEVERITY[row.word])
+    if topics:
+        lines += ["", "| topic | state | | Hz, simulated | missing |", "|---|---|---|---|---|"]
+    for row in topics:
+        rate, missing = row.values.get("bus_rate_hz", ""), row.values.get("missing", "")
+        lines.append(f"| {row.name} | {row.word} | {row.message} | {rate} | {missing if missing != '0' else ''} |")
     return "\n".join(lines)
 
 

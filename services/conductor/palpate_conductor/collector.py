@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from palpate_bus.contract import MS
-from palpate_bus.messages import Clock, DiagnosticArray, DiagnosticStatus, KeyValue
+from palpate_bus.messages import Clock, DiagnosticArray
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import NS, header, nanoseconds, time_message
 
@@ -17,15 +17,6 @@ HEALTH_PERIOD = NS
 """Simulated time between two messages on `diagnostics`."""
 TREE_PERIOD = 50 * MS
 """Simulated time between two messages on `tf`."""
-
-
-class Health(NamedTuple):
-    """How a service is."""
-
-    level: int
-    """DiagnosticStatus.OK, WARN or ERROR."""
-    message: str
-    facts: Mapping[str, str]
 
 
 @dataclass
@@ -67,10 +58,10 @@ class Collector(Service):
 
     role = "conductor"
 
-    def __init__(self, health: Callable[[], Mapping[str, Health]] | None = None, tree: FrameTree | None = None) -> None:
-        """`health` says how each service is, for `diagnostics`; `tree` makes `tf` of the measured joints."""
+    def __init__(self, diagnose: Callable[[], Sequence[Any]] | None = None, tree: FrameTree | None = None) -> None:
+        """`diagnose` gives the statuses for `diagnostics`; `tree` makes `tf` of the measured joints."""
         self.collected = Collected()
-        self.health = health
+        self.diagnose = diagnose
         self._tree = tree
         self._said = -HEALTH_PERIOD
         self._drawn = -TREE_PERIOD
@@ -92,9 +83,9 @@ class Collector(Service):
         c.stiffness_map = inbox.latest("assessment/map")
         c.findings = inbox.latest("assessment/findings")
         out: dict[str, Any] = {"clock": Clock(time_message(t))}
-        if self.health is not None and t - self._said >= HEALTH_PERIOD:
+        if self.diagnose is not None and t - self._said >= HEALTH_PERIOD:
             self._said = t
-            out["diagnostics"] = DiagnosticArray(header(t), [_status(role, health) for role, health in self.health().items()])
+            out["diagnostics"] = DiagnosticArray(header(t), list(self.diagnose()))
         status = inbox.latest("robot/status")
         if self._tree is not None and status is not None and t - self._drawn >= TREE_PERIOD:
             self._drawn = t
@@ -104,8 +95,3 @@ class Collector(Service):
     def finish(self) -> Mapping[str, Any]:
         """Nothing to close."""
         return {"exam_states": len(self.collected.exam_states), "samples": len(self.collected.samples)}
-
-
-def _status(role: str, health: Health) -> Any:
-    values = [KeyValue(key, value) for key, value in health.facts.items()]
-    return DiagnosticStatus(level=health.level, name=f"palpate/{role}", message=health.message, hardware_id="", values=values)

@@ -19,13 +19,15 @@ from palpate_bus import codec
 from palpate_bus.contract import MS, Contract
 from palpate_bus.lockstep import NEVER, run_hash
 from palpate_bus.member import Member
-from palpate_bus.messages import DiagnosticStatus, OperatorRequest, RunControl, ServiceReport
+from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport
 from palpate_bus.observer import ObservedService
 from palpate_bus.stamps import NS, header
 
-from palpate_conductor.collector import Collector, Health
+from palpate_conductor.collector import Collector
+from palpate_conductor.contract_watch import ContractWatch
 from palpate_conductor.handover import Places
 from palpate_conductor.operator import OperatorDesk
+from palpate_conductor.service_health import service_statuses
 from palpate_conductor.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
@@ -127,7 +129,8 @@ class Conductor:
         self._sequence = 0
         self.watchdog = Watchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = Outcome()
-        collector.health = self._health
+        self._contract = ContractWatch(session, rules, domain, wallclock)
+        collector.diagnose = self._diagnose
         self.horizon = NEVER
         self.paused = False
         self._last = False
@@ -174,22 +177,10 @@ class Conductor:
                 heard.append((role, message, json.loads(message.detail) if message.detail else {}))
         return heard
 
-    def _health(self) -> dict[str, Health]:
-        """How each service is, for `diagnostics`."""
-        now = monotonic()
-        health = {}
-        for role, progress in self.watchdog.progress.items():
-            silent = now - progress.reported
-            level, message = DiagnosticStatus.OK, "runs"
-            if role in self.outcome.lost:
-                level, message = DiagnosticStatus.ERROR, "lost"
-            elif silent > self._patience.soft:
-                level, message = DiagnosticStatus.WARN, f"silent for {silent:.0f} s"
-            elif progress.waiting_for:
-                message = f"waits for {progress.waiting_for}"
-            facts = {"tick_s": f"{progress.tick / NS:.3f}", "waiting_for": progress.waiting_for, "report_age_s": f"{silent:.2f}"}
-            health[role] = Health(level, message, facts)
-        return health
+    def _diagnose(self) -> list[Any]:
+        """Services, then topics, for `diagnostics`."""
+        services = service_statuses(self.watchdog.progress, self.outcome.lost, self._patience.soft, self._contract.of)
+        return [*services, *self._contract.statuses()]
 
     # -- the run
 
@@ -217,6 +208,7 @@ class Conductor:
             self.outcome.wall_time_s = monotonic() - self._started_at
             self.abort(str(failure))
         self._desk.close()
+        self._contract.close()
         self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
         self._observed.drain_and_step()
         return self.outcome
@@ -265,6 +257,7 @@ class Conductor:
                 log.error("%s", complaint)
                 self.outcome.trouble.append(complaint)
             self._desk.attend(self._collector.collected.supervisor)
+            self._contract.attend()
             self._extend()
             self._watch()
             tell(self)

@@ -14,9 +14,9 @@ from typing import Any
 import zenoh
 from palpate_bus.contract import Contract
 from palpate_bus.guard import denials
+from palpate_bus.health import TopicHealth, Violation
 from palpate_bus.live import LiveMonitor
 from palpate_bus.liveliness import mismatches
-from palpate_bus.monitor import TopicHealth, Violation
 from palpate_bus.runs import versions
 
 from palpate_tools import graph
@@ -160,14 +160,11 @@ def _shared_memory(bus: Joined) -> list[Finding]:
 
 def _clock(live: LiveMonitor) -> list[Finding]:
     findings = []
-    monitor = live.monitor
-    if monitor.progress is not None and monitor.bus_time is not None:
-        kind = "wall-clock" if monitor.wallclock else "simulated"
-        moves = (
-            "stands still (paused, or somebody holds it up)" if not monitor.progress else f"at {monitor.progress:.2f} x real time"
-        )
-        level = Level.OK if monitor.progress else Level.WARN
-        findings.append(Finding("clock", level, f"{kind} time {monitor.bus_time / 1e9:.2f} s, {moves}"))
+    time, progress = live.monitor.time.now, live.monitor.time.progress
+    if time is not None:
+        kind = "wall-clock" if live.monitor.wallclock else "simulated"
+        moves = f"at {progress:.2f} x real time" if progress else "stands still (paused, or somebody holds it up)"
+        findings.append(Finding("clock", Level.OK if progress else Level.WARN, f"{kind} time {time / 1e9:.2f} s, {moves}"))
     else:
         findings.append(Finding("clock", Level.WARN, "no time: no stamped message came"))
     for name, age in live.offsets.items():
@@ -202,7 +199,7 @@ def _waiting(live: LiveMonitor) -> list[Finding]:
     for role, report in sorted(live.reports.items()):
         if now - report.heard > SILENT_S:
             findings.append(Finding("progress", Level.WARN, f"{role} has said nothing for {now - report.heard:.0f} s"))
-    if live.reports and live.monitor.progress == 0:
+    if live.reports and live.monitor.time.progress == 0:
         for role, report in sorted(live.reports.items()):
             wait = f"waits for {report.waiting_for}" if report.waiting_for else "waits for nobody"
             findings.append(Finding("progress", Level.WARN, f"{role} is at {report.tick / 1e9:.3f} s and {wait}"))

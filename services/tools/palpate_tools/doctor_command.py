@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 from palpate_bus.contract import contract
+from palpate_bus.health import TopicHealth, Violation
 from palpate_bus.live import LiveMonitor
-from palpate_bus.monitor import TopicHealth, Violation
 
 from palpate_tools.console import EXIT_TROUBLE, bandwidth, command, console, number, print_json, print_line, table
 from palpate_tools.doctor import POLL_S, Diagnosis, Level, examine
