@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from palpate_tools.report import Report
 from palpate_tools.rig import Rig
-from palpate_tools.suites import assessment, camera, common, control, perception, planning, robot, tissue
+from palpate_tools.suites import assessment, camera, common, control, perception, planning, robot, supervisor, tissue
 
 SUITES: dict[str, Callable[[Rig, Report], None]] = {
     "robot": robot.suite,
@@ -16,6 +16,7 @@ SUITES: dict[str, Callable[[Rig, Report], None]] = {
     "camera": camera.suite,
     "perception": perception.suite,
     "assessment": assessment.suite,
+    "supervisor": supervisor.suite,
 }
 """The suite of each role."""
 
