@@ -3,42 +3,11 @@
 from __future__ import annotations
 
 import csv
-import json
 import subprocess
-import sys
-import threading
-import time
 from pathlib import Path
 
 import pytest
 from examination import SHORT, Finished, palpate_run
-
-LISTENER = Path(__file__).parent / "contract" / "foreign_listener.py"
-
-
-@pytest.fixture(scope="module")
-def overheard() -> list[subprocess.CompletedProcess[str]]:
-    """What a stranger heard of the distributed run."""
-    return []
-
-
-@pytest.fixture(scope="module")
-def distributed(tmp_path_factory: pytest.TempPathFactory, overheard: list[subprocess.CompletedProcess[str]]) -> Finished:
-    """A short examination by the command, with a stranger listening."""
-    folder = tmp_path_factory.mktemp("distributed")
-
-    def listen() -> None:
-        while not (folder / "bus.json").exists():
-            time.sleep(0.1)
-        endpoints = json.loads((folder / "bus.json").read_text(encoding="utf-8"))
-        words = [sys.executable, str(LISTENER), endpoints["robot"], endpoints["camera"], "--seconds", "120"]
-        overheard.append(subprocess.run(words, capture_output=True, text=True, timeout=180, check=False))
-
-    stranger = threading.Thread(target=listen, daemon=True)
-    stranger.start()
-    finished = palpate_run("rlq_guarding", folder, settings=SHORT)
-    stranger.join(timeout=180)
-    return finished
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,166 @@
+"""What RViz, rqt and `ros2 bag play` look for, in a recorded examination: clock, frames, description, diagnostics, QoS."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from examination import Finished
+from palpate_bus.contract import contract
+from palpate_bus.liveliness import NodeTokens, parse_token
+from palpate_bus.wire import topic_key
+from palpate_bus.zenoh_config import BusOptions, session
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+RULES = contract()
+TYPES = {
+    "/clock": "rosgraph_msgs/msg/Clock",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/robot_description": "std_msgs/msg/String",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/joint_states": "sensor_msgs/msg/JointState",
+}
+TRANSIENT_LOCAL = ("/tf_static", "/robot_description")
+
+
+@pytest.fixture(scope="module")
+def bag(distributed: Finished) -> Iterator[AnyReader]:
+    """The recording of a short examination, opened by what has nothing of ours."""
+    with AnyReader([distributed.folder / "recording_mcap"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        yield reader
+
+
+def messages(bag: AnyReader, topic: str) -> list[Any]:
+    connections = [connection for connection in bag.connections if connection.topic == topic]
+    return [bag.deserialize(raw, connection.msgtype) for connection, _, raw in bag.messages(connections)]
+
+
+def ns(stamp: Any) -> int:
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def test_types_and_qos(bag: AnyReader) -> None:
+    by_topic = {connection.topic: connection for connection in bag.connections}
+    assert {topic: by_topic[topic].msgtype for topic in TYPES} == TYPES
+    for topic in TYPES:
+        (qos,) = by_topic[topic].ext.offered_qos_profiles
+        assert qos.reliability is QosReliability.RELIABLE, topic
+        assert (qos.durability is QosDurability.TRANSIENT_LOCAL) is (topic in TRANSIENT_LOCAL), topic
+        assert by_topic[topic].msgcount > 0, topic
+    assert all(by_topic[topic].msgcount == 1 for topic in TRANSIENT_LOCAL)
+
+
+@pytest.mark.parametrize("topic", TYPES)
+def test_keys_and_tokens_are_rmw_zenohs(topic: str) -> None:
+    """`<domain>/<topic>/<DDS type>/<hash>`; QoS in the token: `<reliability>:<durability>:...`, empty for reliable, volatile."""
+    row = RULES.topics[topic.removeprefix("/")]
+    package, _, base = TYPES[topic].split("/")
+    assert topic_key(row, 3).startswith(f"3{topic}/{package}::msg::dds_::{base}_/RIHS01_")
+    with session(BusOptions()) as bus:
+        tokens = NodeTokens(bus, row.producer, 3)
+        tokens.publisher(row, RULES.qos[row.qos])
+        (seen,) = [
+            entity.endpoint
+            for reply in bus.liveliness().get("@ros2_lv/3/**")
+            if reply.ok is not None and (entity := parse_token(str(reply.ok.key_expr))).endpoint is not None
+        ]
+        tokens.undeclare()
+    assert seen is not None
+    assert (seen.topic.strip("/"), seen.type) == (row.name, TYPES[topic])
+    assert seen.qos.split(":")[:2] == ["", "1" if topic in TRANSIENT_LOCAL else ""]
+
+
+def test_the_clock_runs_forward_and_nothing_is_ahead_of_it_for_long(bag: AnyReader, distributed: Finished) -> None:
+    times = [ns(message.clock) for message in messages(bag, "/clock")]
+    assert all(a < b for a, b in pairwise(times))
+    assert times[-1] / 1e9 == pytest.approx(distributed.report["sim_time_s"], abs=0.5)
+    assert max(b - a for a, b in pairwise(times)) < 500_000_000
+
+
+def frames(bag: AnyReader) -> dict[str, str]:
+    """Parent of each frame."""
+    parents: dict[str, str] = {}
+    for topic in ("/tf", "/tf_static"):
+        for message in messages(bag, topic):
+            for item in message.transforms:
+                parent = parents.setdefault(item.child_frame_id, item.header.frame_id)
+                assert parent == item.header.frame_id, f"{item.child_frame_id} has two parents"
+                q = item.transform.rotation
+                assert np.linalg.norm((q.x, q.y, q.z, q.w)) == pytest.approx(1.0, abs=1e-6)
+    return parents
+
+
+def test_one_tree_of_frames_from_the_world_to_every_sensor(bag: AnyReader) -> None:
+    parents = frames(bag)
+    for frame in parents:
+        path = [frame]
+        while path[-1] in parents:
+            path.append(parents[path[-1]])
+            assert len(path) <= len(parents) + 1, f"{frame} is in a circle"
+        assert path[-1] == "world", path
+    named = {topic.frame for topic in RULES.topics.values() if topic.frame}
+    assert named <= parents.keys() | {"world"}
+    used = {
+        getattr(message, "header").frame_id  # noqa: B009  # the types come from the bag
+        for topic in ("/ft/wrench", "/camera/depth/image_raw", "/camera/depth/camera_info", "/perception/points")
+        for message in messages(bag, topic)[:1]
+    }
+    assert used <= parents.keys() | {"world"}
+    assert {"ft_sensor", "camera_depth_optical_frame"} <= used
+
+
+def test_the_description_is_a_urdf_of_the_joints_and_frames_there_are(bag: AnyReader) -> None:
+    (description,) = messages(bag, "/robot_description")
+    model = pin.buildModelFromXML(description.data)
+    joints = [joint.attrib["name"] for joint in ET.fromstring(description.data).iter("joint") if joint.attrib["type"] != "fixed"]
+    states = messages(bag, "/joint_states")
+    assert list(states[0].name) == joints == list(model.names)[1:]
+    links = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
+    assert links - {"world"} <= frames(bag).keys()
+    geometry = pin.buildGeomFromUrdfString(model, description.data, pin.GeometryType.VISUAL)
+    assert len(geometry.geometryObjects) >= 8
+
+
+def test_tf_is_where_the_described_arm_is_at_its_measured_joints(bag: AnyReader) -> None:
+    (description,) = messages(bag, "/robot_description")
+    model = pin.buildModelFromXML(description.data)
+    data = model.createData()
+    states = {ns(state.header.stamp): np.asarray(state.position) for state in messages(bag, "/joint_states")}
+    trees = messages(bag, "/tf")
+    for tree in trees[:: len(trees) // 20]:
+        X = np.eye(4)
+        for item in tree.transforms[:11]:
+            p, q = item.transform.translation, item.transform.rotation
+            X_PC = np.eye(4)
+            X_PC[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            X_PC[:3, 3] = (p.x, p.y, p.z)
+            X = X @ X_PC
+        assert tree.transforms[10].child_frame_id == "indenter"
+        pin.framesForwardKinematics(model, data, states[ns(tree.transforms[0].header.stamp)])
+        # The status from which tf is made is a mean over 10 ms, in which the tool moves by some mm at most.
+        assert np.linalg.norm(X[:3, 3] - data.oMf[model.getFrameId("indenter")].translation) < 0.01
+
+
+def test_diagnostics_name_every_service_and_topic_and_a_sound_run_has_no_error(bag: AnyReader) -> None:
+    arrays = messages(bag, "/diagnostics")
+    stamps = [ns(message.header.stamp) for message in arrays]
+    assert all(a < b for a, b in pairwise(stamps))
+    for array in arrays:
+        names = [status.name for status in array.status]
+        assert len(names) == len(set(names))
+        assert {f"palpate/topic/{topic}" for topic in RULES.topics} <= set(names)
+        assert {f"palpate/{role}" for role in ("robot", "tissue", "control", "recorder")} <= set(names)
+        for status in array.status:
+            assert status.level in (0, 1, 2, 3)
+            assert status.message
+            assert status.hardware_id
+            assert status.level < 2, f"{status.name}: {status.message}"
