@@ -60,7 +60,7 @@ class Trivial(Service):
         """Reads and answers."""
         for name in self._reads:
             inbox.latest(name)
-        return {f"t/{self.role}": JointTorqueCommand(header(t), np.zeros(7), duration_message(50 * MS))}
+        return {f"t/{self.role}": JointTorqueCommand(header(t), np.zeros(7), duration_message(50 * MS), "")}
 
 
 def serve(role: str, number: int) -> None:

@@ -76,7 +76,7 @@ class ImpedanceController:
         Raises ValueError if `q` or `qd` is not finite or not of shape (7,).
         """
         if q.shape != (DOF,) or qd.shape != (DOF,) or not isfinite(q.dot(q) + qd.dot(qd)):
-            raise ValueError(f"joint state: q = {q}, qd = {qd}: must be {DOF} finite values each")
+            raise ValueError(f"joint_states: position = {q}, velocity = {qd}: must be {DOF} finite values each")
         self.model.update(q, qd)
         raw = self._cartesian(q, qd, reference) if reference.mode is Mode.CARTESIAN else self._joint(q, qd, reference)
         push = self._repulsion.torque(q)

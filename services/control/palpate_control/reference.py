@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from math import exp
+from typing import Final
 
 import numpy as np
 import pinocchio as pin
@@ -56,22 +57,44 @@ class Setpoint:
     """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
 
     def __post_init__(self) -> None:
-        everything = np.concatenate([getattr(self, name).ravel() for name in _FIELDS])
-        if not np.isfinite(everything).all():
-            name = next(name for name in _FIELDS if not np.isfinite(getattr(self, name)).all())
-            raise ValueError(f"set-point: {name} = {getattr(self, name)}: must be finite")
-        if everything[:_POSITIVE].min() < 0:
-            name = next(name for name in _FIELDS if getattr(self, name).min() < 0)
-            raise ValueError(f"set-point: {name} = {getattr(self, name)}: must not be negative")
+        everything = np.concatenate([getattr(self, name).ravel() for name in _ARRAYS])
+        if not ((everything >= _LOW) & (everything <= _HIGH)).all():  # so it is, too, where one is NaN
+            raise ValueError(self._wrong())
         a, b, c, d, e, f, g, h, i = everything[-9:].tolist()
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if abs(determinant - 1) > 1e-6:
             raise ValueError(f"set-point: R_WD has determinant {determinant}: must be a rotation")
 
+    def _wrong(self) -> str:
+        """The first field that is out of its range."""
+        for name, part, field, low, high in RANGES:
+            values = getattr(self, name)[part]
+            if not np.isfinite(values).all():
+                return f"set-point: {field} = {values}: must be finite"
+            if not ((values >= low) & (values <= high)).all():
+                return f"set-point: {field} = {values}: must be within {low:g} and {high:g}"
+        return f"set-point: R_WD = {self.R_WD}: must be a rotation"
 
-_FIELDS = ("stiffness", "damping_ratio", "joint_stiffness", "p_WD", "V_WD", "F_W", "q", "qd", "R_WD")
-"""Those that must not be negative come first: 6, 6 and 7 numbers."""
-_POSITIVE = 19
+
+_ALL, _FIRST, _LAST = slice(None), slice(0, 3), slice(3, 6)
+RANGES: Final = (
+    ("stiffness", _ALL, "stiffness", 0.0, 20000.0),
+    ("damping_ratio", _ALL, "damping_ratio", 0.0, 10.0),
+    ("joint_stiffness", _ALL, "joint_stiffness", 0.0, 5000.0),
+    ("p_WD", _ALL, "pose.position", -3.0, 3.0),
+    ("V_WD", _FIRST, "twist.linear", -2.0, 2.0),
+    ("V_WD", _LAST, "twist.angular", -20.0, 20.0),
+    ("F_W", _FIRST, "wrench.force", -100.0, 100.0),
+    ("F_W", _LAST, "wrench.torque", -50.0, 50.0),
+    ("q", _ALL, "joint_position", -3.2, 3.2),
+    ("qd", _ALL, "joint_velocity", -4.0, 4.0),
+)
+"""What a set-point may ask for: attribute, part of it, the message's field, least and largest value; as in the contract, where it
+says."""
+_ARRAYS: Final = ("stiffness", "damping_ratio", "joint_stiffness", "p_WD", "V_WD", "F_W", "q", "qd", "R_WD")
+_SIZES: Final = (6, 6, 7, 3, 3, 3, 3, 3, 7, 7)
+_LOW: Final = np.repeat([row[3] for row in RANGES] + [-2.0], (*_SIZES, 9))
+_HIGH: Final = np.repeat([row[4] for row in RANGES] + [2.0], (*_SIZES, 9))
 
 
 def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:

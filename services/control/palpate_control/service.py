@@ -26,8 +26,8 @@ class ControlService(Service):
     """Follows set-points by impedance control.
 
     Before the first set-point it commands zero torque, so the driver keeps the arm gravity-compensated. Once a
-    set-point has expired, or joint states are stale or not finite, it sends commands that have expired already: the
-    driver then holds safely by itself, which is better than anything that could be commanded blindly.
+    set-point has expired, or joint states are stale or not finite, it sends commands that have expired already, and says
+    why: the driver then holds safely by itself, which is better than anything that could be commanded blindly.
     """
 
     role: ClassVar[str] = "control"
@@ -45,6 +45,8 @@ class ControlService(Service):
         self._facts = {"setpoints": 0, "setpoints_rejected": 0, "joint_states_rejected": 0, "ticks_without_command": 0}
         self._peak = np.zeros(DOF)
         self._problem = ""
+        self._refused = ""
+        """What was wrong with the newest set-point; empty when it was good."""
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -67,11 +69,14 @@ class ControlService(Service):
         joints = inbox.latest("joint_states")
         if self._expires is None or joints is None:
             return self._command(t, np.zeros(DOF), self._valid)
+        if t > self._expires:
+            return self._cease(t, self._refused or f"the last planning/setpoint expired {(t - self._expires) / MS:.0f} ms ago")
         received = inbox.stamp("joint_states")
-        if t > self._expires or (received is not None and t - received > self._joint_states_age):
-            return self._cease(t)
+        if received is not None and t - received > self._joint_states_age:
+            age, limit = (t - received) / MS, self._joint_states_age / MS
+            return self._cease(t, f"joint_states are {age:.0f} ms old, limit {limit:.0f} ms")
         if joints.name != _NAMES:
-            return self._reject_joints(t, f"joint states name {joints.name}, not {_NAMES}")
+            return self._reject_joints(t, f"joint_states: name = {joints.name}: must be {_NAMES}")
         try:
             torque = self._controller.torque(np.array(joints.position), np.array(joints.velocity), self._reference.at(t))
         except ValueError as error:
@@ -88,27 +93,29 @@ class ControlService(Service):
             setpoint = setpoint_from(message)
         except ValueError as error:
             self._facts["setpoints_rejected"] += 1
-            self._problem = f"at {t} ns: {error}"
+            self._refused = f"planning/setpoint refused: {error}"
+            self._problem = f"at {t} ns: {self._refused}"
             return
+        self._refused = ""
         self._facts["setpoints"] += 1
         self._reference.accept(setpoint, t)
         self._expires = setpoint.stamp + min(nanoseconds(message.valid_for), self._setpoint_expiry)
 
-    def _cease(self, t: int) -> Outbox:
-        """Leaves the arm to the driver's safe hold."""
+    def _cease(self, t: int, problem: str) -> Outbox:
+        """Leaves the arm to the driver's safe hold, and tells it why."""
         self._facts["ticks_without_command"] += 1
+        self._problem = f"at {t} ns: {problem}"
         self._controller.reset()
         self._reference.clear()
-        return self._command(t, np.zeros(DOF), self._expired)
+        return self._command(t, np.zeros(DOF), self._expired, problem)
 
     def _reject_joints(self, t: int, problem: str) -> Outbox:
         self._facts["joint_states_rejected"] += 1
-        self._problem = f"at {t} ns: {problem}"
-        return self._cease(t)
+        return self._cease(t, problem)
 
     @staticmethod
-    def _command(t: int, torque: np.ndarray[Any, np.dtype[np.float64]], valid_for: Message) -> Outbox:
-        return {"control/joint_torque": JointTorqueCommand(header(t), torque, valid_for)}
+    def _command(t: int, torque: np.ndarray[Any, np.dtype[np.float64]], valid_for: Message, problem: str = "") -> Outbox:
+        return {"control/joint_torque": JointTorqueCommand(header(t), torque, valid_for, problem)}
 
 
 def setpoint_from(message: Message) -> Setpoint:

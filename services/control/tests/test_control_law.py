@@ -6,10 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from control_plant import ROBOT, WORKING, reference, setpoint
+from palpate_bus.contract import contract
 from palpate_control import impedance, safety
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import SLOW_S, ArmModel
-from palpate_control.reference import Mode, Reference, Setpoint, rotation_from_quaternion
+from palpate_control.reference import RANGES, Mode, Reference, Setpoint, rotation_from_quaternion
 from palpate_models.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
 
 REST = np.zeros(7)
@@ -150,7 +151,10 @@ def test_torque_changes_by_at_most_a_newton_metre_a_tick(arm: ArmModel) -> None:
 def test_command_and_gravity_together_stay_within_the_limits(arm: ArmModel, unlimited: ImpedanceController) -> None:
     q = np.deg2rad([0.0, 90.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     for sign in (-1, 1):
-        ref = reference(setpoint(arm, q, F_W=sign * np.array([0.0, 0.0, 900.0, 0, 0, 0])))
+        pressed = np.array([0.0, 0.0, sign * 0.09])  # at 10 kN/m
+        ref = reference(
+            setpoint(arm, q, p_WD=setpoint(arm, q).p_WD + pressed, stiffness=np.array([1e4, 1e4, 1e4, 200.0, 200.0, 200.0]))
+        )
         torque = unlimited.torque(q, REST, ref)
         assert (np.abs(torque) <= TORQUE_LIMIT).all()
         assert (np.abs(torque + arm.gravity) <= TORQUE_LIMIT + 1e-9).all()
@@ -203,7 +207,10 @@ def test_joint_state_that_is_not_finite_is_refused(arm: ArmModel, bad: float) ->
     ("field", "value"),
     [
         ("p_WD", np.array([0.0, np.nan, 0.0])),
+        ("p_WD", np.array([0.0, 0.0, 3.1])),
         ("V_WD", np.full(6, np.inf)),
+        ("F_W", np.array([0.0, 0.0, 0.0, 0.0, 60.0, 0.0])),
+        ("q", np.full(7, 3.3)),
         ("stiffness", np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])),
         ("damping_ratio", np.full(6, -0.1)),
         ("joint_stiffness", np.full(7, -1.0)),
@@ -211,8 +218,16 @@ def test_joint_state_that_is_not_finite_is_refused(arm: ArmModel, bad: float) ->
     ],
 )
 def test_setpoint_names_its_bad_field(arm: ArmModel, field: str, value: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=field):
+    names = [row[2] for row in RANGES if row[0] == field] or [field]
+    with pytest.raises(ValueError, match="|".join(names)):
         setpoint(arm, HOME, **{field: value})
+
+
+def test_ranges_are_those_of_the_contract() -> None:
+    said = contract().topics["planning/setpoint"].ranges
+    ours = {field: (low, high) for _, _, field, low, high in RANGES}
+    assert said.keys() <= ours.keys()
+    assert {field: ours[field] for field in said} == {field: tuple(limits) for field, limits in said.items()}
 
 
 def test_quaternion_must_have_unit_length() -> None:

@@ -114,5 +114,5 @@ def test_joint_setpoints_tell_their_acceleration_within_bounds() -> None:
     guide.accept(at(0, 0.0, 0.0, Mode.JOINT), 0)
     guide.accept(at(10 * MS, 0.0, 0.05, Mode.JOINT), 10 * MS)
     assert guide.at(10 * MS).qdd == pytest.approx(np.full(7, 5.0))
-    guide.accept(at(20 * MS, 0.0, 3.0, Mode.JOINT), 20 * MS)
+    guide.accept(at(20 * MS, 0.0, 1.5, Mode.JOINT), 20 * MS)
     assert guide.at(20 * MS).qdd == pytest.approx(np.full(7, module.MAX_ACCELERATION))

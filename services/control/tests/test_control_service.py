@@ -118,9 +118,10 @@ def test_zero_torque_before_the_first_setpoint(rig: Rig) -> None:
 
 def test_expired_setpoint_ends_commanding(rig: Rig) -> None:
     rig.send(setpoint(0, valid=100 * MS))
-    assert valid_for(rig.tick(101)) == EXPIRY
+    command = rig.tick(101)
+    assert (valid_for(command), command.problem) == (EXPIRY, "")
     command = rig.tick()
-    assert valid_for(command) == 0
+    assert (valid_for(command), command.problem) == (0, "the last planning/setpoint expired 1 ms ago")
     np.testing.assert_array_equal(command.torque, 0.0)
     assert valid_for(rig.tick(30)) == 0
     assert rig.service.finish()["ticks_without_command"] == 31
@@ -152,11 +153,12 @@ def test_commands_own_their_arrays(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"joint_position": np.full(7, np.nan)}, "q ="),
+        ({"joint_position": np.full(7, np.nan)}, "joint_position = [nan"),
         ({"stiffness": np.full(6, -1.0)}, "stiffness"),
         ({"mode": 7}, "mode = 7"),
         ({"pose": Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 0.0))}, "quaternion"),
-        ({"pose": Pose(Point(np.inf, 0.0, 0.0), Quaternion(1.0, 0.0, 0.0, 0.0))}, "p_WD"),
+        ({"pose": Pose(Point(np.inf, 0.0, 0.0), Quaternion(1.0, 0.0, 0.0, 0.0))}, "pose.position = [inf"),
+        ({"joint_velocity": np.full(7, 9.0)}, "joint_velocity = [9. 9. 9. 9. 9. 9. 9.]: must be within -4 and 4"),
     ],
 )
 def test_bad_setpoint_is_refused_and_the_one_before_goes_on(rig: Rig, changes: dict[str, Any], named: str) -> None:
@@ -168,6 +170,9 @@ def test_bad_setpoint_is_refused_and_the_one_before_goes_on(rig: Rig, changes: d
     assert np.isfinite(command.torque).all() and np.abs(command.torque).max() > 1
     facts = rig.service.finish()
     assert facts["setpoints_rejected"] == 1 and named in facts["problem"]
+    command = rig.tick(250)
+    assert valid_for(command) == 0
+    assert command.problem.startswith("planning/setpoint refused: ") and named in command.problem
 
 
 @pytest.mark.parametrize("broken", ["nan", "names"])
@@ -177,6 +182,7 @@ def test_bad_joint_states_leave_the_arm_to_the_driver(rig: Rig, broken: str) -> 
     bad = joints(rig.t, np.full(7, np.nan)) if broken == "nan" else joints(rig.t, names=JOINT_NAMES[::-1])
     command = rig.tick(message=bad)
     assert valid_for(command) == 0
+    assert command.problem.startswith("joint_states: ")
     np.testing.assert_array_equal(command.torque, 0.0)
     assert rig.service.finish()["joint_states_rejected"] == 1
 

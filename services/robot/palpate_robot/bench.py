@@ -77,7 +77,7 @@ def measure(steps: int = 2000) -> dict[str, float]:
     def service_step() -> None:
         nonlocal tick
         inbox.messages["sim/contact_wrench"] = contacts[tick // _MS % 2]
-        inbox.messages["control/joint_torque"] = command(header(tick), torque, duration_message(50 * _MS))
+        inbox.messages["control/joint_torque"] = command(header(tick), torque, duration_message(50 * _MS), "")
         tick += _MS
         service.step(tick, inbox)
 

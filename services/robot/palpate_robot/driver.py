@@ -22,6 +22,11 @@ BRAKE: Final = 5.0
 noticeably harder."""
 BRAKE_TICKS: Final = 100
 """How long that lasts [ms]: many times what stopping takes, and a small part of a breath."""
+TORQUE_RATE: Final = 2.0
+"""Largest change of a joint's command in a millisecond [N m]. libfranka ends a motion beyond 1, our controller keeps to 1 a tick.
+A command that was damaged on its way rarely stays within it."""
+AHEAD: Final = 50_000_000
+"""A command stamped so far ahead [ns] comes from a clock that is wrong: its expiry protects nobody."""
 _LIMITS: Final = tuple(
     zip(
         lbr.JOINT_NAMES,
@@ -66,6 +71,8 @@ class Command:
     torque: Array
     stamp: int
     expires: int
+    problem: str = ""
+    """Why the commander gives up; empty while it commands."""
 
 
 class Driver:
@@ -84,6 +91,8 @@ class Driver:
         self._since = -1
         self._brake = 0
         self._judged: Command | None = None
+        self._before: list[float] = []
+        """The torques of the command judged last; empty when none was obeyed since the driver was IDLE."""
 
     @property
     def held(self) -> bool:
@@ -102,6 +111,7 @@ class Driver:
         if self.mode is Mode.SAFE_HOLD:
             self.mode, self.cause, self.reason = Mode.IDLE, Cause.NONE, ""
             self._since = t
+            self._before = []
 
     def update(self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool) -> Array:
         """Joint torques at `t` [ns] without gravity [N m]; zero outside ACTIVE, where `damping` is to act instead.
@@ -149,11 +159,12 @@ class Driver:
         if t > command.expires:
             if self.mode is Mode.ACTIVE:
                 late = (t - command.expires) / 1e6
-                self.hold(t, Cause.COMMAND_EXPIRED, f"the last command expired {late:.0f} ms ago, none came after it")
+                words = f"the last command of control expired {late:.0f} ms ago, none came after it"
+                self.hold(t, Cause.COMMAND_EXPIRED, f"control gives up: {command.problem}" if command.problem else words)
             return
         if command is not self._judged:
-            self._judged = command
             self._judge(t, command, gravity)
+            self._judged = command
         if self.mode is Mode.IDLE:
             self.mode = Mode.ACTIVE
 
@@ -162,7 +173,15 @@ class Driver:
         if shape != (7,):
             self._reject(t, Cause.INVALID_COMMAND, f"a torque command of shape {shape}, want (7,)")
             return
-        for (joint, _, _, limit), torque, weight in zip(_LIMITS, command.torque.tolist(), gravity.tolist(), strict=True):
+        if command.stamp > t + AHEAD:
+            self._reject(t, Cause.INVALID_COMMAND, f"a command of control stamped {(command.stamp - t) / 1e6:.0f} ms ahead")
+            return
+        torques = command.torque.tolist()
+        before, apart = self._before or torques, 1.0
+        if self._judged is not None:
+            apart = max((command.stamp - self._judged.stamp) / 1e6, 1.0)
+        change = TORQUE_RATE * apart
+        for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, torques, before, gravity.tolist(), strict=True):
             if torque - torque != 0.0:  # NaN or infinite
                 self._reject(t, Cause.INVALID_COMMAND, f"a torque command of {torque} N m for {joint}, want a finite one")
                 return
@@ -170,6 +189,11 @@ class Driver:
                 text = f"{joint} commanded {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
                 self._reject(t, Cause.TORQUE_LIMIT, text)
                 return
+            if not -change <= torque - last <= change:
+                text = f"control commands {joint} {torque:.1f} N m after {last:.1f} N m, {apart:.0f} ms apart"
+                self._reject(t, Cause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
+                return
+        self._before = torques
 
     def _reject(self, t: int, cause: Cause, reason: str) -> None:
         self.rejected += 1

@@ -144,7 +144,7 @@ class RobotService(Service):
         message = inbox.latest("control/joint_torque")
         if message is not None and message is not self._command_message:
             stamp = nanoseconds(message.header.stamp)
-            self._command = Command(message.torque, stamp, stamp + nanoseconds(message.valid_for))
+            self._command = Command(message.torque, stamp, stamp + nanoseconds(message.valid_for), message.problem)
             self._command_message = message
         return self._command
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from palpate_bus.codec import message_type
 from palpate_models import lbr
-from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, Cause, Command, Driver, Mode
+from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, Cause, Command, Driver, Mode
 
 MS = 1_000_000
 STILL = np.zeros(7)
@@ -95,7 +95,37 @@ def test_bad_commands_hold_and_are_counted(torque: np.ndarray, cause: Cause, wor
 
 def test_full_torque_in_room_left_by_gravity_is_obeyed(active: Driver) -> None:
     torque = lbr.TORQUE_LIMIT - GRAVITY
-    np.testing.assert_array_equal(_update(active, 2 * MS, _command(MS, torque)), torque)
+    reach = int(np.max(np.abs(torque - 2.0)) / TORQUE_RATE) + 1
+    np.testing.assert_array_equal(_update(active, reach * MS, _command(reach * MS, torque)), torque)
+
+
+def test_a_jump_of_the_torque_holds(active: Driver) -> None:
+    """What a damaged message looks like: every number in its range, and none that the controller can have meant."""
+    for tick in range(1, 40):
+        torque = np.full(7, 2.0) + np.eye(7)[3] * 0.9 * TORQUE_RATE * tick
+        assert _update(active, (tick + 1) * MS, _command(tick * MS, torque)).any()
+    assert active.mode is Mode.ACTIVE
+    assert not _update(active, 41 * MS, _command(40 * MS, torque - 2 * np.eye(7)[3] * torque)).any()
+    assert (active.mode, active.cause, active.rejected) == (Mode.SAFE_HOLD, Cause.INVALID_COMMAND, 1)
+    assert "lbr_A4 -72.2 N m after 72.2 N m, 1 ms apart, limit 2 N m/ms" in active.reason
+
+
+def test_the_first_command_after_a_release_is_judged_against_nothing(active: Driver) -> None:
+    active.hold(2 * MS, Cause.STOP_REQUESTED, "operator")
+    active.release(3 * MS)
+    assert _update(active, 5 * MS, _command(4 * MS, np.full(7, 20.0))).any()
+
+
+def test_a_command_from_a_clock_that_is_ahead_is_refused(active: Driver) -> None:
+    assert not _update(active, 2 * MS, _command(3600 * 1000 * MS)).any()
+    assert active.cause is Cause.INVALID_COMMAND
+    assert "ahead" in active.reason
+
+
+def test_a_controller_that_gives_up_says_why(active: Driver) -> None:
+    last = Command(STILL, MS, MS, "joint_states are 21 ms old, limit 20 ms")
+    assert not _update(active, 2 * MS, last).any()
+    assert (active.cause, active.reason) == (Cause.COMMAND_EXPIRED, f"control gives up: {last.problem}")
 
 
 def test_hold_is_latched_and_keeps_its_first_cause(active: Driver) -> None:

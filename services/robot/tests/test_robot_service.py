@@ -53,7 +53,9 @@ class Rig:
         self.status: Any = None
 
     def command(self, torque: np.ndarray, valid_ms: int = 50) -> None:
-        self.inbox.messages["control/joint_torque"] = COMMAND(header(self.t), np.asarray(torque), duration_message(valid_ms * MS))
+        self.inbox.messages["control/joint_torque"] = COMMAND(
+            header(self.t), np.asarray(torque), duration_message(valid_ms * MS), ""
+        )
 
     def press(self, fx: float, fy: float, fz: float) -> None:
         wrench = PARTS(VECTOR(fx, fy, fz), VECTOR(0.0, 0.0, 0.0))

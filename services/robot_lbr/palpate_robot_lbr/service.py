@@ -179,7 +179,8 @@ class LbrService(Service):
         message = inbox.latest("control/joint_torque") if self._inner is None else self._inner.command(t, inbox, joints)
         if message is not None and message is not self._command_message:
             stamp = nanoseconds(message.header.stamp)
-            self._command = Command(np.array(message.torque), stamp, stamp + nanoseconds(message.valid_for))
+            expires = stamp + nanoseconds(message.valid_for)
+            self._command = Command(np.array(message.torque), stamp, expires, message.problem)
             self._command_message = message
         return self._command
 

@@ -101,7 +101,7 @@ def never_expires(t: int, outbox: dict[str, Any]) -> None:
 
 def wrong_torque_sign(t: int, outbox: dict[str, Any]) -> None:
     command = outbox["control/joint_torque"]
-    outbox["control/joint_torque"] = JointTorqueCommand(command.header, -command.torque, command.valid_for)
+    outbox["control/joint_torque"] = JointTorqueCommand(command.header, -command.torque, command.valid_for, command.problem)
 
 
 def millimetres(t: int, outbox: dict[str, Any]) -> None:
