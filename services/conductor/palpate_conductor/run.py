@@ -13,6 +13,7 @@ from typing import Any
 import zenoh
 from palpate_bus.composed import Composed, ServiceFailed
 from palpate_bus.contract import contract
+from palpate_bus.messages import ExamState
 from palpate_bus.recording import RawRecorder
 from palpate_bus.service import Service
 from palpate_bus.stamps import NS
@@ -51,7 +52,7 @@ class RunResult:
     blame: dict[str, Any]
     counters: dict[str, Any]
     failure: str | None
-    """Service and cause; None when the run completed."""
+    """Service and cause, or why planning gave the examination up; None when it completed."""
     lost: dict[str, int]
 
 
@@ -157,7 +158,7 @@ def conduct(
 
     try:
         outcome = conductor.run(died, report)
-        failure = outcome.failure
+        failure = outcome.failure or _given_up(collector.collected)
     except RunFailed as error:
         outcome = conductor.outcome
         failure = str(error)
@@ -177,6 +178,12 @@ def conduct(
         failure=failure,
         lost=outcome.lost,
     )
+
+
+def _given_up(collected: Collected) -> str | None:
+    """Why planning ended the examination early; None when it did not."""
+    exam = collected.exam
+    return str(exam.message) if exam is not None and exam.phase == ExamState.PHASE_ABORTED else None
 
 
 def _how(code: int) -> str:
@@ -255,6 +262,6 @@ def run_composed(
         start_time_s=start - begin,
         blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
         counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
-        failure=failure,
+        failure=failure or _given_up(collector.collected),
         lost=lost,
     )
