@@ -14,6 +14,7 @@ from time import sleep
 from typing import Annotated, NoReturn
 
 import typer
+from palpate_bus.operator_keys import HINT, OperatorKeys
 from palpate_bus.runs import Run, live
 from palpate_bus.zenoh_config import BusConfigError
 from palpate_models.load import ScenarioError, load_scenario
@@ -47,7 +48,11 @@ def dashboard(
     ] = None,
     leave: Annotated[bool, typer.Option("--leave", help="End with the run; else its picture stays until Ctrl+C.")] = False,
 ) -> None:
-    """Watch a run: live in the browser, joined late or not, or from its recording. It slows no run down."""
+    """Watch a run: live in the browser, joined late or not, or from its recording. It slows no run down.
+
+    While it shows a live run, keys in its terminal are an operator's hand on it: s soft stop (the arm retreats and waits),
+    e emergency stop (the driver holds), r release.
+    """
     console = Console(stderr=True)
     try:
         if source is None:
@@ -88,7 +93,10 @@ def _watch(run: Run, port: int, native: bool, show: bool, leave: bool, console: 
     if show:
         webbrowser.open(address(port))
     try:
-        console.print(follow(run, service, lambda words: console.print(words, highlight=False, soft_wrap=True)))
+        with OperatorKeys() as keys:
+            if keys.attached:
+                console.print(f"[dim]{HINT}[/]", highlight=False)
+            console.print(follow(run, service, lambda words: console.print(words, highlight=False, soft_wrap=True), keys))
         if not leave:
             console.print("its picture stays until Ctrl+C", highlight=False)
             while viewer is None or viewer.poll() is None:

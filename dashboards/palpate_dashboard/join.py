@@ -12,9 +12,11 @@ from time import monotonic, sleep
 
 from palpate_bus import codec
 from palpate_bus.contract import contract
+from palpate_bus.desk import order
 from palpate_bus.member import Member
 from palpate_bus.messages import RunControl
 from palpate_bus.observer import IDLE_S, ObservedService
+from palpate_bus.operator_keys import OperatorKeys
 from palpate_bus.runs import Run, live
 from palpate_bus.zenoh_config import session
 
@@ -26,8 +28,8 @@ CHECK_S = 1.0
 Say = Callable[[str], None]
 
 
-def follow(run: Run, service: DashboardService, say: Say) -> str:
-    """Draws `run` until it ends, and finishes `service`; returns how it ended."""
+def follow(run: Run, service: DashboardService, say: Say, keys: OperatorKeys) -> str:
+    """Draws `run` until it ends, and finishes `service`; passes on what an operator's `keys` say. Returns how it ended."""
     rules = contract()
     with session(run.options()) as bus:
         member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)
@@ -44,6 +46,8 @@ def follow(run: Run, service: DashboardService, say: Say) -> str:
         while not end:
             if not observed.drain_and_step():
                 sleep(IDLE_S)
+            for word in keys.pressed():
+                say(order(bus, run.domain, word, "a key of palpate dashboard"))
             while (sample := control.get(0)) is not None:
                 message = decode(sample.payload)
                 if message.command == RunControl.END:

@@ -1,4 +1,4 @@
-"""Where an operator's word reaches a run: a queryable of the conductor, asked by `palpate stop` and `palpate release`.
+"""Where an operator's word reaches a run: a queryable of the conductor (`palpate_bus.desk` asks it).
 
 The conductor passes the word on as `operator/request` and answers once the supervisor confirms it, so that the operator knows.
 """
@@ -13,16 +13,8 @@ from time import monotonic
 from typing import Any
 
 import zenoh
-from palpate_bus.messages import OperatorRequest, SupervisorState
-
-CONFIRM_S = 2.0
-"""How long a confirmation is waited for, by wall clock."""
-WORDS = {"stop": OperatorRequest.STOP, "release": OperatorRequest.RELEASE, "end": OperatorRequest.END}
-
-
-def desk_key(domain: int) -> str:
-    """The key on which a run is asked."""
-    return f"{domain}/palpate/operator"
+from palpate_bus.desk import CONFIRM_S, WORDS, desk_key
+from palpate_bus.messages import SupervisorState
 
 
 @dataclass
@@ -83,30 +75,13 @@ def _answer(pending: _Pending, supervisor: Any | None) -> tuple[bool, str] | Non
     if supervisor is not None:
         if pending.word == "stop" and supervisor.level == SupervisorState.LEVEL_EMERGENCY:
             return True, f"the driver holds: {supervisor.reason}"
-        if pending.word != "stop" and supervisor.releases > pending.releases:
+        if pending.word == "soft-stop" and supervisor.level != SupervisorState.LEVEL_OK:
+            return True, f"the arm retreats and waits: {supervisor.reason}"
+        lifts = pending.word in ("release", "end")
+        if lifts and supervisor.releases > pending.releases:
             return True, "released"
-        if pending.word != "stop" and supervisor.reason.startswith("release refused"):
+        if lifts and supervisor.reason.startswith("release refused"):
             return False, supervisor.reason
     if monotonic() - pending.since > CONFIRM_S:
         return False, f"passed on, but the supervisor did not confirm it within {CONFIRM_S:g} s"
     return None
-
-
-class NotAnswered(RuntimeError):
-    """No run took the word, or it was refused. The message says which."""
-
-
-def ask(session: zenoh.Session, domain: int, word: str, reason: str) -> tuple[str, float]:
-    """Says a word of `WORDS` to the run on this bus; returns its answer and how long the confirmation took [ms].
-
-    Raises NotAnswered.
-    """
-    payload = json.dumps({"word": word, "reason": reason})
-    for reply in session.get(desk_key(domain), payload=payload, timeout=2 * CONFIRM_S):
-        if reply.ok is None:
-            continue
-        answer = json.loads(reply.ok.payload.to_bytes())
-        if not answer["done"]:
-            raise NotAnswered(answer["words"])
-        return answer["words"], float(answer["after_ms"])
-    raise NotAnswered("the run does not answer: its conductor is gone, or has not started it yet")

@@ -8,10 +8,9 @@ from typing import Annotated
 
 import typer
 from palpate_bus import runs
+from palpate_bus.desk import NotAnswered, ask
 from palpate_bus.zenoh_config import BusOptions, close_session, open_session
 from rich.console import Console
-
-from palpate_conductor.operator import NotAnswered, ask
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
@@ -21,9 +20,15 @@ MEET_S = 1.0
 Named = Annotated[str | None, typer.Option("--run", help="Which run, by its results folder's name; by default the newest.")]
 
 
-def stop(reason: Annotated[str, typer.Argument(help="Why, for the record.")] = "palpate stop", run: Named = None) -> None:
+def stop(
+    reason: Annotated[str, typer.Argument(help="Why, for the record.")] = "palpate stop",
+    soft: Annotated[
+        bool, typer.Option("--soft", help="Retreat along the normal and wait, instead of holding where it is.")
+    ] = False,
+    run: Named = None,
+) -> None:
     """Stop a run at once: the arm is held safely until `palpate release`."""
-    _say("stop", reason, run)
+    _say("soft-stop" if soft else "stop", reason, run)
 
 
 def release(

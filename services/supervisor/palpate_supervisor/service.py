@@ -58,6 +58,8 @@ class SupervisorService(Service):
         for request in inbox.new("operator/request"):
             if request.request == OperatorRequest.STOP:
                 breaches.append(Breach(Level.EMERGENCY, Cause.OPERATOR, f"stopped by the operator: {request.reason}"))
+            elif request.request == OperatorRequest.SOFT_STOP:
+                breaches.append(Breach(Level.SOFT_STOP, Cause.OPERATOR, f"stopped softly by the operator: {request.reason}"))
             else:
                 release = True
         for mesh in inbox.new("perception/surface"):

@@ -1,0 +1,56 @@
+"""How an operator's word reaches a run: a query that its conductor answers once the supervisor confirms it.
+
+Asked by `palpate stop`, `palpate release`, and by the keys of `palpate dashboard` and `palpate run`.
+"""
+
+from __future__ import annotations
+
+import json
+
+import zenoh
+
+from palpate_bus.messages import OperatorRequest
+
+CONFIRM_S = 2.0
+"""How long a confirmation is waited for, by wall clock."""
+WORDS = {
+    "stop": OperatorRequest.STOP,
+    "soft-stop": OperatorRequest.SOFT_STOP,
+    "release": OperatorRequest.RELEASE,
+    "end": OperatorRequest.END,
+}
+"""What can be asked, with the request it is passed on as."""
+
+
+class NotAnswered(RuntimeError):
+    """No run took the word, or it was refused. The message says which."""
+
+
+def desk_key(domain: int) -> str:
+    """The key on which a run is asked."""
+    return f"{domain}/palpate/operator"
+
+
+def ask(session: zenoh.Session, domain: int, word: str, reason: str) -> tuple[str, float]:
+    """Says a word of `WORDS` to the run on this bus; returns its answer and how long the confirmation took [ms].
+
+    Raises NotAnswered.
+    """
+    payload = json.dumps({"word": word, "reason": reason})
+    for reply in session.get(desk_key(domain), payload=payload, timeout=2 * CONFIRM_S):
+        if reply.ok is None:
+            continue
+        answer = json.loads(reply.ok.payload.to_bytes())
+        if not answer["done"]:
+            raise NotAnswered(answer["words"])
+        return answer["words"], float(answer["after_ms"])
+    raise NotAnswered("the run does not answer: its conductor is gone, or has not started it yet")
+
+
+def order(session: zenoh.Session, domain: int, word: str, reason: str) -> str:
+    """The same for who only wants to show what came of it: a sentence, also when nobody answered."""
+    try:
+        answer, after_ms = ask(session, domain, word, reason)
+    except NotAnswered as error:
+        return f"{word}: {error}"
+    return f"{word}: {answer} (confirmed after {after_ms:.0f} ms)"

@@ -1,0 +1,112 @@
+"""An operator's keys: read from a terminal of our own alone, and passed on to the conductor's desk."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from palpate_bus.operator_keys import HINT, OperatorKeys
+from test_dashboard_browser import free_ports
+
+KEYS_PROGRAM = """
+import sys, time
+from palpate_bus.operator_keys import OperatorKeys
+with OperatorKeys() as keys:
+    print("attached" if keys.attached else "not attached", flush=True)
+    while True:
+        for word in keys.pressed():
+            print(word, flush=True)
+        time.sleep(0.01)
+"""
+
+
+def in_a_terminal(words: list[str]) -> tuple[int, int]:
+    """(process, our end of its terminal)"""
+    child, end = pty.fork()
+    if child == 0:
+        os.execv(words[0], words)
+    return child, end
+
+
+def read_until(end: int, done: Callable[[str], bool], patience_s: float = 60.0) -> str:
+    text = ""
+    until = time.monotonic() + patience_s
+    while not done(text):
+        assert time.monotonic() < until, text
+        try:
+            text += os.read(end, 1024).decode()
+        except OSError:  # the terminal closes with its process
+            break
+    return text
+
+
+def test_keys_of_a_terminal_are_words_and_it_is_left_as_it_was() -> None:
+    child, end = in_a_terminal([sys.executable, "-c", KEYS_PROGRAM])
+    read_until(end, lambda text: "attached" in text)
+    assert not termios.tcgetattr(end)[3] & termios.ICANON
+    os.write(end, b"xsqEr")
+    text = read_until(end, lambda text: "release" in text)
+    assert text.split() == ["soft-stop", "stop", "release"]
+    os.write(end, b"\x03")  # Ctrl+C
+    read_until(end, lambda text: "KeyboardInterrupt" in text)
+    os.waitpid(child, 0)
+    assert termios.tcgetattr(end)[3] & termios.ICANON
+    assert termios.tcgetattr(end)[3] & termios.ECHO
+    os.close(end)
+
+
+def test_without_a_terminal_no_key_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "keys").write_text("ser")
+    with (tmp_path / "keys").open() as file:
+        monkeypatch.setattr("sys.stdin", file)
+        with OperatorKeys() as keys:
+            assert not keys.attached
+            assert keys.pressed() == []
+        assert file.read() == "ser"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["--realtime", "--wallclock"])
+def test_keys_stop_and_release_a_live_run(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path / "runs"))
+    palpate = str(Path(sys.executable).with_name("palpate"))
+    out = tmp_path / "out"
+    settings = ["exam.region_m=[0.06,0.06]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=10"]
+    words = [word for setting in settings for word in ("--set", setting)]
+    with (tmp_path / "run.log").open("w") as log:
+        running = subprocess.Popen([palpate, "run", mode, "--out", str(out), *words], stderr=log, stdout=log)
+        child, end = 0, -1
+        try:
+            recording = out / "recording_mcap" / "recording_mcap_0.mcap"
+            while not (recording.is_file() and recording.stat().st_size > 1_000_000):
+                assert running.poll() is None, (tmp_path / "run.log").read_text()
+                time.sleep(0.2)
+            child, end = in_a_terminal([palpate, "dashboard", "--port", str(free_ports())])
+            text = read_until(end, lambda text: "joined at" in text, 120)
+            assert HINT in text
+            for key, answer in ((b"s", "soft-stop: the arm retreats"), (b"r", "release: released"),
+                                (b"e", "stop: the driver holds"), (b"r", "release: released")):  # fmt: skip
+                os.write(end, key)
+                text = read_until(end, lambda text: "confirm" in text)
+                assert answer in text
+            os.write(end, b"\x03")
+            os.waitpid(child, 0)
+            child = 0
+            assert running.wait(300) == 0, (tmp_path / "run.log").read_text()
+        finally:
+            for process in (child, running.pid if running.poll() is None else 0):
+                if process:
+                    os.kill(process, signal.SIGTERM)
+            if end >= 0:
+                os.close(end)
+    stops = json.loads((out / "report.json").read_text())["services"]["supervisor"]["facts"]["stops"]
+    assert [(stop["level"], stop["cause"]) for stop in stops] == [("SOFT_STOP", "OPERATOR"), ("EMERGENCY", "OPERATOR")]
