@@ -51,10 +51,11 @@ def share(image: np.ndarray, color: palette.Rgba, reach: int) -> float:
     return float(np.mean((angle < reach) & (bright > 120)))
 
 
-def wait_for(port: int) -> None:
-    """Until something listens at `port`."""
+def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
+    """Until `process` listens at `port`."""
     until = monotonic() + PATIENCE_S
     while monotonic() < until:
+        assert process.poll() is None, f"it left with status {process.poll()}"
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
                 return
@@ -127,7 +128,7 @@ def test_a_run_that_is_joined_late_is_drawn(tmp_path: Path) -> None:
             assert monotonic() < until, "the run did not start"
             sleep(0.5)
         watching = start([palpate, "dashboard", "--port", str(port)], environment)
-        wait_for(port + 1)
+        wait_for(port + 1, watching)
         look(port, SCENE | CURVE)
     finally:
         for process in (watching, running):

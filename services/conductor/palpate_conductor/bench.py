@@ -19,6 +19,7 @@ from palpate_models.scenario import Scenario
 from rich.console import Console
 from rich.table import Table
 
+from palpate_conductor.case_display import CaseDisplay
 from palpate_conductor.platforms import fingerprint
 from palpate_conductor.run import OBSERVERS, RunResult, run_composed, run_distributed
 
@@ -47,21 +48,25 @@ GROUPS = ("parts", "runs")
 Save = Callable[[dict[str, Any]], None]
 
 
-def measure(scenario: Scenario, console: Console, groups: Sequence[str], save: Save) -> dict[str, Any]:
+def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], save: Save) -> dict[str, Any]:
     """The figures of some of `GROUPS`, by name. `save` gets what there is after each: an interrupted call leaves its part."""
     figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
-    for point in sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name) if "parts" in groups else ():
-        with console.status(f"{point.name}: cost of a step"):
-            figures["parts"][point.name] = _load(point)()
+    points = sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name) if "parts" in groups else []
+    cases: dict[str, Callable[[Path], RunResult]] = {
+        "composed": lambda out: run_composed(scenario, out, lambda _: None, ()),
+        "distributed": lambda out: run_distributed(scenario, out, lambda _: None, ()),
+        "distributed, recorder and viewer": lambda out: run_distributed(scenario, out, lambda _: None, OBSERVERS),
+    }
+    names = list(cases) if "runs" in groups else []
+    total = len(points) + len(names)
+    for done, point in enumerate(points):
+        display.tell(done, total, f"{point.name}: cost of a step")
+        figures["parts"][point.name] = _load(point)()
         save(figures)
-    cases: tuple[tuple[str, Callable[[Path], RunResult]], ...] = (
-        ("composed", lambda out: run_composed(scenario, out, lambda _: None, ())),
-        ("distributed", lambda out: run_distributed(scenario, out, lambda _: None, ())),
-        ("distributed, recorder and viewer", lambda out: run_distributed(scenario, out, lambda _: None, OBSERVERS)),
-    )
-    for name, case in cases if "runs" in groups else ():
-        with console.status(f"{scenario.name}, {name}"), tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
-            figures["runs"][name] = _figures(case(Path(folder)))
+    for done, name in enumerate(names, len(points)):
+        display.tell(done, total, f"{scenario.name}, {name}")
+        with tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
+            figures["runs"][name] = _figures(cases[name](Path(folder)))
         save(figures)
     return figures
 
@@ -101,13 +106,15 @@ def tables(figures: dict[str, Any]) -> list[Table]:
     return [table for table in (runs, blame, small) if table.row_count]
 
 
-def bench(scenario: str, out: Path, console: Console, groups: Sequence[str] = GROUPS) -> None:
-    """Measures, prints the tables and writes bench.json."""
+def bench(scenario: str, out: Path, console: Console, groups: Sequence[str] = GROUPS, quiet: bool = False) -> None:
+    """Measures, prints the tables and writes bench.json; shows on a terminal how far it is, unless `quiet`."""
 
     def save(figures: dict[str, Any]) -> None:
         out.write_text(json.dumps(figures, indent=2), encoding="utf-8")
 
-    figures = measure(load_scenario(scenario), Console(stderr=True), groups, save)
+    screen = Console(stderr=True)
+    with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:
+        figures = measure(load_scenario(scenario), display, groups, save)
     for table in tables(figures):
         console.print(table)
     console.print(f"{platform.platform()}, written to {out}", highlight=False)

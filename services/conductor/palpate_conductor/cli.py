@@ -106,7 +106,11 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON, and nothing else.")] = False,
 ) -> None:
-    """Run an examination and write report, map and recordings."""
+    """Run an examination and write report, map and recordings.
+
+    In a terminal, keys are an operator's hand on it: s soft stop (the arm retreats and waits), e emergency stop (the driver
+    holds), r release.
+    """
     console = Console(stderr=True)
     quiet = quiet or as_json
     try:
@@ -241,12 +245,13 @@ def bench(
     scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "rlq_guarding",
     out: Annotated[Path, typer.Option(help="File for the figures.")] = Path("bench.json"),
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only.")] = False,
 ) -> None:
     """Measure the parts, the bus among them, and whole runs; print tables and write bench.json."""
     for group in only or ():
         if group not in GROUPS:
             raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
-    run_bench(scenario, out, Console(width=max(WIDE, Console().width)), only or GROUPS)
+    run_bench(scenario, out, Console(width=max(WIDE, Console().width)), only or GROUPS, quiet)
 
 
 @app.command()

@@ -1,11 +1,13 @@
-"""What a user sees while a run is on: phase, progress, simulated time, real-time factor and force."""
+"""What a user sees while a run is on: phase, progress, simulated time, real-time factor and force; and the keys that stop it."""
 
 from __future__ import annotations
 
 from types import TracebackType
 from typing import Self
 
+from palpate_bus.desk import WORDS
 from palpate_bus.messages import ExamState
+from palpate_bus.operator_keys import HINT, OperatorKeys
 from palpate_bus.stamps import NS
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
@@ -20,13 +22,15 @@ PHASES = {
 
 
 class RunDisplay:
-    """A progress line on a terminal; plain lines at each phase otherwise; nothing when quiet."""
+    """A progress line on a terminal, and an operator's keys; plain lines at each phase otherwise; nothing when quiet."""
 
     def __init__(self, console: Console, quiet: bool) -> None:
         self._console = console
         self._quiet = quiet
         self._phase = -1
         self._troubles = 0
+        self._stopped = ""
+        self._keys = OperatorKeys()
         self._bar = Progress(
             SpinnerColumn(),
             TextColumn("[bold]{task.fields[phase]:<8}"),
@@ -44,6 +48,7 @@ class RunDisplay:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._keys.__exit__(kind, error, trace)
         self._bar.stop()
 
     def tell(self, progress: RunProgress) -> None:
@@ -51,6 +56,7 @@ class RunDisplay:
         for sentence in progress.trouble[self._troubles :]:
             self._console.print(f"[bold red]{sentence}[/]", highlight=False, soft_wrap=True)
         self._troubles = len(progress.trouble)
+        self._obey(progress)
         exam = progress.collected.exam
         if exam is None:
             return
@@ -66,3 +72,18 @@ class RunDisplay:
                 self._console.print(
                     f"[dim]{progress.t / NS:8.2f} s[/dim]  {PHASES[exam.phase]:<9} {exam.message}", highlight=False
                 )
+
+    def _obey(self, progress: RunProgress) -> None:
+        """Passes on what an operator's keys say, and shows what the supervisor makes of it."""
+        if self._bar.disable or progress.request is None:
+            return
+        if self._phase < 0 and not self._keys.attached and self._keys.__enter__().attached:
+            self._console.print(f"[dim]{HINT}[/]", highlight=False)
+        for word in self._keys.pressed():
+            progress.request(WORDS[word], "a key of palpate run")
+            self._console.print(f"{word}: passed on", highlight=False)
+        supervisor = progress.collected.supervisor
+        stopped = supervisor.reason if supervisor is not None and supervisor.level else ""
+        if stopped != self._stopped:
+            self._stopped = stopped
+            self._console.print(f"[bold red]stopped: {stopped}[/]" if stopped else "released", highlight=False, soft_wrap=True)

@@ -66,6 +66,8 @@ class Progress:
     collected: Collected
     trouble: tuple[str, ...] = ()
     """What went wrong so far: who was lost, when and how."""
+    request: Callable[[int, str], None] | None = None
+    """Passes on an operator's request, with its reason; None where there is nobody to pass it to."""
 
 
 Tell = Callable[[Progress], None]
@@ -154,7 +156,7 @@ def conduct(
     def report(c: Conductor) -> None:
         wall = max(c.elapsed_s, 1e-9)
         t = max(collector.collected.exam_time, 0)
-        tell(Progress(t, t / NS / wall, collector.collected, tuple(c.outcome.trouble)))
+        tell(Progress(t, t / NS / wall, collector.collected, tuple(c.outcome.trouble), c.request))
 
     try:
         outcome = conductor.run(died, report)
