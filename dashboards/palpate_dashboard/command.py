@@ -23,11 +23,13 @@ from rich.status import Status
 
 from palpate_dashboard import replay
 from palpate_dashboard.join import follow
+from palpate_dashboard.picture import NoPicture, take
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import MEMORY_LIMIT, Live, address
 
 EXIT_BAD_INPUT = 2
 DEFAULT_PORT = 9876
+PICTURE_PX = (1500, 940)
 
 
 class NothingToShow(RuntimeError):
@@ -47,6 +49,10 @@ def dashboard(
         str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")
     ] = None,
     leave: Annotated[bool, typer.Option("--leave", help="End with the run; else its picture stays until Ctrl+C.")] = False,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Write how a recorded run looks at --at, by a headless browser, and end.")
+    ] = None,
+    at: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="With --picture: the simulated time.")] = 60.0,
 ) -> None:
     """Watch a run: live in the browser, joined late or not, or from its recording. It slows no run down.
 
@@ -55,11 +61,17 @@ def dashboard(
     """
     console = Console(stderr=True)
     try:
-        if source is None:
+        if picture is not None:
+            if source is None:
+                raise NothingToShow("--picture wants the folder of a run that was recorded")
+            take(
+                Path(source), picture, at, port, *PICTURE_PX, lambda words: console.print(words, highlight=False, soft_wrap=True)
+            )
+        elif source is None:
             _watch(_the_run(chosen), port, native, show, leave, console)
         else:
             _view(_recording(Path(source), console), port, native, show, console)
-    except (NothingToShow, BusConfigError, ScenarioError, OSError, ValueError) as error:
+    except (NothingToShow, NoPicture, BusConfigError, ScenarioError, OSError, ValueError) as error:
         _fail(console, str(error))
     except KeyboardInterrupt:
         raise typer.Exit from None

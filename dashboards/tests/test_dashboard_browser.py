@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import shutil
 import signal
@@ -16,14 +15,11 @@ import numpy as np
 import pytest
 from dashboard_messages import FakeInbox, run
 from palpate_dashboard import palette
+from palpate_dashboard.picture import BROWSERS, PATIENCE_S, look, page_at
 from palpate_dashboard.service import FILE, DashboardService
-from palpate_dashboard.sinks import Live, address
+from palpate_dashboard.sinks import Live
 from palpate_models.scenario import Scenario
 
-ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-PATIENCE_S = 400
-"""A software rasteriser beside a run on two cores takes a minute or two for its first picture."""
 SCENE = {"skin": (palette.SKIN, 4, 0.001), "table": (palette.SHEET, 4, 0.001), "drape": (palette.DRAPE, 5, 0.01)}
 """What the scene must show: colour, reach of its hue [deg], part of the page (of a small region 0.003 is skin)."""
 CURVE = {"curve": (palette.FORCE, 6, 0.0001)}
@@ -63,29 +59,20 @@ def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
     pytest.fail(f"nothing listens at {port} after {PATIENCE_S} s")
 
 
-def look(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> None:
+def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> None:
     """Opens the page in a headless browser until each colour fills its share: (colour, reach of hue [deg], share)."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
-    pillow = pytest.importorskip("PIL.Image")
-    chromium = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if chromium is None:
+    pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
+    if not any(map(shutil.which, BROWSERS)):
         pytest.skip(f"SKIPPED for want of a browser: none of {', '.join(BROWSERS)} is on the PATH")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS)
-        page = browser.new_page(viewport={"width": 1000, "height": 700}, color_scheme="dark")
-        page.set_default_timeout(1000 * PATIENCE_S)
-        page.goto(address(port) + "&renderer=webgl")
-        until = monotonic() + PATIENCE_S
-        seen: dict[str, float] = {}
+    until = monotonic() + PATIENCE_S
+    seen: dict[str, float] = {}
+    with page_at(port, 1000, 700) as page:
         while monotonic() < until:
-            page.wait_for_timeout(3000)
-            image = np.asarray(pillow.open(io.BytesIO(page.screenshot())).convert("RGB"))
+            image = look(page)
             seen = {name: share(image, color, reach) for name, (color, reach, _) in wanted.items()}
             if all(seen[name] > least for name, (_, _, least) in wanted.items()):
-                break
-        else:
-            pytest.fail(f"not drawn within {PATIENCE_S} s: {seen}")
-        browser.close()
+                return
+    pytest.fail(f"not drawn within {PATIENCE_S} s: {seen}")
 
 
 def start(words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
@@ -106,7 +93,7 @@ def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
     for t, new in run(6.0, Scenario().robot):  # all of it before the viewer joins
         inbox.put(t, new)
         service.step(t, inbox)
-    look(port, SCENE | CURVE | {"outline": (palette.TRUTH, 6, 0.0002)})
+    look_for(port, SCENE | CURVE | {"outline": (palette.TRUTH, 6, 0.0002)})
     service.finish()
 
 
@@ -129,7 +116,7 @@ def test_a_run_that_is_joined_late_is_drawn(tmp_path: Path) -> None:
             sleep(0.5)
         watching = start([palpate, "dashboard", "--port", str(port)], environment)
         wait_for(port + 1, watching)
-        look(port, SCENE | CURVE)
+        look_for(port, SCENE | CURVE)
     finally:
         for process in (watching, running):
             if process is not None:

@@ -12,7 +12,7 @@ from time import monotonic
 from typing import Any
 
 import zenoh
-from palpate_bus.access import watched
+from palpate_bus.access import WATCHER, watched
 from palpate_bus.contract import Contract
 from palpate_bus.diagnostics import topic_statuses
 from palpate_bus.health import Seen
@@ -30,7 +30,8 @@ class ContractWatch:
     """Watches the bus of a run. `attend` it often."""
 
     def __init__(self, session: zenoh.Session, rules: Contract, domain: int, wallclock: bool = False) -> None:
-        heard = [rules.topics[name] for name in watched(rules)]
+        watching = [rules.topics[name] for name in watched(rules)]
+        heard = [topic for topic in watching if topic.producer != WATCHER or topic.open]  # it need not listen to itself
         fast = [topic.name for topic in heard if topic.periodic and topic.period_ms < FAST_MS]
         self._slow = [topic.name for topic in heard if topic.name not in fast]
         self._turns = cycle(fast)
