@@ -101,7 +101,7 @@ def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
     """Rotation matrix, shape (3, 3), of a unit quaternion. Raises ValueError if its norm is off by 1 % or more."""
     norm = float(np.sqrt(x * x + y * y + z * z + w * w))
     if not abs(norm - 1) < 0.01:
-        raise ValueError(f"set-point: quaternion ({x}, {y}, {z}, {w}) has norm {norm}: must be 1")
+        raise ValueError(f"set-point: pose.orientation = ({x}, {y}, {z}, {w}) has norm {norm}: must be 1")
     rotation: Array = pin.Quaternion(w / norm, x / norm, y / norm, z / norm).toRotationMatrix()
     return rotation
 

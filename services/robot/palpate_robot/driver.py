@@ -171,10 +171,10 @@ class Driver:
     def _judge(self, t: int, command: Command, gravity: Array) -> None:
         shape = np.shape(command.torque)
         if shape != (7,):
-            self._reject(t, Cause.INVALID_COMMAND, f"a torque command of shape {shape}, want (7,)")
+            self._reject(t, Cause.INVALID_COMMAND, f"control commands torques of shape {shape}, want (7,)")
             return
         if command.stamp > t + AHEAD:
-            self._reject(t, Cause.INVALID_COMMAND, f"a command of control stamped {(command.stamp - t) / 1e6:.0f} ms ahead")
+            self._reject(t, Cause.INVALID_COMMAND, f"control stamps its command {(command.stamp - t) / 1e6:.0f} ms ahead")
             return
         torques = command.torque.tolist()
         before, apart = self._before or torques, 1.0
@@ -183,10 +183,10 @@ class Driver:
         change = TORQUE_RATE * apart
         for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, torques, before, gravity.tolist(), strict=True):
             if torque - torque != 0.0:  # NaN or infinite
-                self._reject(t, Cause.INVALID_COMMAND, f"a torque command of {torque} N m for {joint}, want a finite one")
+                self._reject(t, Cause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
                 return
             if not -limit <= torque + weight <= limit:
-                text = f"{joint} commanded {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
+                text = f"control commands {joint} {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
                 self._reject(t, Cause.TORQUE_LIMIT, text)
                 return
             if not -change <= torque - last <= change:
