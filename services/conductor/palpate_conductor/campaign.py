@@ -22,7 +22,7 @@ from palpate_bus.stamps import NS, nanoseconds
 from palpate_bus.zenoh_config import close_session, open_session
 from palpate_models.load import load_scenario
 
-from palpate_conductor.conductor import Patience
+from palpate_conductor.conductor import Patience, RunFailed
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
 from palpate_conductor.run import WORKERS, Progress, RunResult, conduct, write_scenario_files
 
@@ -30,7 +30,7 @@ SETTINGS: Final = (
     "exam.region_m=[0.03, 0.03]",
     "exam.centre_m=[-0.055, -0.055]",
     "camera.frames=2",
-    "limits.release_patience_s=1.0",
+    "limits.release_patience_s=0.5",
 )
 """A small region on the lesion of rlq_guarding, so that a case takes seconds, and nobody waits long for an operator."""
 PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=8.0)
@@ -41,10 +41,18 @@ CONTACT_S: Final = 0.3
 FORCE_LIMIT_N: Final = 25.0
 PROCESS_KINDS: Final = ("kill", "freeze", "jump")
 MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
+WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
+COMPLETE: Final = "complete"
 LASTING: Final = frozenset({"nan", "stamp"})
 """Kinds that hit every message from then on; the others one."""
 BEFORE_CONTACT: Final = frozenset({"camera", "perception"})
 """Producers whose messages come before contact."""
+ASSESSES: Final = "assessment"
+"""The role whose faults may show after the scan only."""
+
+
+class CaseOver(RunFailed):
+    """Reaction and end of a case are known."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +103,7 @@ class Finding:
             self.injected_s is not None
             and not self.hung
             and self.peak_force_n <= FORCE_LIMIT_N
-            and (self.ended == "complete" or self.named)
+            and (self.ended in (COMPLETE, WENT_ON) or self.named)
         )
 
 
@@ -137,10 +145,22 @@ class _Watch:
             self.finding.detected_ms = round((monotonic() - self.since) * 1e3, 1)
             self.finding.sign = new[0]
         self.signs += new
+        end = self._end(progress.collected.exam)
+        if end is not None and not progress.trouble:  # else the conductor ends it itself, after what the survivors do is recorded
+            raise CaseOver(end)
         if monotonic() - self.since > HANG_S:
             self.finding.hung = True
             for child in self.local.running.values():
                 child.kill()
+
+    def _end(self, exam: Any | None) -> str | None:
+        """How the examination ended, as soon as that is sure: going home and the last second of a run tell nothing new."""
+        if exam is None:
+            return None
+        if exam.phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_DONE):
+            return COMPLETE if exam.phase == ExamState.PHASE_DONE else str(exam.message)
+        scanned = exam.phase == ExamState.PHASE_RETURN and not self.signs
+        return WENT_ON if scanned and self.target != ASSESSES else None
 
     def _strike(self, progress: Progress) -> None:
         exam = progress.collected.exam
@@ -235,10 +255,10 @@ def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
     finding.peak_force_n = round(max((f for t, f in forces if t >= split), default=0.0), 2)
     exam = collected.exam
     done = exam is not None and exam.phase == ExamState.PHASE_DONE
-    finding.ended = result.failure or ("complete" if done else str(exam.message if exam is not None else "never began"))
+    finding.ended = result.failure or (COMPLETE if done else str(exam.message if exam is not None else "never began"))
     if finding.injected_s is None:
         finding.ended = f"the fault was never done: {finding.ended}"
-    finding.reaction = _reaction(collected)
+    finding.reaction = _reaction(collected, finding.ended)
     said = [finding.sign, finding.ended, *watch.signs]
     words = " ".join(re.sub(r"^(supervisor|driver|planning): ", "", sentence) for sentence in said)  # not who said it
     producer = contract().topics[finding.where].producer if finding.where in contract().topics else finding.where
@@ -246,17 +266,18 @@ def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
     finding.named = any(name in words for name in (finding.where, producer, *readers))
 
 
-def _reaction(collected: Any) -> str:
+def _reaction(collected: Any, ended: str) -> str:
     """What the arm did, by the strongest that was seen."""
     held = [status for status in collected.status_changes if status.mode == RobotStatus.MODE_SAFE_HOLD]
     if held:
         return "safe hold"
     exam = collected.exam
-    if exam is not None and exam.phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_RETURN, ExamState.PHASE_RETRACT):
+    phases = (ExamState.PHASE_ABORTED, ExamState.PHASE_RETURN, ExamState.PHASE_RETRACT)
+    if exam is not None and exam.phase in phases and ended != WENT_ON:
         return "lifted off"
     if collected.supervisor is not None and collected.supervisor.level == SupervisorState.LEVEL_SOFT_STOP:
         return "soft stop"
-    return "none needed" if exam is not None and exam.phase == ExamState.PHASE_DONE else "run ended"
+    return "none needed" if ended in (COMPLETE, WENT_ON) else "run ended"
 
 
 def as_json(findings: Sequence[Finding]) -> list[dict[str, Any]]:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate_conductor.campaign import FORCE_LIMIT_N, MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, run_case
+from palpate_conductor.case_display import CaseDisplay
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
@@ -58,13 +59,15 @@ def faults(
     if not again:
         done = {(f.kind, f.where, f.mode) for f in found}
         todo = [case for case in todo if (case.kind, case.where, "wall clock" if case.wallclock else "lockstep") not in done]
-    with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder:
-        for number, case in enumerate(todo[:limit], 1):
+    todo = todo[:limit]
+    with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
+        display.tell(0, len(todo), "")
+        for number, case in enumerate(todo, 1):
             finding = run_case(case, Path(folder))
             found = [f for f in found if (f.kind, f.where, f.mode) != (finding.kind, finding.where, finding.mode)] + [finding]
             out.write_text(json.dumps(as_json(found), indent=1) + "\n", encoding="utf-8")
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
-            console.print(f"{number}/{len(todo[:limit])} {mark} {case.name}: {finding.sign or finding.ended}", highlight=False)
+            display.tell(number, len(todo), f"{mark} {case.name}: {finding.sign or finding.ended}")
     Console(width=max(WIDE, Console().width)).print(table(found))
     if doc is not None:
         doc.write_text(HEAD + markdown(found), encoding="utf-8")

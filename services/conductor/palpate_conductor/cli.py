@@ -6,6 +6,7 @@ import json
 import sys
 from contextlib import nullcontext
 from datetime import datetime
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -29,6 +30,7 @@ from palpate_conductor.evaluate import DEFAULT_CASES
 from palpate_conductor.evaluate import evaluate as run_evaluation
 from palpate_conductor.evaluate import table as evaluation_table
 from palpate_conductor.implementations import chosen_services
+from palpate_conductor.join import Absent, JoinError
 from palpate_conductor.own import OwnServiceError, own_services
 from palpate_conductor.page import write_page
 from palpate_conductor.processes import ProcessListError
@@ -72,6 +74,8 @@ RUN_EXAMPLES = """
 
   palpate run --service assessment=mine.py      a service of your own in place of ours
 
+  palpate run --without control                 waits until you start it: palpate join control
+
   palpate run --secure                          encrypted, and nobody does what is not his
 
   palpate run my.yaml --composed                all services in one process, for sweeps and debugging
@@ -91,6 +95,10 @@ def run(
     handover: Annotated[
         float, typer.Option(min=0, help="With --wallclock: seconds for which a stopped service's place is kept; see takeover.")
     ] = 0.0,
+    without: Annotated[
+        list[str] | None, typer.Option(metavar="ROLE", help="Leave a role to be started by you (palpate join); may be repeated.")
+    ] = None,
+    wait: Annotated[float, typer.Option(min=1, help="With --without: seconds to wait for it.")] = 300.0,
     record: Annotated[bool, typer.Option(help="Write recording.rrd and the MCAP recording.")] = True,
     secure: Annotated[bool, typer.Option("--secure", help="Mutual TLS, and each role may do what its row allows.")] = False,
     keys: Annotated[
@@ -117,10 +125,13 @@ def run(
         chosen = load_scenario(scenario, settings or (), seed)
         chosen_services(chosen)
         own = own_services(services or ())
-    except (ScenarioError, OwnServiceError) as error:
+        absent = Absent(tuple(without or ()), wait, partial(console.print, highlight=False, soft_wrap=True))
+    except (ScenarioError, OwnServiceError, JoinError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     if composed and (realtime or wallclock):
         _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
+    if without and (composed or set(without) & own.keys()):
+        _fail(console, EXIT_BAD_INPUT, "--without ROLE leaves out a process: it goes without --composed and --service ROLE=...")
     if handover and not wallclock:
         _fail(console, EXIT_BAD_INPUT, "--handover is for --wallclock: in lockstep every message of a service is awaited")
     if (composed and secure) or (keys and not secure):
@@ -140,7 +151,7 @@ def run(
                 pace = 1.0 if realtime else None
                 with SecureBus(folder.resolve(), keys) if secure else nullcontext() as bus:
                     result = run_distributed(
-                        chosen, folder.resolve(), display.tell, observers, pace, wallclock, None, bus, own, handover
+                        chosen, folder.resolve(), display.tell, observers, pace, wallclock, None, bus, own, handover, absent
                     )
     except (ProcessListError, OwnServiceError, BusConfigError, KeysError, OSError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))

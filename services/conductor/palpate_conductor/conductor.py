@@ -54,6 +54,10 @@ class Patience:
     """Without a finished tick before it says who blocks."""
     hard: float = 120.0
     """Without a finished tick before it ends the run."""
+    absent: tuple[str, ...] = ()
+    """Roles that somebody else starts ..."""
+    join: float = 300.0
+    """... and how long after all others have answered."""
 
 
 @dataclass
@@ -215,7 +219,8 @@ class Conductor:
 
     def _handshake(self, died: Callable[[], Mapping[str, str]]) -> None:
         ready: dict[str, list[str]] = {}
-        begin = monotonic()
+        begin = met = monotonic()
+        ours = set(self._roles) - set(self._patience.absent)
         while len(ready) < len(self._roles) or any(ready.values()):
             self._say(RunControl.HELLO)
             sleep(0.05)
@@ -226,14 +231,16 @@ class Conductor:
             for role, how in died().items():
                 self.abort(f"{role} died at start")
                 raise RunFailed(f"{role} died at start: {how}")
-            if monotonic() - begin > self._patience.start:
+            if not ours <= ready.keys():
+                met = monotonic()
+            waits_for_others = bool(self._patience.absent) and ours <= ready.keys()
+            since, patience = (met, self._patience.join) if waits_for_others else (begin, self._patience.start)
+            if monotonic() - since > patience:
                 silent = [role for role in self._roles if role not in ready]
                 deaf = "; ".join(f"{role} hears nothing on {', '.join(keys)}" for role, keys in ready.items() if keys)
                 self.abort("start timed out")
                 raise RunFailed(
-                    f"not ready after {self._patience.start:.0f} s: "
-                    + (f"no answer from {', '.join(silent)}. " if silent else "")
-                    + deaf
+                    f"not ready after {patience:.0f} s: " + (f"no answer from {', '.join(silent)}. " if silent else "") + deaf
                 )
 
     def _conduct(self, died: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 
 from palpate_models.load import ScenarioError
 from palpate_models.scenario import Scenario
@@ -51,6 +52,26 @@ def chosen_processes(scenario: Scenario, processes: Mapping[str, ServiceProcess]
         package = point.module.partition(".")[0]
         chosen[role] = replace(chosen[role], command=("python", "-m", package))
     return chosen
+
+
+class ImplementationError(ValueError):
+    """An implementation that cannot be started. Names the option, its value and what is allowed."""
+
+
+def installed_command(role: str, implementation: str, service: Path | None) -> tuple[str, ...] | None:
+    """The words that start a chosen implementation or a file of one's own; None for the default. Raises ImplementationError."""
+    if service is not None:
+        if not service.is_file():
+            raise ImplementationError(f"--service {service}: is no file")
+        return ("python", str(service.resolve()))
+    if implementation == DEFAULT:
+        return None
+    found = {point.name: point for point in entry_points(group="palpate.implementations")}
+    point = found.get(f"{role}.{implementation}")
+    if point is None:
+        known = sorted(name.partition(".")[2] for name in found if name.startswith(f"{role}."))
+        raise ImplementationError(f"--implementation {implementation}: for {role} there are {', '.join([DEFAULT, *known])}")
+    return ("python", "-m", point.module.partition(".")[0])
 
 
 def chosen_environment(scenario: Scenario) -> dict[str, str]:

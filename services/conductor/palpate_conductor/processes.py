@@ -135,10 +135,9 @@ class LocalProcesses:
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, process: ServiceProcess) -> None:
-        """Starts a service."""
-        environment = {
-            **os.environ,
+    def environment(self, process: ServiceProcess) -> dict[str, str]:
+        """What a service is given beyond the environment of this process."""
+        return {
             **{k: v for k, v in process.environment.items() if not k.startswith("PALPATE_ROUTER")},
             **FIXED,
             "PALPATE_SCENARIO": str(self._scenario_files[process.role]),
@@ -146,6 +145,10 @@ class LocalProcesses:
             **self.bus[process.role].to_env(),
             **self._extra,
         }
+
+    def start(self, process: ServiceProcess) -> None:
+        """Starts a service."""
+        environment = {**os.environ, **self.environment(process)}
         log = (self._out / "logs" / f"{process.role}.log").open("wb")
         self._logs.append(log)
         command = [sys.executable if process.command[0] == "python" else process.command[0], *process.command[1:]]

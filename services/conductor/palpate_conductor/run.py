@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from time import perf_counter
@@ -24,6 +24,7 @@ from palpate_models.scenario import Scenario
 from palpate_conductor.collector import Collected, Collector
 from palpate_conductor.conductor import Conductor, Patience, RunFailed
 from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
+from palpate_conductor.join import Absent
 from palpate_conductor.own import in_place, load
 from palpate_conductor.processes import LocalProcesses, compose_file, override_files, read_processes
 from palpate_conductor.secure import SecureBus
@@ -93,8 +94,11 @@ def run_distributed(
     secure: SecureBus | None = None,
     own: Mapping[str, Path] | None = None,
     handover_s: float = 0.0,
+    absent: Absent | None = None,
 ) -> RunResult:
     """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
+
+    Those of `absent` are left to somebody else to start.
 
     `own` gives the file that plays a role in place of the compose file's command. In a wall-clock run the place of a service that
     goes is kept for `handover_s`.
@@ -116,14 +120,21 @@ def run_distributed(
     try:
         session = open_session(local.bus["conductor"])
         for role in roles:
-            local.start(processes[role])
+            if absent is None or role not in absent.roles:
+                local.start(processes[role])
+        if absent is not None and absent.roles:
+            patience = replace(patience or Patience(), absent=absent.roles, join=absent.wait_s)
+            absent.call(out, {role: (processes[role].command, local.environment(processes[role])) for role in absent.roles})
 
         def died() -> Mapping[str, str]:
             return {role: _how(code) for role, code in local.ended().items()}
 
         try:
             tree = FrameTree(exam_input(scenario))
-            return conduct(session, roles, tell, died, realtime, wallclock, patience, begin, tree, handover_s)
+            result = conduct(session, roles, tell, died, realtime, wallclock, patience, begin, tree, handover_s)
+            if absent is not None and result.failure is not None:
+                result.failure = absent.explain(result.failure)
+            return result
         finally:
             close_session(session)
     finally:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -14,7 +13,7 @@ from palpate_bus.zenoh_config import BusOptions
 from rich.console import Console
 
 from palpate_conductor.handover import ROLES
-from palpate_conductor.implementations import DEFAULT
+from palpate_conductor.implementations import DEFAULT, ImplementationError, installed_command
 from palpate_conductor.processes import compose_file, read_processes
 from palpate_conductor.run import KNOWS_PHANTOM
 
@@ -26,21 +25,10 @@ class TakeoverError(ValueError):
 
 
 def command_of(role: str, implementation: str, service: Path | None) -> tuple[str, ...]:
-    """The words that start the process. Raises TakeoverError that names the option, its value and what is allowed."""
+    """The words that start the process. Raises TakeoverError or ImplementationError: the option, its value and what is allowed."""
     if role not in ROLES:
         raise TakeoverError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
-    if service is not None:
-        if not service.is_file():
-            raise TakeoverError(f"--service {service}: is no file")
-        return ("python", str(service.resolve()))
-    if implementation == DEFAULT:
-        return read_processes(compose_file(), (role,))[role].command
-    found = {point.name: point for point in entry_points(group="palpate.implementations")}
-    point = found.get(f"{role}.{implementation}")
-    if point is None:
-        known = sorted(name.partition(".")[2] for name in found if name.startswith(f"{role}."))
-        raise TakeoverError(f"--implementation {implementation}: for {role} there are {', '.join([DEFAULT, *known])}")
-    return ("python", "-m", point.module.partition(".")[0])
+    return installed_command(role, implementation, service) or read_processes(compose_file(), (role,))[role].command
 
 
 def environment_of(role: str, run: runs.Run) -> dict[str, str]:
@@ -74,7 +62,7 @@ def takeover(
         if not live:
             raise TakeoverError(f"no run {run or ''} is on; on this machine: {', '.join(r.name for r in runs.live()) or 'none'}")
         environment = {**os.environ, **environment_of(role, live[-1])}
-    except TakeoverError as error:
+    except (TakeoverError, ImplementationError) as error:
         Console(stderr=True).print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
     program = sys.executable if words[0] == "python" else words[0]

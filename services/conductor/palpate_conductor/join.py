@@ -1,0 +1,99 @@
+"""`palpate run --without ROLE` and `palpate join ROLE`: one process of a run is started by its user, under a debugger, say, or in
+another language. The run waits for it at its start.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from palpate_bus import runs
+from palpate_bus.contract import contract
+from rich.console import Console
+
+from palpate_conductor.implementations import DEFAULT, ImplementationError, installed_command
+
+FILE = "join.json"
+"""In the results folder: command and environment of each process that is left to its user."""
+EXIT_BAD_INPUT = 2
+
+
+class JoinError(ValueError):
+    """A role that cannot be left out or joined. Names the option and what is allowed."""
+
+
+@dataclass
+class Absent:
+    """Roles that a run waits for without starting them."""
+
+    roles: tuple[str, ...]
+    wait_s: float
+    """How long after all others are there, by wall clock."""
+    tell: Callable[[str], None]
+    """Hears where each is awaited and what joins it."""
+    _sentences: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = [name for name in contract().roles if name != "conductor"]
+        for role in self.roles:
+            if role not in known:
+                raise JoinError(f"--without {role}: allowed are {', '.join(known)}")
+
+    def call(self, out: Path, processes: Mapping[str, tuple[Sequence[str], Mapping[str, str]]]) -> None:
+        """Says who is awaited; `processes` gives command and environment of each."""
+        rows = {role: {"command": list(command), "environment": dict(given)} for role, (command, given) in processes.items()}
+        (out / FILE).write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        for role, (_, given) in processes.items():
+            place = given.get("PALPATE_LISTEN") or given.get("PALPATE_ROUTER", "")
+            self._sentences[role] = (
+                f"{role} is awaited at {place} for {self.wait_s:.0f} s: "
+                f"palpate join {role} --run {out.name} (or any program with the environment in {out / FILE})"
+            )
+            self.tell(self._sentences[role])
+
+    def explain(self, failure: str) -> str:
+        """The failure of a run, with what would have joined those who never answered."""
+        if "no answer from" not in failure:
+            return failure
+        return f"{failure.rstrip()} {'; '.join(words for role, words in self._sentences.items() if role in failure)}"
+
+
+def given_to(role: str, run: runs.Run) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Command and environment of a process that `run` waits for. Raises JoinError when it does not."""
+    try:
+        rows = json.loads((Path(run.out) / FILE).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise JoinError(
+            f"run {run.name} started all its services itself; start one with `palpate run --without {role}`"
+        ) from error
+    if role not in rows:
+        raise JoinError(f"run {run.name} does not wait for {role!r}, but for {', '.join(rows)}")
+    return tuple(rows[role]["command"]), rows[role]["environment"]
+
+
+def join(
+    role: Annotated[str, typer.Argument(help="The role that the run was told to do without.")],
+    implementation: Annotated[
+        str, typer.Option(help="An installed implementation, as in `--set <role>.implementation`.")
+    ] = DEFAULT,
+    service: Annotated[Path | None, typer.Option(metavar="FILE.py", help="A service of one's own instead.")] = None,
+    run: Annotated[str | None, typer.Option(help="Which run, by its results folder's name; by default the newest.")] = None,
+) -> NoReturn:
+    """Join a run that was started with --without ROLE; becomes that service."""
+    try:
+        live = [each for each in runs.live() if run is None or each.name == run]
+        if not live:
+            raise JoinError(f"no run {run or ''} is on; on this machine: {', '.join(r.name for r in runs.live()) or 'none'}")
+        words, environment = given_to(role, live[-1])
+        words = installed_command(role, implementation, service) or words
+    except (JoinError, ImplementationError) as error:
+        Console(stderr=True).print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+    program = sys.executable if words[0] == "python" else words[0]
+    os.execvpe(program, [program, *words[1:]], {**os.environ, **environment})
