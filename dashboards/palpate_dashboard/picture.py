@@ -30,8 +30,8 @@ PATIENCE_S = 400
 LOOK_S = 3.0
 SETTLED = 0.001
 """Part of the pixels that may still change between two looks."""
-DRAWN = 20_000
-"""Colours of a page on which the scene is drawn; before that it has a few hundred."""
+DRAWN = 3_000
+"""Colours of a page on which the scene is drawn; before that it has some hundreds to two thousand."""
 COLOURS = 256
 
 Page = Any

@@ -80,7 +80,7 @@ def test_keys_stop_and_release_a_live_run(mode: str, tmp_path: Path, monkeypatch
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path / "runs"))
     palpate = str(Path(sys.executable).with_name("palpate"))
     out = tmp_path / "out"
-    settings = ["exam.region_m=[0.06,0.06]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=10"]
+    settings = ["exam.region_m=[0.1,0.1]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=10"]  # a minute to join it
     words = [word for setting in settings for word in ("--set", setting)]
     with (tmp_path / "run.log").open("w") as log:
         running = subprocess.Popen([palpate, "run", mode, "--out", str(out), *words], stderr=log, stdout=log)
@@ -92,7 +92,7 @@ def test_keys_stop_and_release_a_live_run(mode: str, tmp_path: Path, monkeypatch
                 time.sleep(0.2)
             child, end = in_a_terminal([palpate, "dashboard", "--port", str(free_ports())])
             text = read_until(end, lambda text: "joined at" in text, 120)
-            assert HINT in text
+            assert HINT in text, text + (tmp_path / "run.log").read_text()
             for key, answer in ((b"s", "soft-stop: the arm retreats"), (b"r", "release: released"),
                                 (b"e", "stop: the driver holds"), (b"r", "release: released")):  # fmt: skip
                 os.write(end, key)
