@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_fmu.structure import Indices, structure_2, structure_3
 from palpate_fmu.variables import Kind, Role, Sizes, Variable, variables
 
 Array = NDArray[np.float64]
@@ -17,7 +18,10 @@ MODEL = "abdomen"
 """The model identifier: name of binaries and prefix of functions."""
 STEP_S = 1e-3
 """The step size a master should take."""
-SOURCES = ("component.c", "matrices.c", "phantom.c", "surface.c", "tissue.c")
+SOURCES = (
+    "component.c", "contact.c", "derivative.c", "exchange.c", "flow.c",
+    "matrices.c", "outputs.c", "phantom.c", "surface.c", "tissue.c",
+)  # fmt: skip
 
 UNITS: dict[str, dict[str, str]] = {
     "1": {},
@@ -46,6 +50,8 @@ def _causality(variable: Variable) -> dict[str, str]:
             "variability": "fixed" if variable.kind is Kind.FIXED else "tunable",
             "initial": "exact",
         }
+    if variable.kind is Kind.STATE:
+        return {"causality": "local", "variability": "continuous", "initial": "exact"}
     if variable.role is Role.CALCULATED:
         return {"causality": "calculatedParameter", "variability": "fixed", "initial": "calculated"}
     continuous = "discrete" if variable.integer else "continuous"
@@ -58,16 +64,18 @@ def _number(value: float, integer: bool) -> str:
 
 def _type_attributes(variable: Variable) -> dict[str, str]:
     attributes = {} if variable.unit is None else {"unit": variable.unit}
-    for name, bound in (("min", variable.low), ("max", variable.high)):
+    for name, bound in (("min", variable.low), ("max", variable.high), ("nominal", variable.nominal)):
         if bound is not None:
             attributes[name] = _number(bound, variable.integer)
     return attributes
 
 
-def _start(variable: Variable, starts: Mapping[str, Array]) -> Array | None:
+def _start(variable: Variable, starts: Mapping[str, Array], sizes: Sizes) -> Array | None:
     if variable.name in starts:
         return starts[variable.name]
-    return np.atleast_1d(np.asarray(variable.start, dtype=np.float64)) if variable.kind is Kind.INPUT else None
+    if not variable.settable:
+        return None
+    return np.broadcast_to(np.asarray(variable.start, dtype=np.float64), variable.extents(sizes)).ravel()
 
 
 def _units(root: ET.Element) -> None:
@@ -89,10 +97,7 @@ def _text(root: ET.Element) -> bytes:
 
 
 def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes) -> bytes:
-    """modelDescription.xml of FMI 3.0, where a variable is an array.
-
-    Outputs depend on no input of the same instant: a step sees its inputs, and a master finds no algebraic loop.
-    """
+    """modelDescription.xml of FMI 3.0, where a variable is an array."""
     root = ET.Element(
         "fmiModelDescription",
         fmiVersion="3.0",
@@ -103,38 +108,38 @@ def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Si
         license="Apache-2.0",
         variableNamingConvention="structured",
     )
+    can = {"modelIdentifier": MODEL, "canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
+    ET.SubElement(root, "ModelExchange", can, providesDirectionalDerivatives="true")
     ET.SubElement(
-        root,
-        "CoSimulation",
-        modelIdentifier=MODEL,
-        canHandleVariableCommunicationStepSize="true",
-        canGetAndSetFMUState="true",
-        canSerializeFMUState="true",
-        recommendedIntermediateInputSmoothness="0",
+        root, "CoSimulation", can, canHandleVariableCommunicationStepSize="true", recommendedIntermediateInputSmoothness="0"
     )
     _common(root)
-    table = variables(3)
+    table = variables(3, sizes)
+    references = {v.name: v.vr for v in table}
     parent = ET.SubElement(root, "ModelVariables")
     for variable in table:
         attributes = {"name": variable.name, "valueReference": str(variable.vr), "description": variable.doc}
         attributes |= _causality(variable) | _type_attributes(variable)
-        start = _start(variable, starts)
+        start = _start(variable, starts, sizes)
         if start is not None:
             attributes["start"] = " ".join(_number(value, variable.integer) for value in start)
+        if variable.rate_of:
+            attributes["derivative"] = str(references[variable.rate_of])
         element = ET.SubElement(parent, "Int32" if variable.integer else "Float64", attributes)
         for extent in variable.extents(sizes):
             ET.SubElement(element, "Dimension", start=str(extent))
-    structure = ET.SubElement(root, "ModelStructure")
-    outputs = [v for v in table if _causality(v)["causality"] == "output"]
-    calculated = [v for v in table if _causality(v)["causality"] == "calculatedParameter"]
-    knowns = " ".join(str(v.vr) for v in table if v.parameter or v.kind is Kind.INPUT)
-    for name, members, dependencies in (("Output", outputs, ""), ("InitialUnknown", [*outputs, *calculated], knowns)):
-        for variable in members:
-            ET.SubElement(structure, name, valueReference=str(variable.vr), dependencies=dependencies)
+    structure_3(root, sizes)
     return _text(root)
 
 
-def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes) -> bytes:
+def description_2(
+    token: str,
+    about: str,
+    starts: Mapping[str, Array],
+    sizes: Sizes,
+    coupled: Sequence[NDArray[np.intp]],
+    samples: NDArray[np.int32],
+) -> bytes:
     """modelDescription.xml of FMI 2.0, where each element of an array is a scalar."""
     root = ET.Element(
         "fmiModelDescription",
@@ -146,23 +151,19 @@ def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Si
         license="Apache-2.0",
         variableNamingConvention="structured",
     )
-    support = ET.SubElement(
-        root,
-        "CoSimulation",
-        modelIdentifier=MODEL,
-        canHandleVariableCommunicationStepSize="true",
-        canGetAndSetFMUstate="true",
-        canSerializeFMUstate="true",
-        canNotUseMemoryManagementFunctions="true",
-    )
-    files = ET.SubElement(support, "SourceFiles")
-    for name in ("fmi2.c", *SOURCES):
-        ET.SubElement(files, "File", name=name)
+    can = {"modelIdentifier": MODEL, "canNotUseMemoryManagementFunctions": "true"}
+    can |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
+    exchange = {"completedIntegratorStepNotNeeded": "true", "providesDirectionalDerivative": "true"}
+    for interface, own in (("ModelExchange", exchange), ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"})):
+        files = ET.SubElement(ET.SubElement(root, interface, can | own), "SourceFiles")
+        for name in ("fmi2.c", *SOURCES):
+            ET.SubElement(files, "File", name=name)
     _common(root)
     parent = ET.SubElement(root, "ModelVariables")
-    outputs, unknowns = [], []
-    for variable in variables(2):
-        start = _start(variable, starts)
+    table = variables(2, sizes)
+    indices = Indices(table, sizes)
+    for variable in table:
+        start = _start(variable, starts, sizes)
         causality = _causality(variable)
         for k, index in enumerate(product(*(range(1, extent + 1) for extent in variable.extents(sizes)))):
             suffix = f"[{','.join(map(str, index))}]" if index else ""
@@ -179,18 +180,10 @@ def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Si
             attributes = _type_attributes(variable)
             if start is not None:
                 attributes["start"] = _number(start[k], variable.integer)
+            if variable.rate_of:
+                attributes["derivative"] = str(next(indices.at(variable.rate_of, [k])))
             ET.SubElement(scalar, "Integer" if variable.integer else "Real", attributes)
-            if causality["causality"] == "output":
-                outputs.append(len(parent))
-            if causality["causality"] in ("output", "calculatedParameter"):
-                unknowns.append(len(parent))
-    structure = ET.SubElement(root, "ModelStructure")
-    for name, members in (("Outputs", outputs), ("InitialUnknowns", unknowns)):
-        group = ET.SubElement(structure, name)
-        for member in members:
-            unknown = ET.SubElement(group, "Unknown", index=str(member))
-            if name == "Outputs":
-                unknown.set("dependencies", "")
+    structure_2(root, sizes, coupled, samples)
     return _text(root)
 
 
@@ -222,7 +215,7 @@ def documentation(version: int, about: str, sizes: Sizes) -> bytes:
         ("variable", "size", "unit", "kind", "meaning"),
         *(
             (v.name, " x ".join(map(str, v.extents(sizes))), v.unit or "", _causality(v)["causality"], v.doc)
-            for v in variables(version)
+            for v in variables(version, sizes)
         ),
     ):
         line = ET.SubElement(table, "tr")

@@ -14,7 +14,8 @@ from palpate_models.scenario import Phantom, Scenario
 
 from palpate_fmu.compiling import compile_library, fmi_headers, platforms
 from palpate_fmu.description import MODEL, SOURCES, build_description, description_2, description_3, documentation
-from palpate_fmu.phantom_file import encode_phantom, sizes_of, start_values
+from palpate_fmu.phantom_file import encode_phantom, sample_vertices, sizes_of, start_values
+from palpate_fmu.structure import couplings
 from palpate_fmu.variables import c_table
 
 _NAMESPACE = uuid.UUID("6f1f5a0e-6a0c-5c7e-9a39-0d9b5c1f4a11")
@@ -62,17 +63,20 @@ def build_fmu(
     wanted = platforms(version, targets)
     model = model or build_phantom(phantom, seed)
     starts = start_values(phantom, radius_m)
-    sizes = sizes_of(model)
+    sizes = sizes_of(model, starts)
     token = _token(encode_phantom(model, starts, ""), version)
     about = f"Soft abdomen, {sizes.vertices} vertices, pressed by a sphere; abdomen frame (x left, y head, z outward), SI units"
-    describe = description_3 if version == 3 else description_2
+    if version == 3:
+        description = description_3(token, about, starts, sizes)
+    else:
+        description = description_2(token, about, starts, sizes, couplings(model), sample_vertices(model))
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "sources"
         names = write_sources(folder, version)
         if version == 3:
             (folder / "buildDescription.xml").write_bytes(build_description())
         files = {
-            "modelDescription.xml": describe(token, about, starts, sizes),
+            "modelDescription.xml": description,
             "documentation/index.html": documentation(version, about, sizes),
             "resources/phantom.bin": encode_phantom(model, starts, token),
             **{f"sources/{path.name}": path.read_bytes() for path in sorted(folder.iterdir())},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,18 +73,19 @@ def sample_vertices(model: PhantomModel, count: int = SAMPLES) -> NDArray[np.int
     return np.asarray(pool[chosen], dtype=np.int32)
 
 
-def sizes_of(model: PhantomModel) -> Sizes:
-    """The sizes of a phantom's mesh, and how many of its vertices are samples."""
-    return Sizes(len(model.vertices), len(model.triangles), len(sample_vertices(model)))
+def sizes_of(model: PhantomModel, starts: Mapping[str, Array]) -> Sizes:
+    """The sizes of a phantom's mesh, how many of its vertices are samples, and how many branches relax by its start values."""
+    relaxing = int(np.flatnonzero(starts["prony_g"]).max(initial=-1)) + 1
+    return Sizes(len(model.vertices), len(model.triangles), len(sample_vertices(model)), relaxing)
 
 
 def encode_phantom(model: PhantomModel, starts: dict[str, Array], token: str) -> bytes:
     """The phantom file."""
     laplacian = model.laplacian.copy()
     laplacian.sort_indices()
-    sizes = sizes_of(model)
+    sizes = sizes_of(model, starts)
     values = np.concatenate([starts[variable.name] for variable in parameters()])
-    counts = (sizes.vertices, laplacian.nnz, sizes.triangles, sizes.samples, len(values), 0)
+    counts = (sizes.vertices, laplacian.nnz, sizes.triangles, sizes.samples, len(values), sizes.branches)
     reals = (values, model.vertices, model.normals, model.areas, model.background, model.breathing, laplacian.data)
     integers = (laplacian.indptr, laplacian.indices, model.triangles, sample_vertices(model))
     return b"".join(

@@ -23,6 +23,7 @@ class Kind(StrEnum):
     INPUT = "INPUT"
     FIXED = "FIXED"
     TUNABLE = "TUNABLE"
+    STATE = "STATE"
     READ = "READ"
 
 
@@ -37,11 +38,12 @@ class Role(StrEnum):
 
 @dataclass(frozen=True)
 class Sizes:
-    """The sizes of a phantom's mesh."""
+    """The sizes of a phantom: of its mesh, and how many Prony branches it has."""
 
     vertices: int
     triangles: int
     samples: int
+    branches: int
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Variable:
     doc: str
     unit: str | None = None
     shape: tuple[int | str, ...] = ()
-    """Extents; `vertices`, `triangles` or `samples` stand for the phantom's."""
+    """Extents; the names of `Sizes` stand for the phantom's."""
     kind: Kind = Kind.READ
     role: Role = Role.OUTPUT
     group: str = "NONE"
@@ -63,14 +65,24 @@ class Variable:
     integer: bool = False
     low: float | None = None
     high: float | None = None
+    nominal: float | None = None
     start: float | tuple[float, ...] | None = None
     """The start value; for a parameter only where the phantom's scenario has none."""
     versions: tuple[int, ...] = (2, 3)
+    rate_of: str | None = None
+    """The continuous state of which this is the derivative by time."""
+    behind: bool = False
+    """Whether the C code keeps a pointer to the values; those whose extent is the phantom's always are."""
 
     @property
     def parameter(self) -> bool:
         """Whether it is set before or, if tunable, during the simulation and held."""
         return self.kind in (Kind.FIXED, Kind.TUNABLE)
+
+    @property
+    def settable(self) -> bool:
+        """Whether a master gives it a value, if only to start from."""
+        return self.kind is not Kind.READ
 
     def extents(self, sizes: Sizes) -> tuple[int, ...]:
         """Its shape for a phantom."""
@@ -102,8 +114,24 @@ def _parameter(
     return Variable(vr, name, member, doc, unit, shape, kind, integer=integer, low=low, high=high, start=start)
 
 
+def _state(
+    vr: int, rate_vr: int, name: str, rate: str, member: str, doc: str, shape: tuple[int | str, ...], behind: bool = False
+) -> tuple[Variable, Variable]:
+    """A continuous state of model exchange and its derivative."""
+    return (
+        Variable(
+            vr, name, f"arrays.{member}", doc, "m", shape, Kind.STATE, Role.LOCAL, low=-1, high=1, nominal=1e-3,
+            start=0.0, behind=behind,
+        ),
+        Variable(
+            rate_vr, rate, f"arrays.{member}_rate", f"Derivative of {name}", "m/s", shape, Kind.READ, Role.LOCAL,
+            group="RATES", rate_of=name, behind=behind,
+        ),
+    )  # fmt: skip
+
+
 TABLE: tuple[Variable, ...] = (
-    Variable(0, "time", "outputs.time", "Simulated time", "s", role=Role.INDEPENDENT, group="STATE", versions=(3,)),
+    Variable(0, "time", "outputs.time", "Simulated time", "s", role=Role.INDEPENDENT, group="STATE"),
     _input(1, "indenter_position", "inputs.position", "m", 10, (0.0, 0.0, 1.0), "Centre of the sphere at the end of the step"),
     _input(4, "indenter_velocity", "inputs.velocity", "m/s", 10, (0.0, 0.0, 0.0), "Velocity of the centre, for friction"),
     _input(7, "indenter_angular_velocity", "inputs.spin", "rad/s", 100, (0.0, 0.0, 0.0), "Angular velocity, for friction"),
@@ -127,6 +155,9 @@ TABLE: tuple[Variable, ...] = (
     _parameter(36, "breathing_rate", "1/min", 0, 60, "Breaths a minute", member="rate"),
     _parameter(37, "breathing_phase", "rad", -6.2831854, 6.2831854, "Phase of breathing at time 0", 0.0, member="phase"),
     _parameter(38, "lesion_count", None, 0, LESIONS, "How many entries of the lesion list count", integer=True),
+    _parameter(
+        39, "contact_time", "s", 1e-5, 0.1, "Model exchange: within which contact and friction are restored", 1e-3
+    ),
     _parameter(40, "prony_g", "1", 0, 1, "Relaxing fractions of the stiffness, sum below 1", shape=(BRANCHES,)),
     _parameter(44, "prony_tau", "s", 1e-4, 1e6, "Their time constants", shape=(BRANCHES,)),
     _parameter(48, "lesion_centre", "m", -10, 10, "Centre in the xy plane", shape=(LESIONS, 2)),
@@ -177,12 +208,23 @@ TABLE: tuple[Variable, ...] = (
         5008, "triangles", "arrays.triangles", "Vertex indices from 0, counter-clockwise seen from outside", None,
         ("triangles", 3), role=Role.CALCULATED, integer=True, versions=(3,),
     ),
+    *_state(
+        100_000_000, 200_000_000, "displacement", "displacement_rate", "displacement",
+        "Inward displacement of every vertex, breathing excluded", ("vertices",),
+    ),
+    *_state(
+        300_000_000, 400_000_000, "relaxation", "relaxation_rate", "relaxation",
+        "What of it each Prony branch has relaxed", ("branches", "vertices"),
+    ),
+    *_state(
+        3000, 3003, "skin_stretch", "skin_stretch_rate", "stretch", "Stretch of the skin by friction", (3,), behind=True
+    ),
 )  # fmt: skip
 
 
-def variables(version: int) -> tuple[Variable, ...]:
-    """The variables of an FMI version (2 or 3)."""
-    return tuple(variable for variable in TABLE if version in variable.versions)
+def variables(version: int, sizes: Sizes) -> tuple[Variable, ...]:
+    """The variables of an FMI version (2 or 3) that a phantom of some sizes has any values of."""
+    return tuple(variable for variable in TABLE if version in variable.versions and variable.count(sizes))
 
 
 def parameters() -> Iterator[Variable]:
@@ -194,10 +236,9 @@ def c_table() -> str:
     """The table as C code, to be included where ROW is defined."""
     lines = ["/* Written by the exporter from its table of variables. */"]
     for variable in TABLE:
-        of, count = "PLAIN", variable.shape
-        if variable.shape and isinstance(variable.shape[0], str):
-            of, count = variable.shape[0].upper(), variable.shape[1:]
-        each = prod(extent for extent in count if isinstance(extent, int))
+        own = [extent for extent in variable.shape if isinstance(extent, str)]
+        of = own[0].upper() if own else "BEHIND" if variable.behind else "PLAIN"
+        each = prod(extent for extent in variable.shape if isinstance(extent, int))
         low, high = (bound if variable.kind is not Kind.READ else 0.0 for bound in (variable.low, variable.high))
         what = f"{variable.vr}, {'INTEGER' if variable.integer else 'REAL'}, {variable.kind}, {of}, {each}"
         bounds = f"{float(low or 0)!r}, {float(high or 0)!r}"

@@ -34,13 +34,14 @@ static size_t row_count(const Component *c, const Row *row) {
     const size_t each = (size_t)row->count;
     switch (row->of) {
         case COUNT_VERTICES: return each * (size_t)c->phantom->n;
+        case COUNT_BRANCHES: return each * (size_t)c->phantom->branches * (size_t)c->phantom->n;
         case COUNT_TRIANGLES: return each * (size_t)c->phantom->m;
         case COUNT_SAMPLES: return each * (size_t)c->phantom->samples;
         default: return each;
     }
 }
 
-static char *row_data(Component *c, const Row *row) {
+char *component_data(Component *c, const Row *row) {
     char *place = (char *)c + row->offset;
     if (row->of != COUNT_PLAIN) {
         void *array;
@@ -56,7 +57,7 @@ static void start_values(Component *c) {
     c->inputs.position[2] = 1; /* out of reach of the abdomen */
     for (size_t r = 0; r < ROW_COUNT; r++) {
         const Row *row = &ROWS[r];
-        char *data = row_data(c, row);
+        char *data = component_data(c, row);
         if (row->access != ACCESS_FIXED && row->access != ACCESS_TUNABLE) continue;
         for (int i = 0; i < row->count; i++, k++) {
             if (row->type == TYPE_REAL) {
@@ -89,6 +90,15 @@ static int allocate(Component *c) {
     c->surface = surface_new(c->phantom);
     if (!c->matrices || !c->surface) return 0;
     c->tissue = tissue_new(c->phantom, c->matrices);
+    if (!c->tissue) return 0;
+    c->flow = flow_new(c->tissue);
+    if (!c->flow) return 0;
+    a->displacement = c->tissue->field;
+    a->relaxation = c->tissue->field + n;
+    a->stretch = c->tissue->state.stretch;
+    a->displacement_rate = c->flow->rate;
+    a->relaxation_rate = c->flow->rate + n;
+    a->stretch_rate = c->flow->rate + flow_states(c->phantom) - 3;
     a->inward = calloc(n, sizeof(double));
     a->position = calloc(3 * n, sizeof(double));
     a->normal = calloc(3 * n, sizeof(double));
@@ -100,14 +110,15 @@ static int allocate(Component *c) {
     a->background = c->matrices->plain;
     a->lesion = c->matrices->lesion;
     a->triangles = c->phantom->triangles;
-    return c->tissue && a->inward && a->position && a->normal && a->sample_inward && a->sample_position;
+    return a->inward && a->position && a->normal && a->sample_inward && a->sample_position;
 }
 
-Component *component_new(const char *resources, const char *token, Log log, void *environment) {
+Component *component_new(const char *resources, const char *token, int exchange, Log log, void *environment) {
     Component *c = calloc(1, sizeof *c);
     char error[400], *path;
     size_t length;
     if (!c) return NULL;
+    c->exchange = exchange;
     c->log = log;
     c->environment = environment;
     length = resources ? strlen(resources) : 0;
@@ -149,6 +160,9 @@ void component_free(Component *c) {
     free(c->arrays.normal);
     free(c->arrays.sample_inward);
     free(c->arrays.sample_position);
+    free(c->shadow_memory);
+    free(c->shadow);
+    flow_free(c->flow);
     tissue_free(c->tissue);
     surface_free(c->surface);
     matrices_free(c->matrices);
@@ -157,7 +171,8 @@ void component_free(Component *c) {
 }
 
 int component_expects(Component *c, int phase_is_right, const char *function) {
-    static const char *const NAMES[] = {"instantiated", "initialization mode", "step mode", "terminated"};
+    static const char *const NAMES[] = {"instantiated", "initialization mode",   "step mode",
+                                        "event mode",   "continuous-time mode", "terminated"};
     if (!phase_is_right) component_say(c, "%s is not allowed in the state: %s", function, NAMES[c->phase]);
     return phase_is_right;
 }
@@ -191,82 +206,12 @@ int component_find(Component *c, uint32_t vr, Type type, int flat, Slot *slot) {
     return 0;
 }
 
-static void assemble(Component *c) {
-    if (!c->stale_matrices) return;
-    matrices_assemble(c->matrices, c->phantom, &c->parameters);
-    c->stale_matrices = 0;
-}
-
-/* The wrench's share along the surface normal and across it; the indentation at the rest point beneath. */
-static void look_under(Component *c) {
-    const State *s = &c->tissue->state;
-    const double *p = s->moved ? s->at : c->inputs.position;
-    Outputs *o = &c->outputs;
-    RestPoint under;
-    double across = 0, along = 0;
-    assemble(c);
-    under = surface_nearest(c->surface, p, s->excursion, c->matrices->k_w);
-    for (int k = 0; k < 3; k++) {
-        o->point[k] = under.position[k];
-        o->normal[k] = under.normal[k];
-        along += s->force[k] * under.normal[k];
-    }
-    for (int k = 0; k < 3; k++) {
-        const double part = s->force[k] - along * under.normal[k];
-        across += part * part;
-    }
-    o->depth = c->parameters.radius - under.height;
-    o->k_w = under.k_w;
-    o->normal_force = along > 0 ? along : 0;
-    o->tangential_force = sqrt(across);
-}
-
-static void displace(Component *c) {
-    for (int32_t i = 0; i < c->phantom->n; i++) c->arrays.inward[i] = tissue_inward(c->tissue, i);
-    for (int32_t i = 0; i < c->phantom->samples; i++) c->arrays.sample_inward[i] = c->arrays.inward[c->phantom->sample[i]];
-}
-
-static void deform(Component *c) {
-    const Phantom *p = c->phantom;
-    displace(c);
-    for (int32_t i = 0; i < p->n; i++) {
-        for (int k = 0; k < 3; k++) {
-            c->arrays.position[3 * i + k] = p->vertices[3 * i + k] - c->arrays.inward[i] * p->normals[3 * i + k];
-        }
-    }
-    surface_normals(c->surface, c->arrays.inward, c->arrays.normal);
-}
-
-static void refresh(Component *c, Group group) {
-    const State *s = &c->tissue->state;
-    if (group == GROUP_NONE || c->fresh & 1u << group) return;
-    switch (group) {
-        case GROUP_MATRICES: assemble(c); break;
-        case GROUP_STATE:
-            memcpy(c->outputs.force, s->force, sizeof s->force);
-            memcpy(c->outputs.torque, s->torque, sizeof s->torque);
-            c->outputs.contacts = s->contacts;
-            c->outputs.excursion = s->excursion;
-            c->outputs.time = s->time;
-            break;
-        case GROUP_UNDER: look_under(c); break;
-        case GROUP_ENERGY:
-            assemble(c);
-            c->outputs.energy = tissue_energy(c->tissue);
-            break;
-        case GROUP_INWARD: displace(c); break;
-        case GROUP_SHAPE: deform(c); break;
-        default: break;
-    }
-    c->fresh |= 1u << group;
-}
-
 static size_t size_of(Type type) { return type == TYPE_REAL ? sizeof(double) : sizeof(int32_t); }
 
 int component_read(Component *c, const Slot *slot, void *values) {
     const size_t size = size_of(slot->row->type);
-    refresh(c, slot->row->group);
-    memcpy(values, row_data(c, slot->row) + slot->first * size, slot->count * size);
+    component_refresh(c, slot->row->group);
+    memcpy(values, component_data(c, slot->row) + slot->first * size, slot->count * size);
     return 1;
 }
 
@@ -279,6 +224,10 @@ int component_check(Component *c, const Slot *slot, const void *values) {
     }
     if (c->phase == PHASE_TERMINATED || (row->access == ACCESS_FIXED && !before)) {
         component_say(c, "%s cannot be set any more: it is fixed after initialization", row->name);
+        return 0;
+    }
+    if (row->access == ACCESS_STATE && !before && !c->exchange) {
+        component_say(c, "%s cannot be set any more: in co-simulation it is the FMU's after initialization", row->name);
         return 0;
     }
     for (size_t i = 0; i < slot->count; i++) {
@@ -301,15 +250,16 @@ int component_check(Component *c, const Slot *slot, const void *values) {
 
 void component_write(Component *c, const Slot *slot, const void *values) {
     const size_t size = size_of(slot->row->type);
-    char *data = row_data(c, slot->row) + slot->first * size;
+    char *data = component_data(c, slot->row) + slot->first * size;
     if (memcmp(data, values, slot->count * size) == 0) return;
     memcpy(data, values, slot->count * size);
-    c->fresh &= ~(1u << GROUP_UNDER);
+    if (c->exchange || slot->row->access == ACCESS_STATE) c->fresh &= 1u << GROUP_MATRICES;
+    else c->fresh &= ~(1u << GROUP_UNDER | 1u << GROUP_RATES);
     if (slot->row->access == ACCESS_FIXED) {
         c->stale_matrices = 1;
         c->fresh = 0;
     }
-    if (slot->row->access != ACCESS_INPUT) c->tissue->parameters = c->parameters;
+    if (slot->row->access == ACCESS_FIXED || slot->row->access == ACCESS_TUNABLE) c->tissue->parameters = c->parameters;
 }
 
 int component_enter_initialization(Component *c, double start, int has_stop, double stop) {
@@ -320,9 +270,20 @@ int component_enter_initialization(Component *c, double start, int has_stop, dou
     }
     c->has_stop = has_stop;
     c->stop = stop;
-    tissue_reset(c->tissue, start);
+    tissue_begin(c->tissue, start);
     c->phase = PHASE_INITIALIZATION;
     c->fresh = 0;
+    return 1;
+}
+
+/* In model exchange a Prony branch is a state, of which the phantom fixed the number. */
+static int branches_suffice(Component *c) {
+    for (int32_t k = c->phantom->branches; k < BRANCHES; k++) {
+        if (c->parameters.prony_g[k] <= 0) continue;
+        component_say(c, "prony_g[%ld] = %g needs a branch, but for model exchange this FMU was built with %ld", (long)k + 1,
+                      c->parameters.prony_g[k], (long)c->phantom->branches);
+        return 0;
+    }
     return 1;
 }
 
@@ -334,11 +295,12 @@ static int parameters_agree(Component *c) {
         component_say(c, "prony_g must sum to less than 1, not %g", relaxing);
         return 0;
     }
-    assemble(c);
+    component_assemble(c);
     if (!isfinite(c->matrices->rate)) {
         component_say(c, "the stiffness of this phantom is out of all bounds");
         return 0;
     }
+    if (c->exchange) return branches_suffice(c);
     needed = matrices_substeps(c->matrices, PERIOD_S);
     if (needed > MOST_SUBSTEPS) {
         component_say(c,
@@ -354,8 +316,8 @@ int component_exit_initialization(Component *c) {
     if (!component_expects(c, c->phase == PHASE_INITIALIZATION, "leaving initialization mode")) return 0;
     if (!parameters_agree(c)) return 0;
     c->tissue->parameters = c->parameters;
-    tissue_reset(c->tissue, c->tissue->state.time);
-    c->phase = PHASE_STEP;
+    tissue_begin(c->tissue, c->tissue->state.time);
+    c->phase = c->exchange ? PHASE_EVENT : PHASE_STEP;
     c->fresh &= 1u << GROUP_MATRICES;
     return 1;
 }
@@ -386,7 +348,8 @@ int component_step(Component *c, double time, double dt) {
 }
 
 int component_terminate(Component *c) {
-    if (!component_expects(c, c->phase == PHASE_STEP, "termination")) return 0;
+    const int running = c->phase == PHASE_STEP || c->phase == PHASE_EVENT || c->phase == PHASE_CONTINUOUS;
+    if (!component_expects(c, running, "termination")) return 0;
     c->phase = PHASE_TERMINATED;
     return 1;
 }
@@ -403,6 +366,7 @@ void component_save(const Component *c, Snapshot *s) {
     s->stop = c->stop;
     s->has_stop = c->has_stop;
     s->phase = (int32_t)c->phase;
+    s->exchange = c->exchange;
     memcpy(s->field, c->tissue->field, field_size(c));
 }
 
@@ -410,6 +374,10 @@ int component_load(Component *c, const Snapshot *s, size_t size) {
     if (size != component_snapshot_size(c) || s->phase < PHASE_INSTANTIATED || s->phase > PHASE_TERMINATED ||
         s->parameters.lesion_count < 0 || s->parameters.lesion_count > LESIONS) {
         component_say(c, "this is not a state of this FMU");
+        return 0;
+    }
+    if (s->exchange != c->exchange) {
+        component_say(c, "this is the state of an instance for the other of model exchange and co-simulation");
         return 0;
     }
     if (memcmp(&c->parameters, &s->parameters, sizeof c->parameters) != 0) c->stale_matrices = 1;
@@ -421,7 +389,7 @@ int component_load(Component *c, const Snapshot *s, size_t size) {
     c->tissue->parameters = s->parameters;
     c->tissue->state = s->state;
     memcpy(c->tissue->field, s->field, field_size(c));
-    if (c->phase >= PHASE_STEP) assemble(c);
+    if (c->phase >= PHASE_STEP) component_assemble(c);
     tissue_restore(c->tissue);
     c->fresh = 0;
     return 1;

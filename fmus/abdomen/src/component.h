@@ -2,18 +2,23 @@
 #ifndef PALPATE_COMPONENT_H
 #define PALPATE_COMPONENT_H
 
+#include "flow.h"
 #include "surface.h"
 #include "tissue.h"
 
 typedef enum { TYPE_REAL, TYPE_INTEGER } Type;
-typedef enum { ACCESS_READ, ACCESS_INPUT, ACCESS_FIXED, ACCESS_TUNABLE } Access;
-typedef enum { PHASE_INSTANTIATED, PHASE_INITIALIZATION, PHASE_STEP, PHASE_TERMINATED } Phase;
+typedef enum { ACCESS_READ, ACCESS_INPUT, ACCESS_FIXED, ACCESS_TUNABLE, ACCESS_STATE } Access;
+
+/* Step mode is that of co-simulation; event and continuous-time mode are those of model exchange. */
+typedef enum { PHASE_INSTANTIATED, PHASE_INITIALIZATION, PHASE_STEP, PHASE_EVENT, PHASE_CONTINUOUS, PHASE_TERMINATED } Phase;
 
 /* What has to be brought up to date before a variable is read. */
-typedef enum { GROUP_NONE, GROUP_MATRICES, GROUP_STATE, GROUP_UNDER, GROUP_ENERGY, GROUP_INWARD, GROUP_SHAPE } Group;
+typedef enum {
+    GROUP_NONE, GROUP_MATRICES, GROUP_RATES, GROUP_STATE, GROUP_UNDER, GROUP_ENERGY, GROUP_INWARD, GROUP_SHAPE
+} Group;
 
-/* How many values a variable has: a number, or so many a vertex, triangle or sample. */
-typedef enum { COUNT_PLAIN, COUNT_VERTICES, COUNT_TRIANGLES, COUNT_SAMPLES } CountOf;
+/* How many values a variable has: a number, or a number behind a pointer, or so many a vertex, branch and vertex, and so on. */
+typedef enum { COUNT_PLAIN, COUNT_BEHIND, COUNT_VERTICES, COUNT_BRANCHES, COUNT_TRIANGLES, COUNT_SAMPLES } CountOf;
 
 typedef void (*Log)(void *environment, const char *message);
 
@@ -30,8 +35,14 @@ typedef struct {
     int32_t unused;
 } Outputs;
 
-/* Arrays that belong to the surface; some point into the phantom. */
+/* Arrays; some point into the phantom, the tissue or the flow. */
 typedef struct {
+    double *displacement;      /* (n) */
+    double *relaxation;        /* (branches, n) */
+    double *stretch;           /* (3) */
+    double *displacement_rate; /* (n) */
+    double *relaxation_rate;   /* (branches, n) */
+    double *stretch_rate;      /* (3) */
     double *inward;          /* (n) */
     double *position;        /* (n, 3) */
     double *normal;          /* (n, 3) */
@@ -45,16 +56,20 @@ typedef struct {
     double *sample_position; /* (samples, 3) */
 } Arrays;
 
-typedef struct {
+typedef struct Component {
     Phantom *phantom;
     Matrices *matrices;
     Surface *surface;
     Tissue *tissue;
+    Flow *flow;
+    struct Component *shadow; /* holds a direction and the change along it, where this holds values */
+    double *shadow_memory;    /* of its arrays */
     Parameters parameters;
     Inputs inputs;
     Outputs outputs;
     Arrays arrays;
     Phase phase;
+    int exchange;      /* whether it is for model exchange; otherwise for co-simulation */
     double stop;       /* [s] */
     int has_stop;
     int stale_matrices;
@@ -90,11 +105,13 @@ typedef struct {
     double stop;
     int32_t has_stop;
     int32_t phase;
+    int32_t exchange;
+    int32_t unused;
     double field[]; /* (1 + BRANCHES, n) */
 } Snapshot;
 
 /* Reads the phantom from the FMU's resources; NULL (and a message) if that fails or `token` is not the phantom's. */
-Component *component_new(const char *resources, const char *token, Log log, void *environment);
+Component *component_new(const char *resources, const char *token, int exchange, Log log, void *environment);
 void component_free(Component *component);
 void component_say(const Component *component, const char *format, ...);
 
@@ -109,6 +126,13 @@ int component_step(Component *c, double time, double dt);
 int component_reset(Component *c);
 int component_terminate(Component *c);
 int component_expects(Component *c, int phase_is_right, const char *function);
+
+/* Where a component keeps a variable. */
+char *component_data(Component *c, const Row *row);
+
+/* outputs.c: brings matrices, or what a group of variables shows, up to date. */
+void component_assemble(Component *c);
+void component_refresh(Component *c, Group group);
 
 size_t component_snapshot_size(const Component *c);
 void component_save(const Component *c, Snapshot *snapshot);

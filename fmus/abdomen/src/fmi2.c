@@ -1,10 +1,10 @@
-/* FMI 2.0 for co-simulation. Every failure is an fmi2Error with a message, and leaves the instance as it was. */
+/* FMI 2.0 for co-simulation and model exchange. Every failure is an fmi2Error with a message, and leaves the instance as it was. */
 #include "fmi2Functions.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-#include "component.h"
+#include "exchange.h"
 
 typedef struct {
     Component *core;
@@ -94,13 +94,8 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
     i->name = malloc(instanceName ? strlen(instanceName) + 1 : 1);
     if (i->name) strcpy(i->name, instanceName ? instanceName : "");
     path = path_of(fmuResourceLocation);
-    if (fmuType != fmi2CoSimulation) {
-        forward(i, "this FMU is for co-simulation only");
-    } else if (!path) {
-        forward(i, "the location of the resources is not a file URI");
-    } else {
-        i->core = component_new(path, fmuGUID, forward, i);
-    }
+    if (path) i->core = component_new(path, fmuGUID, fmuType == fmi2ModelExchange, forward, i);
+    else forward(i, "the location of the resources is not a file URI");
     free(path);
     if (i->core) return i;
     free(i->name);
@@ -249,8 +244,10 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte serializedSta
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference vUnknown_ref[], size_t nUnknown,
                                         const fmi2ValueReference vKnown_ref[], size_t nKnown, const fmi2Real dvKnown[],
                                         fmi2Real dvUnknown[]) {
-    (void)vUnknown_ref, (void)nUnknown, (void)vKnown_ref, (void)nKnown, (void)dvKnown, (void)dvUnknown;
-    return refuse(c, "a directional derivative");
+    Component *core = core_of(c);
+    const Derivative derivative = {1, vUnknown_ref, vKnown_ref, nUnknown, nKnown, dvKnown, nKnown, dvUnknown, nUnknown};
+    if ((nUnknown && (!vUnknown_ref || !dvUnknown)) || (nKnown && (!vKnown_ref || !dvKnown))) return fmi2Error;
+    return status(core && exchange_derive(core, &derivative));
 }
 
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2Integer order[],
@@ -298,4 +295,65 @@ fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind s, fmi2Boo
 fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind s, fmi2String *value) {
     (void)s, (void)value;
     return refuse(c, "an asynchronous step");
+}
+
+/* Model exchange. */
+
+fmi2Status fmi2EnterEventMode(fmi2Component c) {
+    Component *core = core_of(c);
+    return status(core && exchange_enter(core, PHASE_EVENT));
+}
+
+/* There are none, and no events: contact is continuous. */
+fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *eventInfo) {
+    static const fmi2EventInfo NOTHING = {fmi2False, fmi2False, fmi2False, fmi2False, fmi2False, 0};
+    Component *core = core_of(c);
+    if (!core || !eventInfo || !exchange_ready(core, "new discrete states")) return fmi2Error;
+    *eventInfo = NOTHING;
+    return fmi2OK;
+}
+
+fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) {
+    Component *core = core_of(c);
+    return status(core && exchange_enter(core, PHASE_CONTINUOUS));
+}
+
+fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean noSetFMUStatePriorToCurrentPoint, fmi2Boolean *enterEventMode,
+                                       fmi2Boolean *terminateSimulation) {
+    Component *core = core_of(c);
+    (void)noSetFMUStatePriorToCurrentPoint;
+    if (!core || !exchange_ready(core, "a completed integrator step")) return fmi2Error;
+    if (enterEventMode) *enterEventMode = fmi2False;
+    if (terminateSimulation) *terminateSimulation = fmi2False;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) {
+    Component *core = core_of(c);
+    return status(core && exchange_time(core, time));
+}
+
+fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t nx) {
+    Component *core = core_of(c);
+    return status(core && x && exchange_set_states(core, x, nx));
+}
+
+fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx) {
+    Component *core = core_of(c);
+    return status(core && derivatives && exchange_rates(core, derivatives, nx));
+}
+
+fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real eventIndicators[], size_t ni) {
+    (void)eventIndicators;
+    return ni ? refuse(c, "an event indicator") : status(c != NULL);
+}
+
+fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t nx) {
+    Component *core = core_of(c);
+    return status(core && x && exchange_get_states(core, x, nx));
+}
+
+fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal[], size_t nx) {
+    Component *core = core_of(c);
+    return status(core && x_nominal && exchange_nominals(core, x_nominal, nx));
 }

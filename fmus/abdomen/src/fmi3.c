@@ -1,10 +1,10 @@
-/* FMI 3.0 for co-simulation. Every failure is an fmi3Error with a message, and leaves the instance as it was. */
+/* FMI 3.0 for co-simulation and model exchange. Every failure is an fmi3Error with a message, and leaves the instance as it was. */
 #include "fmi3Functions.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-#include "component.h"
+#include "exchange.h"
 
 typedef struct {
     Component *core;
@@ -53,7 +53,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
     if (eventModeUsed || nRequiredIntermediateVariables) {
         forward(instance, "this FMU has neither event mode nor intermediate variables");
     } else {
-        instance->core = component_new(resourcePath, instantiationToken, forward, instance);
+        instance->core = component_new(resourcePath, instantiationToken, 0, forward, instance);
     }
     if (instance->core) return instance;
     free(instance);
@@ -63,8 +63,14 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
 fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
                                           fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
                                           fmi3LogMessageCallback logMessage) {
-    (void)instanceName, (void)instantiationToken, (void)resourcePath, (void)visible, (void)loggingOn;
-    if (logMessage) logMessage(instanceEnvironment, fmi3Error, "logStatusError", "this FMU is for co-simulation only");
+    Instance *instance = calloc(1, sizeof *instance);
+    (void)instanceName, (void)visible, (void)loggingOn;
+    if (!instance) return NULL;
+    instance->environment = instanceEnvironment;
+    instance->log = logMessage;
+    instance->core = component_new(resourcePath, instantiationToken, 1, forward, instance);
+    if (instance->core) return instance;
+    free(instance);
     return NULL;
 }
 
@@ -73,9 +79,10 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String instanceName, fmi3Stri
                                                fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage,
                                                fmi3ClockUpdateCallback clockUpdate, fmi3LockPreemptionCallback lockPreemption,
                                                fmi3UnlockPreemptionCallback unlockPreemption) {
+    (void)instanceName, (void)instantiationToken, (void)resourcePath, (void)visible, (void)loggingOn;
     (void)clockUpdate, (void)lockPreemption, (void)unlockPreemption;
-    return fmi3InstantiateModelExchange(instanceName, instantiationToken, resourcePath, visible, loggingOn, instanceEnvironment,
-                                        logMessage);
+    if (logMessage) logMessage(instanceEnvironment, fmi3Error, "logStatusError", "this FMU is not for scheduled execution");
+    return NULL;
 }
 
 void fmi3FreeInstance(fmi3Instance instance) {
@@ -296,8 +303,10 @@ fmi3Status fmi3GetVariableDependencies(fmi3Instance instance, fmi3ValueReference
 fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[], size_t nUnknowns,
                                         const fmi3ValueReference knowns[], size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
                                         fmi3Float64 sensitivity[], size_t nSensitivity) {
-    (void)unknowns, (void)nUnknowns, (void)knowns, (void)nKnowns, (void)seed, (void)nSeed, (void)sensitivity, (void)nSensitivity;
-    return refuse(instance, "a directional derivative");
+    Component *c = core_of(instance);
+    const Derivative derivative = {0, unknowns, knowns, nUnknowns, nKnowns, seed, nSeed, sensitivity, nSensitivity};
+    if ((nUnknowns && (!unknowns || !sensitivity)) || (nKnowns && (!knowns || !seed))) return fmi3Error;
+    return status(c && exchange_derive(c, &derivative));
 }
 
 fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[], size_t nUnknowns,
@@ -317,18 +326,31 @@ fmi3Status fmi3EnterConfigurationMode(fmi3Instance instance) { return refuse(ins
 
 fmi3Status fmi3ExitConfigurationMode(fmi3Instance instance) { return refuse(instance, "configuration mode"); }
 
-fmi3Status fmi3EnterEventMode(fmi3Instance instance) { return refuse(instance, "event mode"); }
+fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
+    Component *c = core_of(instance);
+    return status(c && exchange_enter(c, PHASE_EVENT));
+}
 
 fmi3Status fmi3EnterStepMode(fmi3Instance instance) { return refuse(instance, "event mode"); }
 
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance) { return refuse(instance, "event mode"); }
+fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance) {
+    Component *c = core_of(instance);
+    return status(c && exchange_ready(c, "evaluating discrete states"));
+}
 
+/* There are none, and no events: contact is continuous. */
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate, fmi3Boolean *terminateSimulation,
                                     fmi3Boolean *nominalsOfContinuousStatesChanged, fmi3Boolean *valuesOfContinuousStatesChanged,
                                     fmi3Boolean *nextEventTimeDefined, fmi3Float64 *nextEventTime) {
-    (void)discreteStatesNeedUpdate, (void)terminateSimulation, (void)nominalsOfContinuousStatesChanged;
-    (void)valuesOfContinuousStatesChanged, (void)nextEventTimeDefined, (void)nextEventTime;
-    return refuse(instance, "event mode");
+    Component *c = core_of(instance);
+    if (!c || !exchange_ready(c, "updating discrete states")) return fmi3Error;
+    if (discreteStatesNeedUpdate) *discreteStatesNeedUpdate = fmi3False;
+    if (terminateSimulation) *terminateSimulation = fmi3False;
+    if (nominalsOfContinuousStatesChanged) *nominalsOfContinuousStatesChanged = fmi3False;
+    if (valuesOfContinuousStatesChanged) *valuesOfContinuousStatesChanged = fmi3False;
+    if (nextEventTimeDefined) *nextEventTimeDefined = fmi3False;
+    if (nextEventTime) *nextEventTime = 0;
+    return fmi3OK;
 }
 
 fmi3Status fmi3GetIntervalDecimal(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
@@ -379,56 +401,67 @@ fmi3Status fmi3SetShiftFraction(fmi3Instance instance, const fmi3ValueReference 
     return refuse(instance, "a clock");
 }
 
-/* Model exchange and scheduled execution: importers look for the functions even where the description has neither. */
+/* Model exchange. */
 
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) { return refuse(instance, "model exchange"); }
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
+    Component *c = core_of(instance);
+    return status(c && exchange_enter(c, PHASE_CONTINUOUS));
+}
 
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
                                        fmi3Boolean *enterEventMode, fmi3Boolean *terminateSimulation) {
-    (void)noSetFMUStatePriorToCurrentPoint, (void)enterEventMode, (void)terminateSimulation;
-    return refuse(instance, "model exchange");
+    Component *c = core_of(instance);
+    (void)noSetFMUStatePriorToCurrentPoint;
+    if (!c || !exchange_ready(c, "a completed integrator step")) return fmi3Error;
+    if (enterEventMode) *enterEventMode = fmi3False;
+    if (terminateSimulation) *terminateSimulation = fmi3False;
+    return fmi3OK;
 }
 
 fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
-    (void)time;
-    return refuse(instance, "model exchange");
+    Component *c = core_of(instance);
+    return status(c && exchange_time(c, time));
 }
 
 fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 continuousStates[], size_t nContinuousStates) {
-    (void)continuousStates, (void)nContinuousStates;
-    return refuse(instance, "model exchange");
+    Component *c = core_of(instance);
+    return status(c && continuousStates && exchange_set_states(c, continuousStates, nContinuousStates));
 }
 
 fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[], size_t nContinuousStates) {
-    (void)derivatives, (void)nContinuousStates;
-    return refuse(instance, "model exchange");
+    Component *c = core_of(instance);
+    return status(c && derivatives && exchange_rates(c, derivatives, nContinuousStates));
 }
 
 fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 eventIndicators[], size_t nEventIndicators) {
-    (void)eventIndicators, (void)nEventIndicators;
-    return refuse(instance, "model exchange");
+    (void)eventIndicators;
+    return nEventIndicators ? refuse(instance, "an event indicator") : status(core_of(instance) != NULL);
 }
 
 fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 continuousStates[], size_t nContinuousStates) {
-    (void)continuousStates, (void)nContinuousStates;
-    return refuse(instance, "model exchange");
+    Component *c = core_of(instance);
+    return status(c && continuousStates && exchange_get_states(c, continuousStates, nContinuousStates));
 }
 
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[], size_t nContinuousStates) {
-    (void)nominals, (void)nContinuousStates;
-    return refuse(instance, "model exchange");
+    Component *c = core_of(instance);
+    return status(c && nominals && exchange_nominals(c, nominals, nContinuousStates));
 }
 
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *nEventIndicators) {
-    (void)nEventIndicators;
-    return refuse(instance, "model exchange");
+    if (!core_of(instance) || !nEventIndicators) return fmi3Error;
+    *nEventIndicators = 0;
+    return fmi3OK;
 }
 
 fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *nContinuousStates) {
-    (void)nContinuousStates;
-    return refuse(instance, "model exchange");
+    const Component *c = core_of(instance);
+    if (!c || !nContinuousStates) return fmi3Error;
+    *nContinuousStates = flow_states(c->phantom);
+    return fmi3OK;
 }
 
+/* Scheduled execution: importers look for the function even where the description has none. */
 fmi3Status fmi3ActivateModelPartition(fmi3Instance instance, fmi3ValueReference clockReference, fmi3Float64 activationTime) {
     (void)clockReference, (void)activationTime;
     return refuse(instance, "scheduled execution");

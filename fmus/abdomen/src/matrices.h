@@ -26,6 +26,13 @@ void matrices_free(Matrices *matrices);
 /* Assembles for a set of parameters. */
 void matrices_assemble(Matrices *matrices, const Phantom *phantom, const Parameters *parameters);
 
+/* Row i of a product with K (`value`) or C^-1 K (`relative`). */
+static inline double matrices_row(const Matrices *matrices, const double *value, const double *x, int32_t i) {
+    double sum = 0;
+    for (int32_t e = matrices->first[i]; e < matrices->first[i + 1]; e++) sum += value[e] * x[matrices->column[e]];
+    return sum;
+}
+
 /* How many equal steps a time `dt` [s] must be cut into; as a real number, as it may be huge. */
 double matrices_substeps(const Matrices *matrices, double dt);
 

@@ -16,6 +16,7 @@ typedef struct {
     double amplitude;                /* of breathing, half of peak to peak [m] */
     double rate;                     /* of breathing [1/min] */
     double phase;                    /* of breathing at time 0 [rad] */
+    double contact_time;             /* within which contact and friction are restored in model exchange [s] */
     double prony_g[BRANCHES];        /* relaxing fractions [1] */
     double prony_tau[BRANCHES];      /* time constants [s] */
     double lesion_centre[2 * LESIONS]; /* [m] */

@@ -5,12 +5,14 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "parameters.h"
+
 #ifdef _WIN32
 #include <wchar.h>
 #endif
 
 #define MAGIC "PALPHAN1"
-#define HEADER (8u + 64u + 5u * 4u + 4u + 8u)
+#define HEADER (8u + 64u + 6u * 4u + 8u)
 #define LARGEST 4000000
 
 typedef struct {
@@ -168,11 +170,12 @@ static Phantom *parse(const unsigned char *bytes, size_t size, const char **wron
     p->m = read_i32(&r);
     p->samples = read_i32(&r);
     p->values = read_i32(&r);
-    read_i32(&r); /* keeps the doubles aligned in the file */
+    p->branches = read_i32(&r);
     p->median_background = read_f64(&r);
     *wrong = "a count is out of range";
     if (p->n < 3 || p->n > LARGEST || p->nnz < p->n || p->nnz > 16 * LARGEST || p->m < 1 || p->m > 2 * LARGEST ||
-        p->samples < 0 || p->samples > p->n || p->values < 0 || p->values > 1000 || !(p->median_background > 0)) {
+        p->samples < 0 || p->samples > p->n || p->values < 0 || p->values > 1000 || p->branches < 0 ||
+        p->branches > BRANCHES || !(p->median_background > 0)) {
         phantom_free(p);
         return NULL;
     }

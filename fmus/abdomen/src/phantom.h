@@ -12,6 +12,7 @@ typedef struct {
     int32_t m;                /* triangles */
     int32_t samples;          /* vertices whose displacement FMI 2.0 shows */
     int32_t values;           /* start values of parameters */
+    int32_t branches;         /* Prony branches that are continuous states in model exchange */
     double median_background; /* [N/m^3] */
     double *start;            /* start values, in the order of the settable rows, shape (values) */
     double *vertices;         /* (n, 3) [m] */

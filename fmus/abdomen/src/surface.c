@@ -127,34 +127,52 @@ static int32_t project(const Surface *s, int32_t vertex, const double *p, double
     return chosen;
 }
 
-RestPoint surface_nearest(const Surface *s, const double *p, double excursion, const double *k_w) {
+/* What the rest point is made of: three corners with weights, and the vertex whose breathing moves them. */
+typedef struct {
+    int32_t vertex;
+    int32_t corners[3];
+    int32_t face; /* -1: the vertex alone */
+    double weights[3];
+    int far;
+} Foot;
+
+static Foot find_foot(const Surface *s, const double *p, double excursion) {
     const Phantom *ph = s->phantom;
-    RestPoint rest;
-    double least = HUGE_VAL, weights[3] = {1, 0, 0}, offset[3], moved[3], length, lift = 0, far;
-    int32_t vertex = 0, corners[3], f;
+    Foot foot = {0, {0, 0, 0}, -1, {1, 0, 0}, 0};
+    double least = HUGE_VAL, moved[3];
     for (int32_t i = 0; i < ph->n; i++) {
         double d[3];
         minus(p, ph->vertices + 3 * i, d);
         if (dot(d, d) < least) {
             least = dot(d, d);
-            vertex = i;
+            foot.vertex = i;
         }
     }
-    far = sqrt(least);
-    corners[0] = corners[1] = corners[2] = vertex;
-    if (far <= FAR_M && s->first[vertex] < s->first[vertex + 1]) {
-        for (int k = 0; k < 3; k++) moved[k] = p[k] - excursion * ph->breathing[vertex] * ph->normals[3 * vertex + k];
-        f = project(s, vertex, moved, weights);
-        if (f >= 0) memcpy(corners, ph->triangles + 3 * f, sizeof corners);
+    foot.far = sqrt(least) > FAR_M;
+    foot.corners[0] = foot.corners[1] = foot.corners[2] = foot.vertex;
+    if (!foot.far && s->first[foot.vertex] < s->first[foot.vertex + 1]) {
+        for (int k = 0; k < 3; k++) {
+            moved[k] = p[k] - excursion * ph->breathing[foot.vertex] * ph->normals[3 * foot.vertex + k];
+        }
+        foot.face = project(s, foot.vertex, moved, foot.weights);
+        if (foot.face >= 0) memcpy(foot.corners, ph->triangles + 3 * foot.face, sizeof foot.corners);
     }
+    return foot;
+}
+
+RestPoint surface_nearest(const Surface *s, const double *p, double excursion, const double *k_w) {
+    const Phantom *ph = s->phantom;
+    const Foot foot = find_foot(s, p, excursion);
+    RestPoint rest;
+    double offset[3], length, lift = 0;
     memset(&rest, 0, sizeof rest);
     for (int c = 0; c < 3; c++) {
         for (int k = 0; k < 3; k++) {
-            rest.normal[k] += weights[c] * ph->normals[3 * corners[c] + k];
-            rest.position[k] += weights[c] * ph->vertices[3 * corners[c] + k];
+            rest.normal[k] += foot.weights[c] * ph->normals[3 * foot.corners[c] + k];
+            rest.position[k] += foot.weights[c] * ph->vertices[3 * foot.corners[c] + k];
         }
-        lift += weights[c] * ph->breathing[corners[c]];
-        rest.k_w += weights[c] * k_w[corners[c]];
+        lift += foot.weights[c] * ph->breathing[foot.corners[c]];
+        rest.k_w += foot.weights[c] * k_w[foot.corners[c]];
     }
     length = sqrt(dot(rest.normal, rest.normal));
     for (int k = 0; k < 3; k++) {
@@ -162,8 +180,61 @@ RestPoint surface_nearest(const Surface *s, const double *p, double excursion, c
         rest.position[k] += excursion * lift * rest.normal[k];
     }
     minus(p, rest.position, offset);
-    rest.height = far <= FAR_M ? dot(offset, rest.normal) : sqrt(dot(offset, offset));
+    rest.height = foot.far ? sqrt(dot(offset, offset)) : dot(offset, rest.normal);
     return rest;
+}
+
+/* How the weights change when the point that was projected moves by dm: not at a corner, along an edge, linearly in a face. */
+static void weights_along(const Surface *s, const Foot *foot, const double *dm, double *change) {
+    const Phantom *ph = s->phantom;
+    int inner[3], count = 0;
+    memset(change, 0, 3 * sizeof *change);
+    if (foot->face < 0) return;
+    for (int c = 0; c < 3; c++) {
+        if (foot->weights[c] > 0) inner[count++] = c;
+    }
+    if (count == 3) {
+        change[1] = dot(s->slope + 6 * foot->face, dm);
+        change[2] = dot(s->slope + 6 * foot->face + 3, dm);
+        change[0] = -change[1] - change[2];
+    } else if (count == 2) {
+        double edge[3];
+        minus(ph->vertices + 3 * foot->corners[inner[1]], ph->vertices + 3 * foot->corners[inner[0]], edge);
+        change[inner[1]] = dot(edge, dm) / dot(edge, edge);
+        change[inner[0]] = -change[inner[1]];
+    }
+}
+
+RestPoint surface_nearest_along(const Surface *s, const double *p, double excursion, const double *k_w, const double *dp,
+                                double dexcursion) {
+    const Phantom *ph = s->phantom;
+    const Foot foot = find_foot(s, p, excursion);
+    const RestPoint rest = surface_nearest(s, p, excursion, k_w);
+    RestPoint change;
+    double dm[3], weight[3], blend[3] = {0, 0, 0}, offset[3], length, along, lift = 0, dlift = 0;
+    for (int k = 0; k < 3; k++) dm[k] = dp[k] - dexcursion * ph->breathing[foot.vertex] * ph->normals[3 * foot.vertex + k];
+    weights_along(s, &foot, dm, weight);
+    memset(&change, 0, sizeof change);
+    for (int c = 0; c < 3; c++) {
+        for (int k = 0; k < 3; k++) {
+            blend[k] += foot.weights[c] * ph->normals[3 * foot.corners[c] + k];
+            change.normal[k] += weight[c] * ph->normals[3 * foot.corners[c] + k];
+            change.position[k] += weight[c] * ph->vertices[3 * foot.corners[c] + k];
+        }
+        lift += foot.weights[c] * ph->breathing[foot.corners[c]];
+        dlift += weight[c] * ph->breathing[foot.corners[c]];
+        change.k_w += weight[c] * k_w[foot.corners[c]];
+    }
+    length = sqrt(dot(blend, blend));
+    along = dot(rest.normal, change.normal);
+    minus(p, rest.position, offset);
+    for (int k = 0; k < 3; k++) {
+        change.normal[k] = (change.normal[k] - rest.normal[k] * along) / length;
+        change.position[k] += (dexcursion * lift + excursion * dlift) * rest.normal[k] + excursion * lift * change.normal[k];
+    }
+    minus(dp, change.position, dm);
+    change.height = foot.far ? dot(offset, dm) / rest.height : dot(dm, rest.normal) + dot(offset, change.normal);
+    return change;
 }
 
 void surface_normals(const Surface *s, const double *inward, double *normals) {

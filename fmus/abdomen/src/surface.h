@@ -26,6 +26,10 @@ void surface_free(Surface *surface);
 /* The rest point nearest to `p` (3) [m] at a breathing excursion [m]; k_w (n) is interpolated. */
 RestPoint surface_nearest(const Surface *surface, const double *p, double excursion, const double *k_w);
 
+/* How the rest point changes when p moves by `dp` [m] and the excursion by `dexcursion` [m]. */
+RestPoint surface_nearest_along(const Surface *surface, const double *p, double excursion, const double *k_w, const double *dp,
+                                double dexcursion);
+
 /* Unit normals (n, 3) of the surface whose vertices have moved inward by (n) [m]: n + grad u, normalised. */
 void surface_normals(const Surface *surface, const double *inward, double *normals);
 

@@ -2,6 +2,7 @@
 #ifndef PALPATE_TISSUE_H
 #define PALPATE_TISSUE_H
 
+#include "contact.h"
 #include "matrices.h"
 #include "parameters.h"
 #include "phantom.h"
@@ -24,23 +25,13 @@ typedef struct {
     int32_t contacts;   /* how many */
 } State;
 
-/* Contact candidates: gathered into contiguous memory, `count` of them. */
-typedef struct {
-    int32_t count;
-    int32_t *index;
-    double *normals;   /* (count, 3) */
-    double *positions; /* (count, 3) [m] */
-    double *breathing;
-    double *damping;   /* [N s/m] */
-} Candidates;
-
 typedef struct {
     const Phantom *phantom;
     const Matrices *matrices;
     Parameters parameters;
     State state;
     double *field; /* u, then y_k: (1 + BRANCHES, n) [m] */
-    double *strain; /* (n) */
+    double *strain; /* (n), scratch */
     Candidates near;
 } Tissue;
 
@@ -50,6 +41,12 @@ void tissue_free(Tissue *tissue);
 /* Back to rest at `time` [s]. */
 void tissue_reset(Tissue *tissue, double time);
 
+/* Starts at `time` [s] from the field and the stretch that are there. */
+void tissue_begin(Tissue *tissue, double time);
+
+/* u - sum y (n) [m]: what the springs feel. */
+void tissue_strain(const Tissue *tissue, double *strain);
+
 /* Advances by `dt` [s] in `count` equal steps; the sphere moves straight from where it was to inputs->position. */
 void tissue_step(Tissue *tissue, const Inputs *inputs, double dt, long count);
 
@@ -58,6 +55,9 @@ void tissue_restore(Tissue *tissue);
 
 /* Breathing excursion [m] at a time [s]. */
 double tissue_excursion(const Parameters *parameters, double time);
+
+/* How fast it changes [m/s]. */
+double tissue_excursion_rate(const Parameters *parameters, double time);
 
 /* How far vertex i is from its place at rest [m] along its inward normal, breathing included. */
 double tissue_inward(const Tissue *tissue, int32_t i);

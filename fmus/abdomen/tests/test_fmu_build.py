@@ -14,7 +14,7 @@ import pytest
 from palpate_fmu.compiling import native, platforms
 from palpate_fmu.export import build_fmu, write_sources
 from palpate_fmu.instance import FmuInstance
-from palpate_fmu.phantom_file import ExportError, sizes_of
+from palpate_fmu.phantom_file import ExportError, sizes_of, start_values
 from palpate_fmu.probing import probe
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Lesion, Phantom, Stiffness
@@ -73,7 +73,7 @@ def test_sanitizers_find_nothing(version: int, request: pytest.FixtureRequest, p
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
     command = ["gcc", *STRICT, "-O1", "-g", *sanitizers, f"-DFMI_VERSION={version}", "-I.", "-o", str(binary)]
     subprocess.run([*command, str(HERE / "exercise.c"), *names, "-lm"], cwd=tmp_path / "c", check=True)
-    sizes = sizes_of(build_phantom(phantom, 1))
+    sizes = sizes_of(build_phantom(phantom, 1), start_values(phantom, 0.015))
     token = fmpy.read_model_description(str(path)).guid
     done = subprocess.run(
         [str(binary), str(folder / "resources"), token, str(sizes.vertices), str(sizes.triangles)],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -89,15 +88,3 @@ def test_libcosim_steps_it_too(fmu2: Path) -> None:
             expected.append(ours.get("contact_force"))
     np.testing.assert_allclose(forces, expected, rtol=1e-12, atol=1e-12)
     assert np.abs(expected).max() > 1
-
-
-def test_casadi_reads_its_description(fmu3: Path, tmp_path: Path) -> None:
-    """CasADi's DaeBuilder reads the whole description; it then takes FMUs for model exchange only, which this is not.
-
-    The day it takes co-simulation too, this test fails and is to be replaced by one that looks at inputs and outputs.
-    """
-    casadi = pytest.importorskip("casadi")
-    with zipfile.ZipFile(fmu3) as archive:
-        archive.extractall(tmp_path)
-    with pytest.raises(RuntimeError, match="must be of ModelExchange type"):
-        casadi.DaeBuilder("abdomen", str(tmp_path), {})

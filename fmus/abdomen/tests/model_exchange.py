@@ -1,0 +1,109 @@
+"""An FMU for model exchange as the tests drive it, and a phantom small enough for dense solvers."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import fmpy
+import numpy as np
+from fmpy import fmi2, fmi3
+from palpate_fmu.instance import read_variables
+from palpate_models.scenario import Lesion, Phantom
+
+Array = np.ndarray
+
+
+def coarse_phantom() -> Phantom:
+    return Phantom(lesions=(Lesion(centre_m=(-0.05, -0.05)),), edge_m=0.02)
+
+
+class Exchange:
+    """An instance in continuous-time mode, by FMPy; `values` are scalar parameters."""
+
+    def __init__(self, path: Path, values: dict[str, float] | None = None) -> None:
+        self.folder = fmpy.extract(str(path))
+        description = fmpy.read_model_description(self.folder)
+        self.older = description.fmiVersion == "2.0"
+        self.variables = read_variables(description)
+        kind = fmi2.FMU2Model if self.older else fmi3.FMU3Model
+        self.fmu: Any = kind(
+            guid=description.guid,
+            unzipDirectory=self.folder,
+            modelIdentifier=description.modelExchange.modelIdentifier,
+            instanceName="x",
+        )
+        self.fmu.instantiate()
+        for name, value in (values or {}).items():
+            self._set(name, [value])
+        if self.older:
+            self.fmu.setupExperiment()
+        self.fmu.enterInitializationMode()
+        self.fmu.exitInitializationMode()
+        (self.fmu.newDiscreteStates if self.older else self.fmu.updateDiscreteStates)()
+        self.fmu.enterContinuousTimeMode()
+        self.states: int = description.numberOfContinuousStates
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.fmu.terminate()
+        self.fmu.freeInstance()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _set(self, name: str, values: Any) -> None:
+        references = list(self.variables[name].references)
+        (self.fmu.setReal if self.older else self.fmu.setFloat64)(references, [float(value) for value in values])
+
+    def put(self, position: Array, velocity: Array, time: float = 0.0) -> None:
+        """Sets time and inputs."""
+        self.fmu.setTime(time)
+        self._set("indenter_position", position)
+        self._set("indenter_velocity", velocity)
+
+    def value(self, name: str) -> Array:
+        """A variable at what was set last, flat."""
+        v = self.variables[name]
+        if self.older:
+            return np.array(self.fmu.getReal(list(v.references)))
+        return np.array(self.fmu.getFloat64(list(v.references), nValues=v.size))
+
+    def rates(self, x: Array) -> Array:
+        """The derivatives of the states at x."""
+        pointer = np.ctypeslib.as_ctypes(np.ascontiguousarray(x))
+        rates = np.zeros(self.states)
+        self.fmu.setContinuousStates(pointer, self.states)
+        out = np.ctypeslib.as_ctypes(rates)
+        (self.fmu.getDerivatives if self.older else self.fmu.getContinuousStateDerivatives)(out, self.states)
+        return rates
+
+    def euler(self, x: Array, steps: int, h: float = 1e-3) -> Array:
+        """Explicit Euler with inputs held."""
+        for _ in range(steps):
+            x = x + h * self.rates(x)
+        return x
+
+    def runge_kutta(self, x: Array, steps: int, h: float) -> Array:
+        """The classical fourth-order method with inputs held."""
+        for _ in range(steps):
+            a = self.rates(x)
+            b = self.rates(x + h / 2 * a)
+            c = self.rates(x + h / 2 * b)
+            d = self.rates(x + h * c)
+            x = x + h / 6 * (a + 2 * b + 2 * c + d)
+        return x
+
+    def derivative(self, unknowns: list[str], knowns: dict[str, Array]) -> dict[str, Array]:
+        """The directional derivative of some variables along a direction of others."""
+        seed = np.concatenate([np.ravel(value) for value in knowns.values()]).astype(float)
+        sizes = [self.variables[name].size for name in unknowns]
+        known = [r for name in knowns for r in self.variables[name].references]
+        unknown = [r for name in unknowns for r in self.variables[name].references]
+        if self.older:
+            found = np.array(self.fmu.getDirectionalDerivative(unknown, known, seed.tolist()))
+        else:
+            found = np.array(self.fmu.getDirectionalDerivative(unknown, known, seed.tolist(), sum(sizes)))
+        return dict(zip(unknowns, np.split(found, np.cumsum(sizes)[:-1]), strict=True))
