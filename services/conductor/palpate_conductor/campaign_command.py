@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from palpate_conductor.campaign import FORCE_LIMIT_N, MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, run_case
@@ -67,7 +68,7 @@ def faults(
             found = [f for f in found if (f.kind, f.where, f.mode) != (finding.kind, finding.where, finding.mode)] + [finding]
             out.write_text(json.dumps(as_json(found), indent=1) + "\n", encoding="utf-8")
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
-            display.tell(number, len(todo), f"{mark} {case.name}: {finding.sign or finding.ended}")
+            display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDE, Console().width)).print(table(found))
     if doc is not None:
         doc.write_text(HEAD + markdown(found), encoding="utf-8")
@@ -96,7 +97,7 @@ def table(findings: Sequence[Finding]) -> Table:
     """For a terminal."""
     shown = Table(*COLUMNS, box=None)
     for finding in _sorted(findings):
-        shown.add_row(*_row(finding), style=None if finding.good else "bold red")
+        shown.add_row(*map(escape, _row(finding)), style=None if finding.good else "bold red")
     return shown
 
 

@@ -20,6 +20,7 @@ from palpate_bus.zenoh_config import BusConfigError, close_session, open_session
 from palpate_models.load import ScenarioError, exam_input, load_scenario, scenario_names
 from palpate_models.scenario import Scenario
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from palpate_conductor.bench import GROUPS
@@ -59,7 +60,7 @@ app = typer.Typer(
 
 
 def _fail(console: Console, status: int, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {message}", highlight=False, soft_wrap=True)
+    console.print(f"[bold red]palpate:[/] {escape(message)}", highlight=False, soft_wrap=True)
     raise typer.Exit(status)
 
 

@@ -16,6 +16,7 @@ import typer
 from palpate_bus import runs
 from palpate_bus.contract import contract
 from rich.console import Console
+from rich.markup import escape
 
 from palpate_conductor.implementations import DEFAULT, ImplementationError, installed_command
 
@@ -93,7 +94,7 @@ def join(
         words, environment = given_to(role, live[-1])
         words = installed_command(role, implementation, service) or words
     except (JoinError, ImplementationError) as error:
-        Console(stderr=True).print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
+        Console(stderr=True).print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
     program = sys.executable if words[0] == "python" else words[0]
     os.execvpe(program, [program, *words[1:]], {**os.environ, **environment})

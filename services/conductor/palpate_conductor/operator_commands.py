@@ -11,6 +11,7 @@ from palpate_bus import runs
 from palpate_bus.desk import NotAnswered, ask
 from palpate_bus.zenoh_config import BusOptions, close_session, open_session
 from rich.console import Console
+from rich.markup import escape
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
@@ -47,7 +48,7 @@ def _say(word: str, reason: str, name: str | None) -> None:
     try:
         answer, after_ms = _met(session, domain, word, reason)
     except NotAnswered as error:
-        console.print(f"[bold red]palpate:[/] {title}: {error}", highlight=False, soft_wrap=True)
+        console.print(f"[bold red]palpate:[/] {title}: {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_FAILED) from None
     finally:
         close_session(session)

@@ -10,6 +10,7 @@ from palpate_bus.messages import ExamState
 from palpate_bus.operator_keys import HINT, OperatorKeys
 from palpate_bus.stamps import NS
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
 
 from palpate_conductor.run import Progress as RunProgress
@@ -54,7 +55,7 @@ class RunDisplay:
     def tell(self, progress: RunProgress) -> None:
         """Shows where the run stands."""
         for sentence in progress.trouble[self._troubles :]:
-            self._console.print(f"[bold red]{sentence}[/]", highlight=False, soft_wrap=True)
+            self._console.print(f"[bold red]{escape(sentence)}[/]", highlight=False, soft_wrap=True)
         self._troubles = len(progress.trouble)
         self._obey(progress)
         exam = progress.collected.exam
@@ -70,7 +71,7 @@ class RunDisplay:
             self._phase = exam.phase
             if not self._quiet:
                 self._console.print(
-                    f"[dim]{progress.t / NS:8.2f} s[/dim]  {PHASES[exam.phase]:<9} {exam.message}", highlight=False
+                    f"[dim]{progress.t / NS:8.2f} s[/dim]  {PHASES[exam.phase]:<9} {escape(exam.message)}", highlight=False
                 )
 
     def _obey(self, progress: RunProgress) -> None:
@@ -86,4 +87,6 @@ class RunDisplay:
         stopped = supervisor.reason if supervisor is not None and supervisor.level else ""
         if stopped != self._stopped:
             self._stopped = stopped
-            self._console.print(f"[bold red]stopped: {stopped}[/]" if stopped else "released", highlight=False, soft_wrap=True)
+            self._console.print(
+                f"[bold red]stopped: {escape(stopped)}[/]" if stopped else "released", highlight=False, soft_wrap=True
+            )

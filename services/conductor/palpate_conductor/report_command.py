@@ -12,6 +12,7 @@ from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from palpate_conductor.archive import EvidenceError
 from palpate_conductor.page import write_page
@@ -46,7 +47,7 @@ def write_pdf(page: Path) -> Path:
 
 
 def _fail(console: Console, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {message}", highlight=False, soft_wrap=True)
+    console.print(f"[bold red]palpate:[/] {escape(message)}", highlight=False, soft_wrap=True)
     raise typer.Exit(EXIT_BAD_INPUT)
 
 

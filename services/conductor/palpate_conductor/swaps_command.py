@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from palpate_conductor.processes import ProcessListError, compose_file
 from palpate_conductor.swaps import measure, read_swaps, table
@@ -34,7 +35,7 @@ def swaps(
         chosen = [known[name] for name in only or known]
         reports = measure(scenario, settings or (), chosen, out, keep, lambda name: console.print(f"examining: {name}"))
     except (ProcessListError, RuntimeError) as error:
-        console.print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
+        console.print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2 if isinstance(error, ProcessListError) else 3) from error
     text = table(chosen, reports)
     typer.echo(text)

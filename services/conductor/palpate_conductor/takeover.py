@@ -11,6 +11,7 @@ import typer
 from palpate_bus import runs
 from palpate_bus.zenoh_config import BusOptions
 from rich.console import Console
+from rich.markup import escape
 
 from palpate_conductor.handover import ROLES
 from palpate_conductor.implementations import DEFAULT, ImplementationError, installed_command
@@ -25,7 +26,7 @@ class TakeoverError(ValueError):
 
 
 def command_of(role: str, implementation: str, service: Path | None) -> tuple[str, ...]:
-    """The words that start the process. Raises TakeoverError or ImplementationError: the option, its value and what is allowed."""
+    """The words that start the process. Raises TakeoverError or ImplementationError: option, value and what is allowed."""
     if role not in ROLES:
         raise TakeoverError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
     return installed_command(role, implementation, service) or read_processes(compose_file(), (role,))[role].command
@@ -63,7 +64,7 @@ def takeover(
             raise TakeoverError(f"no run {run or ''} is on; on this machine: {', '.join(r.name for r in runs.live()) or 'none'}")
         environment = {**os.environ, **environment_of(role, live[-1])}
     except (TakeoverError, ImplementationError) as error:
-        Console(stderr=True).print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
+        Console(stderr=True).print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
     program = sys.executable if words[0] == "python" else words[0]
     os.execvpe(program, [program, *words[1:]], environment)

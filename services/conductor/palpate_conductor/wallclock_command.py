@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from palpate_conductor.swaps import read_report
 
@@ -122,7 +123,7 @@ def wallclock(
                 console.print(f"{value} Hz, in lockstep")
                 found[f"lockstep, {value} Hz"] = _run(scenario, settings or [], folder / f"lockstep_{value}", value, "--composed")
         except RuntimeError as error:
-            console.print(f"[bold red]palpate:[/] {error}", highlight=False, soft_wrap=True)
+            console.print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
             raise typer.Exit(3) from error
     machine = real[rates[0]]["platform"]
     text = f"{machine['cpu']}, {machine['cores']} cores, load before the first run {load:.1f}\n\n"
