@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -10,6 +11,7 @@ from typing import Any, Self
 import fmpy
 import numpy as np
 from fmpy import fmi2, fmi3
+from numpy.typing import ArrayLike
 from palpate_fmu.instance import read_variables
 from palpate_models.scenario import Lesion, Phantom
 
@@ -21,9 +23,9 @@ def coarse_phantom() -> Phantom:
 
 
 class Exchange:
-    """An instance in continuous-time mode, by FMPy; `values` are scalar parameters."""
+    """An instance in continuous-time mode, by FMPy; `values` are parameters."""
 
-    def __init__(self, path: Path, values: dict[str, float] | None = None) -> None:
+    def __init__(self, path: Path, values: Mapping[str, ArrayLike] | None = None) -> None:
         self.folder = fmpy.extract(str(path))
         description = fmpy.read_model_description(self.folder)
         self.older = description.fmiVersion == "2.0"
@@ -37,7 +39,7 @@ class Exchange:
         )
         self.fmu.instantiate()
         for name, value in (values or {}).items():
-            self._set(name, [value])
+            self.set(name, np.atleast_1d(value))
         if self.older:
             self.fmu.setupExperiment()
         self.fmu.enterInitializationMode()
@@ -54,15 +56,16 @@ class Exchange:
         self.fmu.freeInstance()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _set(self, name: str, values: Any) -> None:
+    def set(self, name: str, values: Any) -> None:
+        """Sets a real variable."""
         references = list(self.variables[name].references)
         (self.fmu.setReal if self.older else self.fmu.setFloat64)(references, [float(value) for value in values])
 
     def put(self, position: Array, velocity: Array, time: float = 0.0) -> None:
         """Sets time and inputs."""
         self.fmu.setTime(time)
-        self._set("indenter_position", position)
-        self._set("indenter_velocity", velocity)
+        self.set("indenter_position", position)
+        self.set("indenter_velocity", velocity)
 
     def value(self, name: str) -> Array:
         """A variable at what was set last, flat."""
