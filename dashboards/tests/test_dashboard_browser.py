@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 from time import monotonic, sleep
+from typing import IO
 
 import numpy as np
 import pytest
@@ -75,11 +76,11 @@ def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> N
     pytest.fail(f"not drawn within {PATIENCE_S} s: {seen}")
 
 
-def start(words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+def start(words: list[str], environment: dict[str, str], log: IO[str] | None = None) -> subprocess.Popen[bytes]:
     """A command that heeds Ctrl+C: what a shell starts in the background ignores it, and that is inherited."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        return subprocess.Popen(words, env=environment)
+        return subprocess.Popen(words, env=environment, stdout=log, stderr=log)
     finally:
         signal.signal(signal.SIGINT, before)
 
