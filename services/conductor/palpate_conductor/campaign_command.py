@@ -13,22 +13,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from palpate_conductor.campaign import FORCE_LIMIT_N, MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, run_case
+from palpate_conductor.campaign import MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, run_case
 from palpate_conductor.case_display import CaseDisplay
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
 KINDS = (*PROCESS_KINDS, *MESSAGE_KINDS)
 WIDE = 200
-HEAD = f"""\
-# Faults, and what comes of them
-
-Written by `palpate faults --doc docs/faults.md`; do not edit. One short examination a row, the fault while the indenter slides
-at depth (for camera and perception: while the camera looks). *After*: from the fault to its first sign, by wall clock, read every
-10 ms. *Force*: the highest true force before and after. A row is bad (**!**) when the run hung, the force went above
-{FORCE_LIMIT_N:g} N, or it ended without naming who or what was at fault.
-
-"""
+BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 
 Listed = Annotated[list[str] | None, typer.Option("--only", help="Keep these roles and topics; may be repeated.")]
 
@@ -40,7 +32,7 @@ def faults(
     out: Annotated[Path, typer.Option(help="File for the findings; those already there are kept, and not run again.")] = Path(
         "faults.json"
     ),
-    doc: Annotated[Path | None, typer.Option(help="Write the table as Markdown too.")] = None,
+    doc: Annotated[Path | None, typer.Option(help="A Markdown file whose marked table is replaced.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
 ) -> None:
@@ -71,7 +63,8 @@ def faults(
             display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDE, Console().width)).print(table(found))
     if doc is not None:
-        doc.write_text(HEAD + markdown(found), encoding="utf-8")
+        before, _, rest = doc.read_text(encoding="utf-8").partition(BEGIN)
+        doc.write_text(f"{before}{BEGIN}{markdown(found)}{END}{rest.partition(END)[2]}", encoding="utf-8")
     if any(not finding.good for finding in found):
         raise typer.Exit(EXIT_FAILED)
 
