@@ -64,6 +64,7 @@ def test_ones_own_assessment_finds_the_lesion(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_ones_own_patient_and_mesh_are_examined(tmp_path: Path) -> None:
     patient = palpate_run(
         str(EXAMPLES / "my_patient.yaml"), tmp_path / "patient", "--composed", "--no-record",

@@ -1,4 +1,4 @@
-"""An assessment of one's own: whatever takes more than twice the usual force is stiff."""
+"""An assessment of one's own: whatever takes more than twice the force of the softest tenth is stiff."""
 
 import numpy as np
 from palpate_bus.codec import message_type
@@ -14,7 +14,7 @@ Point = message_type("geometry_msgs/msg/Point")
 
 
 class Threshold(Service):
-    """Force at depth over its median."""
+    """Force at depth over that of the softest places."""
 
     role = "assessment"
 
@@ -32,8 +32,8 @@ class Threshold(Service):
         return {}
 
     def findings(self):
-        """One finding, of all places that took more than twice the median."""
-        places, ratio = apply(self.X_AW, np.array(self.places)), np.array(self.forces) / np.median(self.forces)
+        """One finding, of all places that took more than twice the force of the softest tenth."""
+        places, ratio = apply(self.X_AW, np.array(self.places)), np.array(self.forces) / np.quantile(self.forces, 0.1)
         stiff = places[ratio > 2.0]
         if not len(stiff):
             return []

@@ -170,15 +170,18 @@ def lesion_of(truth: Truth, surface: TrueSurface, points: Array) -> IntArray:
 def score(centroids: Array, found: Map | None, truth: Truth) -> Scores:
     """Scores of findings with `centroids` [m], shape (k, 2 or 3), in A, and of the map that holds their areas.
 
-    A finding matches a lesion when their areas overlap; each counts once, so that the overlap is greatest.
+    A finding matches a lesion when their areas overlap; each counts once, so that the overlap is greatest. Without a map a
+    finding is no more than a place: it matches the lesion in whose area it lies, and every lesion counts.
     """
     surface = TrueSurface(truth)
     lesions, masks = true_lesions(truth, surface, found)
-    counted = [i for i, lesion in enumerate(lesions) if lesion.scanned >= SCANNED_SHARE]
-    if found is None:
-        return Scores(None, None, 0, len(lesions), len(centroids), None)
+    counted = [i for i, lesion in enumerate(lesions) if found is None or lesion.scanned >= SCANNED_SHARE]
     overlap = np.zeros((len(centroids), len(lesions)))
     for j, (points, mask) in enumerate(masks):
+        if found is None:
+            for i, centroid in enumerate(centroids):
+                overlap[i, j] = np.linalg.norm(points[mask] - centroid[:2], axis=1).min() <= RASTER
+            continue
         area = surface.steepness(points) * RASTER**2 * mask
         owner = _owner(found, points)
         for i in range(len(centroids)):
@@ -189,11 +192,11 @@ def score(centroids: Array, found: Map | None, truth: Truth) -> Scores:
     hit = {j for _, j in pairs}
     return Scores(
         localisation_error_m=float(np.mean(errors)) if errors else None,
-        dice=_dice(found, truth, surface),
+        dice=None if found is None else _dice(found, truth, surface),
         matched=len(pairs),
         missed=len([j for j in counted if j not in hit]),
         false_positives=len(centroids) - len(pairs),
-        coverage_90=_coverage(found, truth, surface),
+        coverage_90=None if found is None else _coverage(found, truth, surface),
     )
 
 

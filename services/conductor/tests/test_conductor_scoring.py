@@ -148,3 +148,13 @@ def test_the_map_grid_need_not_be_the_truths() -> None:
     s = scoring.score(centroids(areas), found(areas), truth(areas, pitch=0.005))
     assert s.dice is not None
     assert s.dice > 0.96
+
+
+def test_without_a_map_a_finding_is_a_place_in_a_lesion_or_beside_it() -> None:
+    lesions = [(CENTRE, RADIUS)]
+    inside, beside = CENTRE + (0.01, 0.0), CENTRE + (RADIUS + 0.02, 0.0)
+    s = scoring.score(centroids([(inside, RADIUS), (beside, RADIUS)]), None, truth(lesions))
+    assert (s.matched, s.missed, s.false_positives, s.dice, s.coverage_90) == (1, 0, 1, None, None)
+    assert s.localisation_error_m == pytest.approx(0.01, abs=3e-4)
+    s = scoring.score(centroids([]), None, truth(lesions))
+    assert (s.matched, s.missed, s.false_positives, s.localisation_error_m) == (0, 1, 0, None)
