@@ -152,7 +152,7 @@ def test_the_map_grid_need_not_be_the_truths() -> None:
 
 def test_without_a_map_a_finding_is_a_place_in_a_lesion_or_beside_it() -> None:
     lesions = [(CENTRE, RADIUS)]
-    inside, beside = CENTRE + (0.01, 0.0), CENTRE + (RADIUS + 0.02, 0.0)
+    inside, beside = CENTRE + np.array((0.01, 0.0)), CENTRE + np.array((RADIUS + 0.02, 0.0))
     s = scoring.score(centroids([(inside, RADIUS), (beside, RADIUS)]), None, truth(lesions))
     assert (s.matched, s.missed, s.false_positives, s.dice, s.coverage_90) == (1, 0, 1, None, None)
     assert s.localisation_error_m == pytest.approx(0.01, abs=3e-4)
