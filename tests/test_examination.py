@@ -75,6 +75,18 @@ def test_bad_input_ends_with_status_2_and_says_what_is_wrong(
         assert word in finished.output
 
 
+@pytest.mark.parametrize(
+    "runtime",
+    ["--composed", pytest.param("--realtime", marks=pytest.mark.slow), pytest.param("--wallclock", marks=pytest.mark.slow)],
+)
+def test_an_examination_that_planning_gave_up_ends_with_status_3_and_says_why(tmp_path: Path, runtime: str) -> None:
+    own = ("--service", f"planning={Path(__file__).with_name('quitting_planning.py')}")
+    finished = palpate_run("rlq_guarding", tmp_path, runtime, "--no-record", *own)
+    assert finished.status == 3, finished.output
+    assert "the run failed: aborted in phase HOME: enough" in finished.output
+    assert finished.report["failure"] == "aborted in phase HOME: enough"
+
+
 def test_an_unknown_scenario_is_answered_with_the_known_ones(tmp_path: Path) -> None:
     finished = palpate_run("no_such", tmp_path)
     assert finished.status == 2

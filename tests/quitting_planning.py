@@ -1,0 +1,38 @@
+"""Planning that gives the examination up a moment after its beginning; a file for `palpate run --service planning=FILE`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from palpate_bus.messages import ExamState
+from palpate_bus.run import main
+from palpate_bus.service import Inbox, Outbox
+from palpate_models.load import exam_input, load_scenario
+from palpate_models.scenario import Scenario
+from palpate_planning.service import PlanningService
+
+MS = 1_000_000
+
+
+class Quitting(PlanningService):
+    """Says what planning says when it has to end the examination."""
+
+    end: int | None = None
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """As planning, but for the phase."""
+        out: dict[str, Any] = dict(super().step(t, inbox))
+        self.end = t + 1000 * MS if self.end is None else self.end
+        given_up = {"phase": ExamState.PHASE_ABORTED, "message": "aborted in phase HOME: enough", "end_tick": self.end}
+        out["exam/state"] = dataclasses.replace(out["exam/state"], **given_up)
+        return out
+
+
+def create(scenario: Scenario) -> Quitting:
+    """The service of a scenario."""
+    return Quitting(exam_input(scenario))
+
+
+if __name__ == "__main__":
+    main("planning", create, load_scenario)
