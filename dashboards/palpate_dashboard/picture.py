@@ -1,6 +1,6 @@
 """A picture of the dashboard at a moment of a recorded run, by a headless browser: the one in the README is made so.
 
-palpate dashboard DIR --picture docs/images/dashboard.png --at 60
+palpate dashboard DIR --picture docs/images/dashboard.png --at 105
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def take(folder: Path, target: Path, at_s: float, port: int, width: int, height:
     finally:
         service.finish()
     target.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(image).quantize(COLOURS, kmeans=1, dither=Image.Dither.NONE).save(target, optimize=True)
+    small = Image.fromarray(image).quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)  # keeps rare colours
+    small.save(target, optimize=True)
 
 
 def _settled(page: Page) -> Pixels:

@@ -85,7 +85,7 @@ class DashboardService(Service):
         self._recording = open_recording(path, live, layout, scenario.name)
         self._force_depth = ForceDepth(self._recording, plane)
         self._region = (exam.region_m, exam.centre_m)
-        self._send_period = SEND_PERIOD if live == Live() else SEND_PERIOD_LIVE
+        self._send_period = SEND_PERIOD_LIVE if paced and live != Live() else SEND_PERIOD
         self._columns = Columns(self._recording)
         self._scene = Scene(self._recording, self._columns)
         self._map = StiffnessMap(self._recording, exam.region_m, exam.centre_m)
