@@ -12,15 +12,20 @@ from palpate_fmu.running import run_and_plot
 from typer.testing import CliRunner
 
 runner = CliRunner()
+BUILD = ("build", "healthy", "--platform", native(), "--set", "phantom.edge_m=0.01")
 
 
 def test_build_info_and_simulate(tmp_path: Path) -> None:
     path = tmp_path / "a.fmu"
-    built = runner.invoke(app, ["build", "healthy", "-o", str(path), "--platform", native(), "--set", "phantom.edge_m=0.01"])
+    built = runner.invoke(app, [*BUILD, "-o", str(path)])
     assert built.exit_code == 0, built.output
+    assert len(built.output.splitlines()) == 1  # no bar where there is no terminal
+    silent = runner.invoke(app, [*BUILD, "-o", str(path), "--quiet"])
+    assert (silent.exit_code, silent.output) == (0, "")
     shown = runner.invoke(app, ["info", str(path)])
     assert shown.exit_code == 0
-    for word in ("abdomen", "FMI 3.0", native(), "indenter_position", "m/s", "-10.0 .. 10.0", "valid"):
+    kinds = "FMI 3.0, coSimulation, modelExchange"
+    for word in ("abdomen", kinds, native(), "indenter_position", "m/s", "-10.0 .. 10.0", "valid"):
         assert word in shown.output
     plot = tmp_path / "a.png"
     probed = runner.invoke(app, ["simulate", str(path), "-o", str(plot), "--depth", "0.008", "--at", "0.02", "-0.03"])

@@ -58,13 +58,20 @@ def test_explicit_euler_is_the_step_of_the_co_simulation(fmu3: Path) -> None:
     np.testing.assert_allclose(euler["contact_torque"][:-1], steps["contact_torque"], atol=2e-4)
 
 
+def test_finer_integration_agrees_with_the_co_simulation(coarse: Path) -> None:
+    """Contact lags by contact_time, so by a step of the co-simulation."""
+    steps = run(coarse, "CoSimulation", STEP_S, 0.3)
+    fine = run(coarse, "ModelExchange", 0.0, 0.3, solver="Euler", step_size=STEP_S / 8)
+    np.testing.assert_allclose(fine["surface_displacement"][1:], steps["surface_displacement"][:-1], atol=1e-6)
+    assert steps["contact_force"][:, 2].max() > 1
+
+
 @pytest.mark.slow
 def test_cvode_agrees_with_the_co_simulation(coarse: Path) -> None:
-    """A master that integrates by its own steps; contact lags by contact_time, so by a step of the co-simulation."""
+    """FMPy's CVode holds inputs over its own steps, which reach past the millisecond: at 40 mm/s, some 40 um each."""
     steps = run(coarse, "CoSimulation", STEP_S, 0.3)
     found = run(coarse, "ModelExchange", 0.0, 0.3, solver="CVode", relative_tolerance=1e-4)
-    np.testing.assert_allclose(found["surface_displacement"][1:], steps["surface_displacement"][:-1], atol=5e-5)
-    assert steps["contact_force"][:, 2].max() > 1
+    np.testing.assert_allclose(found["surface_displacement"][1:], steps["surface_displacement"][:-1], atol=1.5e-4)
 
 
 @pytest.mark.parametrize("sliding", [False, True], ids=["sticking", "sliding"])
