@@ -5,8 +5,6 @@ another language. The run waits for it at its start.
 from __future__ import annotations
 
 import json
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,17 +13,15 @@ from typing import Annotated, NoReturn
 import typer
 from palpate_bus import runs
 from palpate_bus.contract import contract
-from rich.console import Console
-from rich.markup import escape
 
 from palpate_conductor.implementations import DEFAULT, ImplementationError, installed_command
+from palpate_conductor.place import Implementation, OwnService, PlaceError, RunName, become, live_run, refuse
 
 FILE = "join.json"
 """In the results folder: command and environment of each process that is left to its user."""
-EXIT_BAD_INPUT = 2
 
 
-class JoinError(ValueError):
+class JoinError(PlaceError):
     """A role that cannot be left out or joined. Names the option and what is allowed."""
 
 
@@ -80,21 +76,14 @@ def given_to(role: str, run: runs.Run) -> tuple[tuple[str, ...], dict[str, str]]
 
 def join(
     role: Annotated[str, typer.Argument(help="The role that the run was told to do without.")],
-    implementation: Annotated[
-        str, typer.Option(help="An installed implementation, as in `--set <role>.implementation`.")
-    ] = DEFAULT,
-    service: Annotated[Path | None, typer.Option(metavar="FILE.py", help="A service of one's own instead.")] = None,
-    run: Annotated[str | None, typer.Option(help="Which run, by its results folder's name; by default the newest.")] = None,
+    implementation: Implementation = DEFAULT,
+    service: OwnService = None,
+    run: RunName = None,
 ) -> NoReturn:
     """Join a run that was started with --without ROLE; becomes that service."""
     try:
-        live = [each for each in runs.live() if run is None or each.name == run]
-        if not live:
-            raise JoinError(f"no run {run or ''} is on; on this machine: {', '.join(r.name for r in runs.live()) or 'none'}")
-        words, environment = given_to(role, live[-1])
+        words, environment = given_to(role, live_run(run))
         words = installed_command(role, implementation, service) or words
-    except (JoinError, ImplementationError) as error:
-        Console(stderr=True).print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
-    program = sys.executable if words[0] == "python" else words[0]
-    os.execvpe(program, [program, *words[1:]], {**os.environ, **environment})
+    except (PlaceError, ImplementationError) as error:
+        refuse(error)
+    become(words, environment)

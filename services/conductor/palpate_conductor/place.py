@@ -1,0 +1,45 @@
+"""A place in a live run that a process of its user takes: what `palpate join` and `palpate takeover` have in common."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from palpate_bus import runs
+from rich.console import Console
+from rich.markup import escape
+
+EXIT_BAD_INPUT = 2
+
+Implementation = Annotated[str, typer.Option(help="An installed implementation, as in `--set <role>.implementation`.")]
+OwnService = Annotated[Path | None, typer.Option(metavar="FILE.py", help="A service of one's own instead.")]
+RunName = Annotated[str | None, typer.Option(help="Which run, by its results folder's name; by default the newest.")]
+
+
+class PlaceError(ValueError):
+    """A place that cannot be taken. Says why, and what can be done."""
+
+
+def live_run(name: str | None) -> runs.Run:
+    """The newest live run, or the one of that name. Raises PlaceError that names those there are."""
+    live = runs.live()
+    matching = [run for run in live if name is None or run.name == name]
+    if not matching:
+        raise PlaceError(f"no run{f' {name}' if name else ''} is on; on this machine: {', '.join(run.name for run in live) or 'none'}")
+    return matching[-1]
+
+
+def refuse(error: Exception) -> NoReturn:
+    """Prints what is wrong and ends the command with the status of bad input."""
+    Console(stderr=True).print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+    raise typer.Exit(EXIT_BAD_INPUT) from error
+
+
+def become(words: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
+    """Replaces this process by that of a service: `words` start it, `environment` is added to this process's own."""
+    program = sys.executable if words[0] == "python" else words[0]
+    os.execvpe(program, [program, *words[1:]], {**os.environ, **environment})
