@@ -26,8 +26,9 @@ class ControlService(Service):
     """Follows set-points by impedance control.
 
     Before the first set-point it commands zero torque, so the driver keeps the arm gravity-compensated. Once a
-    set-point has expired, or joint states are stale or not finite, it sends commands that have expired already, and says
-    why: the driver then holds safely by itself, which is better than anything that could be commanded blindly.
+    set-point has expired, or joint states are not finite, it sends commands that have expired already, and says why: the
+    driver then holds safely by itself, which is better than anything that could be commanded blindly. While joint states
+    are stale the last torque stands, no longer than it was valid anyway: late states are then what a late command is.
     """
 
     role: ClassVar[str] = "control"
@@ -39,11 +40,17 @@ class ControlService(Service):
         topics = contract().topics
         self._setpoint_expiry = (topics["planning/setpoint"].expiry_ms or 0) * MS
         self._joint_states_age = (topics["joint_states"].max_age_ms or 0) * MS
-        self._valid = duration_message((topics["control/joint_torque"].expiry_ms or 0) * MS)
+        self._validity = (topics["control/joint_torque"].expiry_ms or 0) * MS
+        self._valid = duration_message(self._validity)
         self._expired = duration_message(0)
         self._expires: int | None = None
-        self._facts = {"setpoints": 0, "setpoints_rejected": 0, "joint_states_rejected": 0, "ticks_without_command": 0}
+        self._facts = dict.fromkeys(
+            ("setpoints", "setpoints_rejected", "joint_states_rejected", "ticks_without_joint_states", "ticks_without_command"), 0
+        )
         self._peak = np.zeros(DOF)
+        self._torque = np.zeros(DOF)
+        self._until = -1
+        """The last torque and how long it is valid [ns]."""
         self._problem = ""
         self._refused = ""
         """What was wrong with the newest set-point; empty when it was good."""
@@ -74,7 +81,7 @@ class ControlService(Service):
         received = inbox.stamp("joint_states")
         if received is not None and t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
-            return self._cease(t, f"joint_states are {age:.0f} ms old, limit {limit:.0f} ms")
+            return self._stand(t, f"joint_states are {age:.0f} ms old, limit {limit:.0f} ms")
         if joints.name != _NAMES:
             return self._reject_joints(t, f"joint_states: name = {joints.name}: must be {_NAMES}")
         try:
@@ -82,6 +89,7 @@ class ControlService(Service):
         except ValueError as error:
             return self._reject_joints(t, str(error))
         np.maximum(self._peak, np.abs(torque), out=self._peak)
+        self._torque, self._until = torque, t + self._validity
         return self._command(t, torque, self._valid)
 
     def finish(self) -> Mapping[str, Any]:
@@ -101,8 +109,17 @@ class ControlService(Service):
         self._reference.accept(setpoint, t)
         self._expires = setpoint.stamp + min(nanoseconds(message.valid_for), self._setpoint_expiry)
 
+    def _stand(self, t: int, problem: str) -> Outbox:
+        """The last torque for as long as it is valid, then as `_cease`."""
+        if t >= self._until:
+            return self._cease(t, problem)
+        self._facts["ticks_without_joint_states"] += 1
+        self._problem = f"at {t} ns: {problem}"
+        return self._command(t, self._torque, duration_message(self._until - t), problem)
+
     def _cease(self, t: int, problem: str) -> Outbox:
         """Leaves the arm to the driver's safe hold, and tells it why."""
+        self._until = -1
         self._facts["ticks_without_command"] += 1
         self._problem = f"at {t} ns: {problem}"
         self._controller.reset()

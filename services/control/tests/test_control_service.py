@@ -187,12 +187,20 @@ def test_bad_joint_states_leave_the_arm_to_the_driver(rig: Rig, broken: str) -> 
     assert rig.service.finish()["joint_states_rejected"] == 1
 
 
-def test_stale_joint_states_leave_the_arm_to_the_driver(rig: Rig) -> None:
+def test_while_joint_states_are_stale_the_last_torque_stands_no_longer_than_it_was_valid(rig: Rig) -> None:
     rig.send(setpoint(0))
     rig.tick(10)
     late = rig.t - MS + 20 * MS
-    assert valid_for(rig.service.step(late, rig.inbox)["control/joint_torque"]) == EXPIRY
-    assert valid_for(rig.service.step(late + MS, rig.inbox)["control/joint_torque"]) == 0
+    last = rig.service.step(late, rig.inbox)["control/joint_torque"]
+    assert valid_for(last) == EXPIRY
+    for ms in (1, 10, 49):
+        command = rig.service.step(late + ms * MS, rig.inbox)["control/joint_torque"]
+        assert valid_for(command) == EXPIRY - ms * MS
+        assert command.torque == pytest.approx(last.torque)
+        assert "joint_states are" in command.problem
+    ceased = rig.service.step(late + EXPIRY, rig.inbox)["control/joint_torque"]
+    assert valid_for(ceased) == 0
+    assert not ceased.torque.any()
 
 
 def test_same_messages_same_torques() -> None:
