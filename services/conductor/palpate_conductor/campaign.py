@@ -43,6 +43,8 @@ PROCESS_KINDS: Final = ("kill", "freeze", "jump")
 MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
 WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
 COMPLETE: Final = "complete"
+UNHARMED: Final = (COMPLETE, WENT_ON)
+"""Ends that need no cause."""
 LASTING: Final = frozenset({"nan", "stamp"})
 """Kinds that hit every message from then on; the others one."""
 BEFORE_CONTACT: Final = frozenset({"camera", "perception"})
@@ -103,7 +105,7 @@ class Finding:
             self.injected_s is not None
             and not self.hung
             and self.peak_force_n <= FORCE_LIMIT_N
-            and (self.ended in (COMPLETE, WENT_ON) or self.named)
+            and (self.ended in UNHARMED or self.named)
         )
 
 
@@ -246,7 +248,8 @@ def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
     last = Progress(0, 0.0, collected, ())
     if finding.injected_s is not None:
         watch.signs += [sign for sign in _signs(last) if sign not in watch.signs]
-        if finding.detected_ms is None and (watch.signs or result.failure):
+        failed = result.failure is not None and result.failure not in UNHARMED
+        if finding.detected_ms is None and (watch.signs or failed):
             finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
             finding.sign = watch.signs[0] if watch.signs else str(result.failure)
     split = (finding.injected_s or 0.0) * NS
@@ -277,7 +280,7 @@ def _reaction(collected: Any, ended: str) -> str:
         return "lifted off"
     if collected.supervisor is not None and collected.supervisor.level == SupervisorState.LEVEL_SOFT_STOP:
         return "soft stop"
-    return "none needed" if ended in (COMPLETE, WENT_ON) else "run ended"
+    return "none needed" if ended in UNHARMED else "run ended"
 
 
 def as_json(findings: Sequence[Finding]) -> list[dict[str, Any]]:
