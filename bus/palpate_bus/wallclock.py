@@ -1,8 +1,10 @@
 """Wall clock: one service a process, each on its own timer, freshest sample wins: for hardware, real or simulated in real time.
 
 A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
-A late step is counted as an overrun and caught up; when a service is further behind than `RESYNC`, its clock is set anew and
-the jump is counted. Nothing waits for anybody. Expiry protects those who depend on a late sample.
+A late step is counted as an overrun. A critical role stands for hardware, whose physics has to keep time: it catches up
+tick by tick, up to `CATCH_UP`. Whoever else is late, and who is later than that, goes on at the present tick: what should
+have been commanded a while ago helps nobody, and stamps stay on the common clock. Nothing waits for anybody. Expiry
+protects those who depend on a late sample.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
 
-RESYNC = 200 * MS
-"""Lag [ns] beyond which a service gives up catching up."""
+CATCH_UP = 200 * MS
+"""Lag [ns] beyond which a critical role gives up catching up."""
 HANDSHAKE_POLL_S = 0.02
 
 
@@ -44,7 +46,7 @@ class WallClockNode:
         self.gaps = 0
         self.undecodable = 0
         self.overruns = 0
-        self.resyncs = 0
+        self.skips = 0
         self._ages = {name: Ages() for name in self._data}
         self._end: int | None = None
         self._tick = NEVER
@@ -101,6 +103,7 @@ class WallClockNode:
 
     def _loop(self, epoch: int) -> None:
         period = self._stepper.role.period
+        catch_up = CATCH_UP if self._stepper.role.critical else period
         t = self._await_inputs(epoch)
         while self._end is None or t <= self._end:
             due = epoch + t
@@ -109,9 +112,9 @@ class WallClockNode:
                 sleep((due - now) / 1e9)
             elif now - due > period:
                 self.overruns += 1
-                if now - due > RESYNC:
-                    epoch = now - t
-                    self.resyncs += 1
+                if now - due > catch_up:
+                    t += (now - due) // period * period
+                    self.skips += 1
             self._receive(t)
             everything: list[Sent] = []
             for sent in self._stepper.parts(t):
@@ -173,7 +176,7 @@ class WallClockNode:
             "gaps": self.gaps,
             "undecodable": self.undecodable,
             "overruns": self.overruns,
-            "resyncs": self.resyncs,
+            "skips": self.skips,
             "age_ms": {name: ages.as_ms() for name, ages in self._ages.items() if ages.count},
             "facts": facts,
         }

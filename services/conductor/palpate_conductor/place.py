@@ -29,7 +29,8 @@ def live_run(name: str | None) -> runs.Run:
     live = runs.live()
     matching = [run for run in live if name is None or run.name == name]
     if not matching:
-        raise PlaceError(f"no run{f' {name}' if name else ''} is on; on this machine: {', '.join(run.name for run in live) or 'none'}")
+        there = ", ".join(run.name for run in live) or "none"
+        raise PlaceError(f"no run{f' {name}' if name else ''} is on; on this machine: {there}")
     return matching[-1]
 
 

@@ -64,13 +64,13 @@ def _three(figures: Sequence[float]) -> str:
 
 def ticks(reports: Mapping[int, dict[str, Any]]) -> str:
     """A Markdown table of ticks that came late by more than a period in the fast loop, one row a rate [Hz]."""
-    text = _row("control rate", *(f"{role}: late ticks, clock set anew" for role in FAST)) + _row(*["---"] * (1 + len(FAST)))
+    text = _row("control rate", *(f"{role}: late ticks, times skipped ahead" for role in FAST)) + _row(*["---"] * (1 + len(FAST)))
     for rate, report in reports.items():
         cells = []
         for role in FAST:
             counters, steps = report["services"][role], report["blame"][role]["steps"]
             late = counters["overruns"]
-            cells.append(f"{late} of {steps} ({100 * late / max(steps, 1):.2f} %), {counters['resyncs']}")
+            cells.append(f"{late} of {steps} ({100 * late / max(steps, 1):.2f} %), {counters['skips']}")
         text += _row(f"{rate} Hz", *cells)
     return text
 

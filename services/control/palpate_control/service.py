@@ -54,6 +54,8 @@ class ControlService(Service):
         self._problem = ""
         self._refused = ""
         """What was wrong with the newest set-point; empty when it was good."""
+        self._ceased = ""
+        """Why the arm was left to the driver; empty since a good set-point has come."""
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -76,6 +78,8 @@ class ControlService(Service):
         joints = inbox.latest("joint_states")
         if self._expires is None or joints is None:
             return self._command(t, np.zeros(DOF), self._valid)
+        if self._ceased:
+            return self._cease(t, self._ceased)
         if t > self._expires:
             return self._cease(t, self._refused or f"the last planning/setpoint expired {(t - self._expires) / MS:.0f} ms ago")
         received = inbox.stamp("joint_states")
@@ -104,7 +108,7 @@ class ControlService(Service):
             self._refused = f"planning/setpoint refused: {error}"
             self._problem = f"at {t} ns: {self._refused}"
             return
-        self._refused = ""
+        self._refused = self._ceased = ""
         self._facts["setpoints"] += 1
         self._reference.accept(setpoint, t)
         self._expires = setpoint.stamp + min(nanoseconds(message.valid_for), self._setpoint_expiry)
@@ -120,6 +124,7 @@ class ControlService(Service):
     def _cease(self, t: int, problem: str) -> Outbox:
         """Leaves the arm to the driver's safe hold, and tells it why."""
         self._until = -1
+        self._ceased = problem
         self._facts["ticks_without_command"] += 1
         self._problem = f"at {t} ns: {problem}"
         self._controller.reset()

@@ -26,8 +26,8 @@ TORQUE_RATE: Final = 2.0
 """Largest change of a joint's command in a millisecond [N m]. libfranka ends a motion beyond 1, our controller keeps to 1 a tick.
 A command that was damaged on its way rarely stays within it."""
 AHEAD: Final = 500_000_000
-"""A command stamped so far ahead [ns] comes from a clock that is wrong: its expiry protects nobody. More than a driver that is behind
-its own timer can be (`palpate_bus.wallclock.RESYNC`) and the command's validity: a busy machine is no wrong clock."""
+"""A command stamped so far ahead [ns] comes from a clock that is wrong: its expiry protects nobody. More than a driver can be
+behind its own timer (`palpate_bus.wallclock.CATCH_UP`) and the command's validity: a busy machine is no wrong clock."""
 _LIMITS: Final = tuple(
     zip(
         lbr.JOINT_NAMES,
