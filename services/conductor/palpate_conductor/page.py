@@ -64,10 +64,10 @@ def sample_places(folder: Path) -> Array:
     """Where samples were taken, xy of A [m], shape (n, 2), from samples.csv. Raises EvidenceError."""
     path = folder / "samples.csv"
     try:
-        table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(1, 2), ndmin=2)
+        _, *rows = path.read_text(encoding="utf-8").splitlines()
+        return np.loadtxt(rows, delimiter=",", usecols=(1, 2), ndmin=2) if rows else np.empty((0, 2))
     except (OSError, ValueError) as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error
-    return table.reshape(-1, 2)
 
 
 def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: Array) -> str:
