@@ -193,9 +193,9 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
     statuses = {status.name: status for status in codec.decode(heard[-1][1], topic.type).status}
     for name in ("palpate/topic/robot/status", "palpate/robot"):
         assert statuses[name].level == DiagnosticStatus.ERROR
-        assert "robot/status" in statuses[name].message
         assert "from robot: not finite" in statuses[name].message
         assert statuses[name].hardware_id == "robot"
+    assert "robot/status" in statuses["palpate/topic/robot/status"].message
     assert statuses["palpate/topic/supervisor/state"].level == DiagnosticStatus.OK
 
     dashboard = DashboardService(Scenario(), tmp_path / "drawn.rrd", Live())
