@@ -78,10 +78,9 @@ class ControlService(Service):
         joints = inbox.latest("joint_states")
         if self._expires is None or joints is None:
             return self._command(t, np.zeros(DOF), self._valid)
-        if self._ceased:
-            return self._cease(t, self._ceased)
-        if t > self._expires:
-            return self._cease(t, self._refused or f"the last planning/setpoint expired {(t - self._expires) / MS:.0f} ms ago")
+        if self._ceased or t > self._expires:
+            expired = f"the last planning/setpoint expired {(t - self._expires) / MS:.0f} ms ago"
+            return self._cease(t, self._ceased or self._refused or expired)
         received = inbox.stamp("joint_states")
         if received is not None and t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
