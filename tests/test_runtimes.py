@@ -125,6 +125,20 @@ def test_killed_controller_is_named_and_the_survivors_run_one_more_second() -> N
     assert abs(outcome.last_tick - outcome.lost["control"] - NS) <= NS // 2
 
 
+def test_an_interrupted_run_ends_every_service_and_says_when() -> None:
+    def interrupt(running: Running) -> None:
+        if at(running, 0.5, done):
+            raise KeyboardInterrupt
+
+    done: list[bool] = []
+    outcome = run_toys(interrupt, {"TOY_END_S": "30"})
+    assert outcome.interrupted
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("interrupted at tick 0.")
+    assert outcome.run_hash is None
+    assert done
+
+
 def test_killed_tissue_ends_the_run_at_once() -> None:
     done: list[bool] = []
 

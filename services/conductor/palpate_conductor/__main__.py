@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
+import signal
 import sys
 
 from palpate_conductor.layout import share_addresses
@@ -30,6 +31,7 @@ def main() -> None:
         os.execve(sys.executable, [sys.executable, "-m", "palpate_conductor", *sys.argv[1:]], {**os.environ, **FIXED})
     if "--secure" not in sys.argv:
         share_addresses()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `docker stop`, systemd: what Ctrl-C does
     from palpate_conductor.cli import main as run  # noqa: PLC0415
 
     run()

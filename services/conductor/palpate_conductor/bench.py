@@ -66,7 +66,10 @@ def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], sav
     for done, name in enumerate(names, len(points)):
         display.tell(done, total, f"{scenario.name}, {name}")
         with tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
-            figures["runs"][name] = _figures(cases[name](Path(folder)))
+            result = cases[name](Path(folder))
+        if result.interrupted:
+            raise KeyboardInterrupt
+        figures["runs"][name] = _figures(result)
         save(figures)
     return figures
 

@@ -217,6 +217,8 @@ def run_case(case: Case, folder: Path) -> Finding:
                 local.start(processes[role])
             watch = _Watch(case, local, target, finding)
             result = conduct(session, WORKERS, watch.tell, lambda: _died(local), None, case.wallclock, PATIENCE)
+            if result.interrupted:
+                raise KeyboardInterrupt
             _conclude(finding, watch, result)
         finally:
             close_session(session)

@@ -76,6 +76,8 @@ class Outcome:
     """Tick [ns] at which each lost service fell silent."""
     failure: str | None = None
     """Service and cause, None when the run completed."""
+    interrupted: bool = False
+    """Whether it was ended by Ctrl-C or SIGTERM."""
 
     @property
     def run_hash(self) -> str | None:
@@ -195,9 +197,14 @@ class Conductor:
     ) -> Outcome:
         """Runs to the end. `died` gives the roles whose process is gone, with how; `tell` is called often, for progress.
 
-        Raises RunFailed when the run cannot start; later failures are in the outcome.
+        Raises RunFailed when the run cannot start; later failures are in the outcome, KeyboardInterrupt among them.
         """
-        self._handshake(died)
+        try:
+            self._handshake(died)
+        except KeyboardInterrupt:
+            self.outcome.interrupted = True
+            self.abort("interrupted")
+            raise RunFailed("interrupted before the first tick") from None
         self._started_at = monotonic()
         self.started_at_perf = perf_counter()
         self.watchdog.forgive()
@@ -207,10 +214,12 @@ class Conductor:
             self._conduct(died, tell)
             self.outcome.wall_time_s = monotonic() - self._started_at
             self._end(died)
-        except RunFailed as failure:
-            self.outcome.failure = self.outcome.failure or str(failure)
+        except (RunFailed, KeyboardInterrupt) as failure:
+            self.outcome.interrupted = isinstance(failure, KeyboardInterrupt)
+            why = f"interrupted at tick {max(self._observed.now, 0) / NS:.3f} s" if self.outcome.interrupted else str(failure)
+            self.outcome.failure = self.outcome.failure or why
             self.outcome.wall_time_s = monotonic() - self._started_at
-            self.abort(str(failure))
+            self.abort(why)
         self._desk.close()
         self._contract.close()
         self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import IO, Any
 
 import yaml
@@ -152,7 +154,13 @@ class LocalProcesses:
         log = (self._out / "logs" / f"{process.role}.log").open("wb")
         self._logs.append(log)
         command = [sys.executable if process.command[0] == "python" else process.command[0], *process.command[1:]]
-        self.running[process.role] = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        self.running[process.role] = subprocess.Popen(
+            command,
+            env=environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            process_group=0,  # Ctrl-C is the conductor's to hear: it ends the run, and the recorder closes its files
+        )
 
     def ended(self) -> dict[str, int]:
         """Exit status of every process that has ended, by role; negative is a signal's number."""
@@ -164,16 +172,16 @@ class LocalProcesses:
         return "\n".join(text.splitlines()[-lines:])
 
     def stop(self, patience_s: float = 5.0) -> None:
-        """Waits for the processes to leave, then ends those that are left; removes the sockets."""
+        """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets."""
         for send in (None, signal.SIGTERM, signal.SIGKILL):
-            for child in self.running.values():
-                if send is not None and child.poll() is None:
+            left = [child for child in self.running.values() if child.poll() is None]
+            deadline = monotonic() + patience_s
+            for child in left:
+                if send is not None:
                     child.send_signal(send)
-            for child in self.running.values():
-                try:
-                    child.wait(timeout=patience_s)
-                except subprocess.TimeoutExpired:
-                    continue
+            for child in left:
+                with suppress(subprocess.TimeoutExpired):
+                    child.wait(timeout=max(0.0, deadline - monotonic()))
         for log in self._logs:
             log.close()
         self._announcement.withdraw()

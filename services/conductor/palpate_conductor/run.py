@@ -55,6 +55,8 @@ class RunResult:
     failure: str | None
     """Service and cause, or why planning gave the examination up; None when it completed."""
     lost: dict[str, int]
+    interrupted: bool = False
+    """Whether it was ended by Ctrl-C or SIGTERM; what it had measured until then is here all the same."""
 
 
 @dataclass(frozen=True)
@@ -190,6 +192,7 @@ def conduct(
         },
         failure=failure,
         lost=outcome.lost,
+        interrupted=outcome.interrupted,
     )
 
 
@@ -254,8 +257,12 @@ def run_composed(
         return collector.collected.end_tick
 
     lost: dict[str, int] = {}
+    interrupted = False
     try:
         last = run.run(end, SIM_LIMIT)
+    except KeyboardInterrupt:
+        interrupted = True
+        failure, last = f"interrupted at tick {run.t / NS:.3f} s", run.t
     except ServiceFailed as error:
         failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.__cause__}"
         lost = {error.role: error.t}
@@ -277,4 +284,5 @@ def run_composed(
         counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
         failure=failure or _given_up(collector.collected),
         lost=lost,
+        interrupted=interrupted,
     )
