@@ -23,6 +23,7 @@ from palpate_bus.zenoh_config import close_session, open_session
 from palpate_models.load import load_scenario
 
 from palpate_conductor.conductor import Patience, RunFailed
+from palpate_conductor.forks import Forks
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
 from palpate_conductor.run import WORKERS, Progress, RunResult, conduct, write_scenario_files
 
@@ -33,7 +34,7 @@ SETTINGS: Final = (
     "limits.release_patience_s=0.5",
 )
 """A small region on the lesion of rlq_guarding, so that a case takes seconds, and nobody waits long for an operator."""
-PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=8.0)
+PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
 HANG_S: Final = 90.0
 """A case that takes longer after its fault has hung."""
 CONTACT_S: Final = 0.3
@@ -197,7 +198,12 @@ def _signs(progress: Progress) -> list[str]:
     return found
 
 
-def run_case(case: Case, folder: Path) -> Finding:
+def forks() -> Forks:
+    """What starts the processes of many cases."""
+    return Forks(process.command[2] for process in read_processes(compose_file(), WORKERS).values())
+
+
+def run_case(case: Case, folder: Path, forks: Forks | None = None) -> Finding:
     """Runs one case; its logs stay in a folder of its own under `folder`."""
     scenario = load_scenario("rlq_guarding", SETTINGS)
     out = (folder / case.name).resolve()
@@ -209,7 +215,7 @@ def run_case(case: Case, folder: Path) -> Finding:
     extra = {"PALPATE_RUNTIME": "wallclock" if case.wallclock else "lockstep", "PALPATE_RECORD": "0"}
     finding = Finding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
     begin = monotonic()
-    local = LocalProcesses(WORKERS, out, files, extra)
+    local = LocalProcesses(WORKERS, out, files, extra, forks=forks)
     try:
         session = open_session(local.bus["conductor"])
         try:

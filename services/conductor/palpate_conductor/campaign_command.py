@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from palpate_conductor.campaign import MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, run_case
+from palpate_conductor.campaign import MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, forks, run_case
 from palpate_conductor.case_display import CaseDisplay
 
 EXIT_BAD_INPUT = 2
@@ -53,10 +53,11 @@ def faults(
         done = {(f.kind, f.where, f.mode) for f in found}
         todo = [case for case in todo if (case.kind, case.where, "wall clock" if case.wallclock else "lockstep") not in done]
     todo = todo[:limit]
+    started_by = forks()
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.tell(0, len(todo), "")
         for number, case in enumerate(todo, 1):
-            finding = run_case(case, Path(folder))
+            finding = run_case(case, Path(folder), started_by)
             found = [f for f in found if (f.kind, f.where, f.mode) != (finding.kind, finding.where, finding.mode)] + [finding]
             out.write_text(json.dumps(as_json(found), indent=1) + "\n", encoding="utf-8")
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"

@@ -21,6 +21,7 @@ from palpate_bus.runs import Announcement, Run
 from palpate_bus.zenoh_config import mesh
 
 from palpate_conductor.__main__ import FIXED
+from palpate_conductor.forks import Child, Forks
 from palpate_conductor.secure import SecureBus
 
 COMPOSE = "docker-compose.yml"
@@ -109,8 +110,13 @@ class LocalProcesses:
         scenario_files: Mapping[str, Path],
         extra: Mapping[str, str],
         secure: SecureBus | None = None,
+        forks: Forks | None = None,
     ) -> None:
-        """`scenario_files` gives the scenario that each role may see; with `secure` all are clients of its router."""
+        """`scenario_files` gives the scenario that each role may see; with `secure` all are clients of its router.
+
+        `forks` starts the processes in place of a fresh interpreter each.
+        """
+        self._forks = forks
         self._out = out
         self._scenario_files = scenario_files
         self._extra = dict(extra)
@@ -135,7 +141,7 @@ class LocalProcesses:
             )
         )
         self._logs: list[IO[bytes]] = []
-        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.running: dict[str, Child] = {}
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """What a service is given beyond the environment of this process."""
@@ -151,7 +157,11 @@ class LocalProcesses:
     def start(self, process: ServiceProcess) -> None:
         """Starts a service."""
         environment = {**os.environ, **self.environment(process)}
-        log = (self._out / "logs" / f"{process.role}.log").open("wb")
+        path = self._out / "logs" / f"{process.role}.log"
+        if self._forks is not None:
+            self.running[process.role] = self._forks.start(process.command, environment, path)
+            return
+        log = path.open("wb")
         self._logs.append(log)
         command = [sys.executable if process.command[0] == "python" else process.command[0], *process.command[1:]]
         self.running[process.role] = subprocess.Popen(
