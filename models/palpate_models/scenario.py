@@ -242,7 +242,8 @@ class TissueChoice(_Section):
     """Which tissue plays the role."""
 
     implementation: str = "default"
-    """`default`, or the name of another that an installed package registers (`fmu`)."""
+    """`default`; the name of another that an installed package registers (`fmu`, `elastic`); `none` where what the arm touches is
+    real: then no tissue is simulated, nothing is known of a truth, and nothing is scored (wall clock only)."""
     fmu: str | None = None
     """Co-simulation FMU for `implementation: fmu`; built from the phantom when empty."""
 

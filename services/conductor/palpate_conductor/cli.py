@@ -30,14 +30,14 @@ from palpate_conductor.conductor import RunFailed
 from palpate_conductor.evaluate import DEFAULT_CASES
 from palpate_conductor.evaluate import evaluate as run_evaluation
 from palpate_conductor.evaluate import table as evaluation_table
-from palpate_conductor.implementations import chosen_services
+from palpate_conductor.implementations import NONE, chosen_services
 from palpate_conductor.join import Absent, JoinError
 from palpate_conductor.own import OwnServiceError, own_services
 from palpate_conductor.page import write_page
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
 from palpate_conductor.report import print_findings, write_results
-from palpate_conductor.run import OBSERVERS, WORKERS, RunResult, run_composed, run_distributed, write_scenario_files
+from palpate_conductor.run import OBSERVERS, RunResult, run_composed, run_distributed, workers, write_scenario_files
 from palpate_conductor.run import conduct as run_conduct
 from palpate_conductor.secure import SecureBus
 from palpate_conductor.tree import FrameTree
@@ -45,6 +45,7 @@ from palpate_conductor.tree import FrameTree
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
 SECURE_ENDPOINT = "tls/[::]:7447"
+NEEDS_WALLCLOCK = "tissue.implementation = 'none' is for hardware, which does not wait: run with --wallclock"
 WIDE = 160
 """Columns of the wide tables, where the terminal has fewer or there is none."""
 
@@ -131,6 +132,8 @@ def run(
         _fail(console, EXIT_BAD_INPUT, str(error))
     if composed and (realtime or wallclock):
         _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
+    if chosen.tissue.implementation == NONE and not wallclock:
+        _fail(console, EXIT_BAD_INPUT, NEEDS_WALLCLOCK)
     if without and (composed or set(without) & own.keys()):
         _fail(console, EXIT_BAD_INPUT, "--without ROLE leaves out a process: it goes without --composed and --service ROLE=...")
     if handover and not wallclock:
@@ -211,7 +214,9 @@ def conduct(
         session = open_session()
     except (ScenarioError, BusConfigError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
-    roles = (*WORKERS, *(name for name in observers.split(",") if name))
+    if chosen.tissue.implementation == NONE and not wallclock:
+        _fail(console, EXIT_BAD_INPUT, NEEDS_WALLCLOCK)
+    roles = (*workers(chosen), *(name for name in observers.split(",") if name))
     with RunDisplay(console, quiet) as display:
         pace, tree = 1.0 if realtime else None, FrameTree(exam_input(chosen))
         result = run_conduct(session, roles, display.tell, realtime=pace, wallclock=wallclock, tree=tree)

@@ -236,7 +236,7 @@ class Conductor:
             for role, message, detail in self._heard():
                 if message.state == ServiceReport.FAILED:
                     raise RunFailed(f"{role} failed at start: {detail.get('error')}")
-                ready[role] = detail.get("missing", [])
+                ready[role] = [name for name in detail.get("missing", []) if not self._absent(name)]
             for role, how in died().items():
                 self.abort(f"{role} died at start")
                 raise RunFailed(f"{role} died at start: {how}")
@@ -251,6 +251,11 @@ class Conductor:
                 raise RunFailed(
                     f"not ready after {patience:.0f} s: " + (f"no answer from {', '.join(silent)}. " if silent else "") + deaf
                 )
+
+    def _absent(self, name: str) -> bool:
+        """Whether it is a topic whose producer has no part in this run."""
+        topic = self._rules.topics.get(name)
+        return topic is not None and topic.producer not in (*self._roles, self._collector.role)
 
     def _conduct(self, died: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         finished: set[str] = set()

@@ -1,7 +1,7 @@
 """Service processes forked from one that has imported everything: a campaign of many short runs starts each in half the time.
 
-They are processes of their own like any other, with their own session, log and signals. What differs from a fresh start is only who
-did the imports, so a single run, where it saves nothing, starts fresh ones.
+They are processes of their own like any other, with their own session, log and signals; only who did the imports differs from a
+fresh start. A single run starts fresh ones: there it would save nothing.
 """
 
 from __future__ import annotations

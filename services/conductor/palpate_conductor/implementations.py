@@ -17,6 +17,8 @@ from palpate_models.scenario import Scenario
 from palpate_conductor.processes import ServiceProcess
 
 DEFAULT = "default"
+NONE = "none"
+"""Of the tissue: nothing plays the role, since what is examined is real."""
 
 
 def _choices(scenario: Scenario) -> dict[str, str]:
@@ -35,12 +37,13 @@ def chosen_services(scenario: Scenario) -> dict[str, EntryPoint]:
     found = {point.name: point for point in entry_points(group="palpate.implementations")}
     chosen = {}
     for role, name in _choices(scenario).items():
-        if name == DEFAULT:
+        if name == DEFAULT or (role, name) == ("tissue", NONE):
             continue
         point = found.get(f"{role}.{name}")
         if point is None:
             known = sorted(key.partition(".")[2] for key in found if key.startswith(f"{role}."))
-            raise ScenarioError(f"{scenario.name}: {role}.implementation = {name!r}: allowed are {', '.join([DEFAULT, *known])}")
+            allowed = [DEFAULT, *known, *([NONE] if role == "tissue" else [])]
+            raise ScenarioError(f"{scenario.name}: {role}.implementation = {name!r}: allowed are {', '.join(allowed)}")
         chosen[role] = point
     return chosen
 

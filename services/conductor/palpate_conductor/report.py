@@ -133,10 +133,12 @@ class Report(_Row):
     depth: DepthRow
     surface_rms_error_m: float | None
     """RMS distance of the perceived from the true rest surface in the examined region, along the normal."""
+    assessed: bool
+    """Whether there are findings that are final, though it be none."""
     findings: list[FindingRow]
     truth: TruthRow | None
     scores: ScoresRow | None
-    """Null when the run ended before there was anything to score."""
+    """Null when the run ended before there was anything to score, or nothing is known of a truth."""
     blame: dict[str, Any]
     """Where each service's time goes."""
     services: dict[str, Any]
@@ -177,6 +179,7 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
         depth_rms_error_m=depth.true_against_setpoint_m,
         depth=depth,
         surface_rms_error_m=_surface(scenario, c.surface, truth),
+        assessed=final is not None,
         findings=[_finding(f) for f in ([] if final is None else final.findings)],
         truth=None if truth is None else TruthRow(lesions=[_lesion(lesion) for lesion in lesions]),
         scores=scores,
@@ -234,7 +237,7 @@ def print_findings(console: Console, report: Report) -> None:
                 "over 99 %" if f.confidence > 0.99 else f"{100 * f.confidence:.0f} %",
             )
         console.print(table)
-    elif report.scores is not None:
+    elif report.assessed and report.failure is None:
         console.print("no finding")
     else:
         console.print("not assessed")

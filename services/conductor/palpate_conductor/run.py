@@ -23,7 +23,7 @@ from palpate_models.scenario import Scenario
 
 from palpate_conductor.collector import Collected, Collector
 from palpate_conductor.conductor import Conductor, Patience, RunFailed
-from palpate_conductor.implementations import chosen_environment, chosen_processes, chosen_services
+from palpate_conductor.implementations import NONE, chosen_environment, chosen_processes, chosen_services
 from palpate_conductor.join import Absent
 from palpate_conductor.own import in_place, load
 from palpate_conductor.processes import LocalProcesses, compose_file, override_files, read_processes
@@ -76,6 +76,11 @@ class Progress:
 Tell = Callable[[Progress], None]
 
 
+def workers(scenario: Scenario) -> tuple[str, ...]:
+    """The roles without which a run of this scenario is none: all, but for the tissue where what is examined is real."""
+    return tuple(role for role in WORKERS if role != "tissue" or scenario.tissue.implementation != NONE)
+
+
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
     """Makes the results folder and the scenario files; returns the file that each role may see."""
     (out / "logs").mkdir(parents=True, exist_ok=True)
@@ -109,7 +114,7 @@ def run_distributed(
     in the result.
     """
     begin = perf_counter()
-    roles = (*WORKERS, *observers)
+    roles = (*workers(scenario), *observers)
     files = write_scenario_files(scenario, out)
     listed = read_processes(compose_file(), roles, override_files())
     processes = in_place(chosen_processes(scenario, listed), own or {})

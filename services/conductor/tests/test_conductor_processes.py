@@ -5,9 +5,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from palpate_conductor.cli import EXIT_BAD_INPUT, app
+from palpate_conductor.implementations import chosen_processes
 from palpate_conductor.processes import ProcessListError, compose_file, override_files, read_processes
-from palpate_conductor.run import OBSERVERS, WORKERS
+from palpate_conductor.run import OBSERVERS, WORKERS, workers
 from palpate_conductor.swaps import read_swaps
+from palpate_models.load import load_scenario
+from typer.testing import CliRunner
 
 
 def test_every_role_of_a_run_is_in_the_compose_file() -> None:
@@ -71,6 +75,30 @@ def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs
         assert processes[role].command == ("python", "-m", registered[f"{role}.{chosen}"])
         assert (root / service["build"]["dockerfile"]).is_file()
         assert service["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
+
+
+def test_the_override_for_hardware_starts_no_simulation() -> None:
+    root = compose_file().parent
+    file = root / "swap" / "hardware" / "real.yml"
+    document = yaml.safe_load(file.read_text(encoding="utf-8"))
+    words = document["services"]["prepare"]["environment"]["PALPATE_SETTINGS"].split()
+    scenario = load_scenario("rlq_guarding", [word for word in words if "=" in word])
+    roles = workers(scenario)
+    assert set(WORKERS) - set(roles) == {"tissue"}
+    assert document["services"]["tissue"]["profiles"] == ["simulated"]
+    processes = read_processes(compose_file(), (*roles, *OBSERVERS), (file,))
+    chosen = chosen_processes(scenario, processes)
+    assert {role: process.command for role, process in processes.items()} == {r: p.command for r, p in chosen.items()}
+    assert {process.environment["PALPATE_RUNTIME"] for process in processes.values()} == {"wallclock"}
+    assert "--wallclock" in document["services"]["conductor"]["command"]
+
+
+@pytest.mark.parametrize("words", [["run"], ["run", "--composed"], ["run", "--realtime"]])
+def test_real_tissue_waits_for_no_simulated_time(words: list[str], tmp_path: Path) -> None:
+    called = CliRunner().invoke(app, [*words, "--set", "tissue.implementation=none", "--out", str(tmp_path / "out")])
+    assert called.exit_code == EXIT_BAD_INPUT
+    assert "--wallclock" in called.output
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_swap_without_settings_is_named(tmp_path: Path) -> None:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from conductor_messages import FOUND, collected, result
 from palpate_conductor.evidence import samples_of, steady_contact
+from palpate_conductor.page import write_page
 from palpate_conductor.report import Report, assemble, print_findings, write_results
+from palpate_conductor.run import write_scenario_files
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
 from rich.console import Console
@@ -108,3 +110,18 @@ def test_findings_in_words(scenario: Scenario) -> None:
     print_findings(Console(file=text, width=120), assemble(scenario, result(collected())))
     assert "RLQ" in text.getvalue()
     assert "1 matched, 0 missed, 0 false" in text.getvalue()
+
+
+def test_a_real_abdomen_is_assessed_without_a_truth(scenario: Scenario, tmp_path: Path) -> None:
+    real = collected()
+    real.phantom, real.indentation = None, []
+    write_scenario_files(scenario, tmp_path)
+    report = write_results(tmp_path, scenario, result(real))
+    assert report.assessed
+    assert report.findings[0].quadrant == "RLQ"
+    assert (report.truth, report.scores, report.depth_rms_error_m) == (None, None, None)
+    assert "nothing is known of it" in write_page(tmp_path).read_text(encoding="utf-8").lower()
+    text = io.StringIO()
+    print_findings(Console(file=text, width=120), report)
+    assert "RLQ" in text.getvalue()
+    assert "truth" not in text.getvalue()
