@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+from contextlib import suppress
 from time import monotonic, perf_counter_ns, time_ns
 from typing import Any
 
@@ -134,6 +135,8 @@ class LockstepNode:
             self._service.finish()
             raise
         except Exception as error:
+            with suppress(Exception):
+                self._outlet.flush(self._tick)  # what others have heard belongs in the recording
             self._link.report(ServiceReport.FAILED, self._tick, detail={"error": f"{type(error).__name__}: {error}"})
             raise
 

@@ -3,7 +3,7 @@
 | variable | example | meaning |
 |---|---|---|
 | `PALPATE_FAULT` | `planning/setpoint:nan` | topic and kind; nothing is ever wrapped without it |
-| `PALPATE_FAULT_AT` | `signal` (default) or `7.5` | from SIGUSR1 on, or from that simulated second on |
+| `PALPATE_FAULT_AT` | `signal` (default) or `7.5` | from SIGUSR1 on, or from that simulated second on (periodic topics) |
 | `PALPATE_FAULT_COUNT` | 1 | how many messages it hits; 0 for all from then on |
 
 | kind | what happens |
@@ -33,7 +33,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from palpate_bus import codec
-from palpate_bus.contract import Topic
+from palpate_bus.contract import Topic, contract
 
 DELAY_S: Final = 0.5
 PAST_S: Final = 3600
@@ -77,7 +77,11 @@ class Fault:
         topic, _, kind = text.rpartition(":")
         if not topic or kind not in (*CHANGES, "drop", "delay", "duplicate", "jump"):
             raise FaultError(f"PALPATE_FAULT is {text!r}; want TOPIC:KIND with a kind out of {', '.join(KINDS)}")
+        if topic not in contract().topics and (topic, kind) != ("clock", "jump"):
+            raise FaultError(f"PALPATE_FAULT is {text!r}: there is no topic {topic}; want one of {', '.join(contract().topics)}")
         when = environ.get("PALPATE_FAULT_AT", "signal")
+        if when != "signal" and (kind == "jump" or not contract().topics[topic].periodic):
+            raise FaultError(f"PALPATE_FAULT_AT is {when!r}: {text} begins by signal only, its messages tell no time")
         try:
             at = None if when == "signal" else round(float(when) * NS)
             count = int(environ.get("PALPATE_FAULT_COUNT", "1"))

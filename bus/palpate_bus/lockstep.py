@@ -48,7 +48,7 @@ class InputBuffer:
     """
 
     __slots__ = (
-        "_advances", "_last_sequence", "_pending", "_unstamped",
+        "_advances", "_blocks", "_last_sequence", "_latched", "_pending", "_unstamped",
         "advanced", "decode", "delay", "edge", "grid", "latest", "lost", "new", "period", "topic",
     )  # fmt: skip
 
@@ -63,21 +63,20 @@ class InputBuffer:
         self.latest: Received | None = None
         self.new: list[Received] = []
         self.lost = False
+        self._blocks, self._latched = edge.blocking, edge is Edge.LATCHED
         self._pending: deque[Received] = deque()
         self._unstamped: deque[Received] = deque()
         self._advances: deque[tuple[int, int]] = deque()
         self._last_sequence = 0
 
-    def need(self, t: int) -> int:
-        """The producer's tick [ns] that must have been reached before the reader may step at `t`; negative for none."""
-        limit = t - self.delay
-        return limit - limit % self.grid if limit >= 0 else NEVER
-
     def ready(self, t: int) -> bool:
-        """Whether the reader may step at `t` as far as this topic goes."""
-        if self.lost or not self.edge.blocking:
-            return self.lost or self.edge is not Edge.LATCHED or self.holds_any
-        return self.advanced >= self.need(t)
+        """Whether the reader may step at `t` as far as this topic goes: its producer has reached the newest tick that counts."""
+        if self.lost:
+            return True
+        if not self._blocks:
+            return not self._latched or self.holds_any
+        limit = t - self.delay
+        return limit < 0 or self.advanced >= limit - limit % self.grid
 
     def accept(self, sequence: int, payload: bytes) -> None:
         """Takes a message off the wire. Raises LockstepError when one is missing before it."""
@@ -131,11 +130,14 @@ class InputBuffer:
         """Moves what the reader may see at `t` into `new` and `latest`."""
         limit = t - self.delay
         pending = self._pending
-        new = self.new = []
+        if not pending or pending[0].stamp > limit:
+            if self.new:
+                self.new = []
+            return
+        new = self.new = [pending.popleft()]
         while pending and pending[0].stamp <= limit:
             new.append(pending.popleft())
-        if new:
-            self.latest = new[-1]
+        self.latest = new[-1]
 
 
 class TickInbox:

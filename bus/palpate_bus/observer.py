@@ -18,7 +18,7 @@ from palpate_bus.lockstep import NEVER, Received, Stepper
 from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.service import Service
-from palpate_bus.transport import HELLO, decodes
+from palpate_bus.transport import HELLO, decoded
 from palpate_bus.wire import WireError, unpack
 
 log = logging.getLogger(__name__)
@@ -49,8 +49,8 @@ class _Feed:
         self.garbage = 0
         self.heard = False
 
-    def drain(self) -> list[tuple[int, bytes]]:
-        """Everything that came in since last time: (sequence, payload)."""
+    def drain(self) -> list[tuple[int, bytes, codec.Message]]:
+        """Everything that came in since last time: (sequence, payload, message)."""
         received = []
         while (sample := self._try()) is not None:
             try:
@@ -62,13 +62,14 @@ class _Feed:
             if sequence == HELLO and not (payload and self.topic.open):
                 self.heard = True
                 continue
-            if not decodes(self._decode, payload):  # an observer knows no rightful sender, and must not end with what it gets
+            message = decoded(self._decode, payload)
+            if message is None:  # an observer knows no rightful sender, and must not end with what it gets
                 self.garbage += 1
                 continue
             if sequence > self.sequence + 1 and not self.topic.open:
                 self.missed += sequence - self.sequence - 1
             self.sequence = max(self.sequence, sequence)
-            received.append((sequence, payload))
+            received.append((sequence, payload, message))
         return received
 
 
@@ -108,9 +109,10 @@ class ObservedService:
             if topic.periodic:
                 self.now = max(self.now, (received[-1][0] - 1) * topic.period)
             buffer = self.stepper.buffers[topic.name]
-            for sequence, payload in received:
-                stamp = (sequence - 1) * topic.period if topic.periodic else max(self.now, 0)
-                buffer.deliver(Received(payload, stamp, sequence))
+            for sequence, payload, message in received:
+                arrival = Received(payload, (sequence - 1) * topic.period if topic.periodic else max(self.now, 0), sequence)
+                arrival.message = message
+                buffer.deliver(arrival)
         return busy
 
     def counters(self) -> dict[str, object]:

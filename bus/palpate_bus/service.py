@@ -43,6 +43,9 @@ class Service(ABC):
     """Base of every service. `role` names its row in the contract."""
 
     role: ClassVar[str]
+    catches_up: ClassVar[bool] = True
+    """Whether its physics has to keep time: in wall-clock mode a critical service that is late then steps every tick that it
+    missed. A driver of real hardware says False: the arm has moved on by itself, and what was due a while ago is past."""
 
     def start(self) -> Outbox:
         """Messages to send before the first tick: the latched ones. Called once."""
