@@ -18,6 +18,9 @@ VELOCITY_LAG_S: Final = 0.004
 (about 1e-5 rad) below 3 mrad/s at 500 Hz and costs the damping 4 ms."""
 STATE_AGE_NS: Final = 20_000_000
 """A state older than this is none: the contract's age of joint_states."""
+CLOCK_SET_NS: Final = 1_000_000_000
+"""A stamp that is so much older than the newest [ns] is of a controller whose clock was set back; any other is a state that was
+overtaken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +64,16 @@ class Arm:
         self._trouble = "no LBRState has come yet"
 
     def update(self, t: int, state: Any) -> bool:
-        """Takes a state that came at `t` [ns]; returns whether it is new and usable."""
+        """Takes a state that came at `t` [ns]; returns whether it is new and usable.
+
+        Where the controller's clock was set, velocities start anew from zero.
+        """
         q = np.array(state.measured_joint_position)
         stamp = int(state.time_stamp_sec) * 1_000_000_000 + int(state.time_stamp_nano_sec)
         if not np.isfinite(q).all():
             self._trouble = f"LBRState: measured_joint_position = {q}: must be finite"
             return False
-        if self._stamp is not None and stamp <= self._stamp:
+        if self._stamp is not None and 0 <= self._stamp - stamp < CLOCK_SET_NS:
             return False
         dt = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
         if 0.0 < dt < 0.1:
