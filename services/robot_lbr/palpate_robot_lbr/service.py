@@ -87,10 +87,12 @@ class LbrService(Service):
         if self._inner is not None:
             self._inner.listen(inbox)
         if self._arm.heard is not None and t - self._arm.heard <= STATE_AGE_NS:
-            joints = JointState(header(t), _NAMES, self._arm.q, self._arm.v, self._applied.copy())
-            outbox["joint_states"] = joints  # between two states of the arm the newest again: readers count on every tick
+            joints = JointState(header(self._arm.heard), _NAMES, self._arm.q, self._arm.v, self._applied.copy())
+            outbox["joint_states"] = (
+                joints  # on every tick, as readers count on it: between two states the newest, with its stamp
+            )
             if self._wrench_at is not None and t - self._wrench_at <= FT_AGE:
-                outbox["ft/wrench"] = WrenchStamped(header(t, "ft_sensor"), _wrench(self._wrench))
+                outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), _wrench(self._wrench))
             if fresh:
                 self._drive(t, inbox, joints)
         if self._arm.heard is not None:
