@@ -47,6 +47,8 @@ class LbrService(Service):
     """A real LBR in the role robot."""
 
     role: ClassVar[str] = "robot"
+    catches_up: ClassVar[bool] = False
+    """The arm has moved on: a tick that was missed is never made up for."""
 
     def __init__(self, exam: ExamInput, settings: Settings, port: LbrPort, inner: InnerLoop | None = None) -> None:
         """`inner` is the loop that follows set-points in this process; without it `control/joint_torque` is obeyed."""
