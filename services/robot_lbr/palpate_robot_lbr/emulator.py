@@ -49,8 +49,6 @@ log = logging.getLogger("emulator")
 
 BRAKE: Final = np.full(7, 2000.0)
 """Joint damping while nothing is commanded [N m s/rad]: the arm's own position control, then its brakes, hold it."""
-STALL_NS: Final = 100_000_000
-"""A cycle that comes later than this was no fault of the client's, but the emulator's machine stood still: not counted."""
 CONTACT_AGE_NS: Final = 200_000_000
 """A contact wrench older than this is none: the tissue is gone."""
 
@@ -145,6 +143,31 @@ class Emulator:
         return TFMessage(found)
 
 
+class Metronome:
+    """When cycles are due and what they are stamped with. Time comes from outside.
+
+    A real arm never hurries: a late cycle moves all that follow, and by its own clock one period passes in every cycle.
+    """
+
+    def __init__(self, period: int, now: int, wall: int) -> None:
+        """The first cycle is one `period` [ns] after `now` [ns] of a steady clock, when the time of day is `wall` [ns]."""
+        self._period = period
+        self._due = now + period
+        self._stamp = wall
+
+    def wait(self, now: int) -> int:
+        """How long it is until the next cycle [ns], 0 when it is due."""
+        return max(self._due - now, 0)
+
+    def begin(self, now: int) -> int:
+        """Begins a cycle; returns its stamp [ns]."""
+        if now - self._due > self._period:
+            self._due = now
+        self._due += self._period
+        self._stamp += self._period
+        return self._stamp
+
+
 class Graph:
     """The emulator's publishers and subscriptions."""
 
@@ -160,18 +183,14 @@ class Graph:
 
 def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool]) -> None:
     """Cycles on the wall clock while `running[0]`; after the session's end the arm stands, and the stack says no more."""
-    period = options.period_ms * 1_000_000
-    due = monotonic_ns() + period
+    metronome = Metronome(options.period_ms * 1_000_000, monotonic_ns(), time_ns())
     contact_at = 0
     cycles = 0
     said = ""
     while running[0]:
+        sleep(metronome.wait(monotonic_ns()) / 1e9)
         now = monotonic_ns()
-        if now < due:
-            sleep((due - now) / 1e9)
-        stalled = now - due > STALL_NS
-        if stalled:
-            due = now
+        stamp = metronome.begin(now)
         contact = graph.contact.newest()
         if contact is not None:
             f, m = contact.wrench.force, contact.wrench.torque
@@ -183,18 +202,16 @@ def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool
         if command is not None:
             emulator.session.take(np.array(command.joint_position), np.array(command.torque))
         emulator.cycle()
-        wall = time_ns()
         if not emulator.session.ended:
-            graph.state.publish(emulator.state(wall))
+            graph.state.publish(emulator.state(stamp))
         elif said != emulator.session.ended:
             said = emulator.session.ended
             log.error("the session has ended: %s", said)
-        graph.wrench.publish(emulator.wrench(wall))
-        graph.tool.publish(emulator.tool(wall))
+        graph.wrench.publish(emulator.wrench(stamp))
+        graph.tool.publish(emulator.tool(stamp))
         if cycles % (50 // options.period_ms or 1) == 0:
-            graph.links.publish(emulator.links(wall))
+            graph.links.publish(emulator.links(stamp))
         cycles += 1
-        due += period
 
 
 def main(arguments: list[str] | None = None) -> int:
