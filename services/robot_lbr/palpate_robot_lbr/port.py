@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
-from palpate_bus.ros_node import RosNode
 from palpate_bus.zenoh_config import BusOptions
 from palpate_models.frames import Array
 
+from palpate_robot_lbr.commands import LbrNode
 from palpate_robot_lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand
 from palpate_robot_lbr.settings import Settings
 
@@ -34,6 +34,10 @@ class LbrPort(ABC):
         """Joint positions [rad] and torque overlay [N m], shapes (7,)."""
 
     @abstractmethod
+    def rivals(self) -> list[bytes]:
+        """GIDs of others who commanded the arm since last time, oldest first."""
+
+    @abstractmethod
     def contact(self, wrench: Any) -> None:
         """Emulated: the tissue's wrench on the indenter."""
 
@@ -52,10 +56,11 @@ class ZenohPort(LbrPort):
     def __init__(self, settings: Settings) -> None:
         """Joins. Raises BusConfigError."""
         name = settings.namespace
-        self._node = RosNode("palpate_robot_lbr", settings.domain, BusOptions(router=settings.router))
+        self._node = LbrNode("palpate_robot_lbr", settings.domain, BusOptions(router=settings.router))
         self._states = self._node.subscription(f"{name}/state", STATE)
         self._wrenches = self._node.subscription(settings.ft_topic, WRENCH)
         self._command = self._node.publisher(f"{name}/command/torque", TORQUE_COMMAND)
+        self._commands = self._node.commands(f"{name}/command/torque")
         if settings.emulated:
             self._contact = self._node.publisher(CONTACT_TOPIC, WRENCH)
             self._tool = self._node.subscription(TOOL_TOPIC, TOOL_STATE)
@@ -72,6 +77,10 @@ class ZenohPort(LbrPort):
     def command(self, q: Array, torque: Array) -> None:
         """The stack's torque controller wants a joint position as well; see docs/real-robot.md on its stiffness."""
         self._command.publish(LBRTorqueCommand(q, torque))
+
+    def rivals(self) -> list[bytes]:
+        """Everyone's commands come back, also this process's: those are left out."""
+        return self._commands.others(self._command.gid)
 
     def contact(self, wrench: Any) -> None:
         """To the emulator."""

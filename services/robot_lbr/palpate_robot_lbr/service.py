@@ -40,6 +40,8 @@ arm's own viscous friction (10) that is stable with any delay; more is for the j
 LINKS_PERIOD = 50_000_000
 FT_AGE = 50_000_000
 """An F/T reading older than this is none [ns]."""
+TAKE_OVER = 100_000_000
+"""For so long after its first command [ns] the driver lets others finish: the watchdog commands until it hears a new driver."""
 _NAMES = list(lbr.JOINT_NAMES)
 
 
@@ -64,6 +66,7 @@ class LbrService(Service):
         self._R_ST = settings.ft_sign * turn
         self._command: Command | None = None
         self._command_message: Message | None = None
+        self._commanding_since: int | None = None
         self._releases = 0
         self._wrench = np.zeros(6)
         self._wrench_at: int | None = None
@@ -124,6 +127,9 @@ class LbrService(Service):
 
     def _listen(self, t: int) -> bool:
         """Takes what the ROS side sent; returns whether the joint state is new."""
+        since = self._commanding_since
+        if self._port.rivals() and since is not None and t - since > TAKE_OVER:
+            self._driver.hold(t, Cause.DEVICE, "another process, likely the watchdog, commands the arm")
         fresh = False
         for state in self._port.states():
             fresh = self._arm.update(t, state) or fresh
@@ -177,6 +183,7 @@ class LbrService(Service):
         self._applied = np.asarray(torque, dtype=float)
         np.maximum(self._peak_torque, np.abs(self._applied), out=self._peak_torque)
         self._port.command(arm.q, self._applied)
+        self._commanding_since = t if self._commanding_since is None else self._commanding_since
         self._commands += 1
 
     def _newest_command(self, t: int, inbox: Inbox, joints: Message) -> Command | None:

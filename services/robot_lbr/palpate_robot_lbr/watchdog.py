@@ -4,7 +4,8 @@
 
 lbr_fri_ros2_stack applies the last torque for ever (its torque controller has no time-out): a driver that dies in contact would
 leave its last push on the patient. This process hears state and commands; when commands stop while the session commands, it sends
-damping and no torque, until another driver appears. It shares no code path with the driver but the messages.
+damping and no torque, until another driver appears. The old driver, should it wake, hears that and holds. Driver and watchdog share
+how messages are read, and nothing of what decides.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from types import FrameType
 from typing import Any, Final
 
 import numpy as np
-from palpate_bus.ros_node import RosNode
 from palpate_bus.zenoh_config import BusOptions
 from palpate_models.frames import Array
 
 from palpate_robot_lbr.arm import Arm
+from palpate_robot_lbr.commands import LbrNode
 from palpate_robot_lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
 from palpate_robot_lbr.settings import Settings
 
@@ -75,11 +76,10 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    node = RosNode("palpate_lbr_watchdog", settings.domain, BusOptions(router=settings.router))
+    node = LbrNode("palpate_lbr_watchdog", settings.domain, BusOptions(router=settings.router))
     states = node.subscription(f"{settings.namespace}/state", STATE)
-    commands = node.subscription(f"{settings.namespace}/command/torque", TORQUE_COMMAND)
+    commands = node.commands(f"{settings.namespace}/command/torque")
     publisher = node.publisher(f"{settings.namespace}/command/torque", TORQUE_COMMAND)
-    own = publisher.gid
     watchdog = Watchdog()
     said = False
     try:
@@ -87,8 +87,8 @@ def main() -> int:
             now = monotonic_ns()
             for state in states.take():
                 watchdog.state(now, state)
-            if commands.take() and commands.sender != own:
-                watchdog.command(now, commands.sender)
+            for sender in commands.others(publisher.gid):
+                watchdog.command(now, sender)
             answer = watchdog.decide(now)
             if answer is not None:
                 publisher.publish(LBRTorqueCommand(*answer))

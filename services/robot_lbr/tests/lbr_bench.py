@@ -26,6 +26,7 @@ class DirectPort(LbrPort):
         self.silent = False
         self.ft_silent = False
         self.torques: list[np.ndarray] = []
+        self.commanded_by: list[bytes] = []
         self._readings: list[Any] = []
         self._moved = True
 
@@ -46,6 +47,10 @@ class DirectPort(LbrPort):
     def command(self, q: Any, torque: Any) -> None:
         self.torques.append(np.array(torque))
         self.emulator.session.take(np.array(q), np.array(torque))
+
+    def rivals(self) -> list[bytes]:
+        others, self.commanded_by = self.commanded_by, []
+        return others
 
     def contact(self, wrench: Any) -> None:
         f, m = wrench.wrench.force, wrench.wrench.torque
