@@ -4,8 +4,8 @@
 
 lbr_fri_ros2_stack applies the last torque for ever (its torque controller has no time-out): a driver that dies in contact would
 leave its last push on the patient. This process hears state and commands; when commands stop while the session commands, it sends
-damping and no torque, until another driver appears. The old driver, should it wake, hears that and holds. Driver and watchdog share
-how messages are read, and nothing of what decides.
+damping and no torque, until another driver appears. The old driver, should it wake, hears that and holds. Driver and watchdog
+share how messages are read, and nothing of what decides.
 """
 
 from __future__ import annotations
