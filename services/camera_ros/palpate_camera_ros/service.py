@@ -110,6 +110,7 @@ class RosCameraService(Service):
         if not self._wanted or not images or info is None:
             return {}
         try:
+            _agree(images[-1], info)
             image = _image(t, images[-1])
             intrinsics = _intrinsics(t, info)
         except CameraError as error:
@@ -142,6 +143,12 @@ def _await_pose(port: CameraPort, frame: str, world: str, wait_s: float) -> Arra
             tree = ", ".join(f"{parent} -> {child}" for child, (parent, _) in sorted(known.items())) or "nothing"
             raise CameraError(f"tf_static has no way from {world!r} to {frame!r}: it has {tree}. Calibrate and publish it")
         sleep(0.05)
+
+
+def _agree(image: Any, info: Any) -> None:
+    """The intrinsics must be those of the image: a driver that scales one of them shifts everything that is seen."""
+    if (image.width, image.height) != (info.width, info.height):
+        raise CameraError(f"depth image is {image.width} x {image.height}, camera_info says {info.width} x {info.height}")
 
 
 def _image(t: int, image: Any) -> Any:

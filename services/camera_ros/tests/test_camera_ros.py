@@ -145,6 +145,19 @@ def test_a_distorted_image_is_refused_and_said_so() -> None:
     assert "rectified" in str(service.finish()["problem"])
 
 
+def test_an_image_that_camera_info_is_not_of_is_refused_and_said_so() -> None:
+    port = Port()
+    port.intrinsics.width, port.intrinsics.height = 6, 4
+    service = RosCameraService(port)
+    inbox = Inbox(frames=1)
+    service.step(0, inbox)
+    port.waiting = [ros_image()]
+    assert service.step(100_000_000, inbox) == {}
+    facts = service.finish()
+    assert (facts["frames"], facts["frames_rejected"]) == (0, 1)
+    assert facts["problem"] == "depth image is 3 x 2, camera_info says 6 x 4"
+
+
 def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/ros.sock"
     node = RosNode("realsense", 0, BusOptions(listen=(endpoint,)))

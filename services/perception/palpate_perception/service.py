@@ -53,11 +53,11 @@ class PerceptionService(Service):
             return {}
         burst.waiting += [frame for frame in frames if nanoseconds(frame.header.stamp) >= burst.asked]
         self._fuse(burst, inbox)
-        done = burst.fusion is not None and burst.fusion.frames >= burst.wanted
+        done = bool(burst.wrong) or (burst.fusion is not None and burst.fusion.frames >= burst.wanted)
         if not done and t < burst.deadline and not inbox.lost("camera"):
             return {}
         self._burst = None
-        if burst.fusion is None or burst.camera is None:
+        if burst.wrong or burst.fusion is None or burst.camera is None:
             return {"perception/targets": targets(t, _nothing(burst, inbox))}
         perceived = self._pipeline.perceive(burst.fusion, burst.camera)
         self._last = perceived
@@ -92,7 +92,9 @@ class PerceptionService(Service):
             burst.fusion = self._pipeline.fusion(burst.camera)
         if burst.fusion is not None:
             for frame in burst.waiting[: burst.wanted - burst.fusion.frames]:
-                burst.fusion.add(depth_in_metres(frame))
+                burst.wrong = burst.wrong or _disagreement(frame, burst.camera)
+                if not burst.wrong:
+                    burst.fusion.add(depth_in_metres(frame))
             burst.waiting.clear()
 
 
@@ -105,6 +107,8 @@ class _Burst:
         self.waiting: list[Message] = []
         self.camera: Intrinsics | None = None
         self.fusion: DepthFusion | None = None
+        self.wrong = ""
+        """Why its frames cannot be used; empty while they can."""
 
 
 def create(scenario: Scenario) -> Service:
@@ -112,9 +116,19 @@ def create(scenario: Scenario) -> Service:
     return PerceptionService(exam_input(scenario))
 
 
+def _disagreement(frame: Message, camera: Intrinsics) -> str:
+    """Why the intrinsics cannot be those of a frame; empty when they can."""
+    height, width = camera.shape
+    if (frame.height, frame.width) == (height, width):
+        return ""
+    return f"depth image is {frame.width} x {frame.height}, camera_info says {width} x {height}"
+
+
 def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
     """The answer to a burst of which nothing could be used."""
-    if inbox.lost("camera"):
+    if burst.wrong:
+        why = burst.wrong
+    elif inbox.lost("camera"):
         why = "the camera's service is gone"
     elif burst.waiting and inbox.latest("tf_static") is None:
         why = "frames came, but no tf_static with the camera's pose"

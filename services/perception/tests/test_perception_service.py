@@ -337,6 +337,28 @@ def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
     assert "no tf_static" in answer["perception/targets"].message
 
 
+@pytest.mark.parametrize("larger", ["info", "image"])
+def test_an_image_that_camera_info_is_not_of_is_answered_in_words(larger: str) -> None:
+    case = scenario()
+    camera, perception = CameraService(exam_input(case)), create(case)
+    wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 2)}
+    frame = dict(camera.step(TICK, FakeInbox().put(wake)))
+    depth, info = frame["camera/depth/image_raw"], frame["camera/depth/camera_info"]
+    width, height = int(depth.width), int(depth.height)
+    if larger == "info":
+        info.width, info.height = 2 * width, 2 * height
+    else:
+        info.width, info.height = width // 2, height // 2
+    inbox = FakeInbox(tf_static=camera.start()["tf_static"])
+    assert perception.step(TICK, inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 2)})) == {}
+    sent = perception.step(2 * TICK, inbox.put(frame))
+    assert set(sent) == {"perception/targets"}, "answered at once: more frames will not help"
+    targets = sent["perception/targets"]
+    assert len(targets.positions) == 0
+    told = f"depth image is {width} x {height}, camera_info says {info.width} x {info.height}"
+    assert targets.message == f"nothing seen: {told}"
+
+
 def image(encoding: str, data: np.ndarray, width: int, step: int, bigendian: int = 0) -> Any:
     return Image(header(0, "c"), 2, width, encoding, bigendian, step, data.view(np.uint8).reshape(-1))
 
