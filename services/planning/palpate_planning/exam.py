@@ -20,7 +20,7 @@ from palpate_planning.setpoint import ControlMode, Setpoint
 from palpate_planning.status import PHASE_OF, ExamStatus, Observation, Outcome, Phase, Unseen
 from palpate_planning.surface import Surface
 from palpate_planning.thinking import Thought
-from palpate_planning.timing import JointTrajectory
+from palpate_planning.timing import JointTrajectory, Pace
 from palpate_planning.weight import ToolWeight
 
 Array = NDArray[np.float64]
@@ -60,6 +60,7 @@ class Exam:
         self._planner = Planner(known)
         self._looks = look_postures(known)
         self._follower = Follower(self._kinematics, np.array(lbr.HOME))
+        self._pace, self._rate = Pace(), 1.0
         self.status = ExamStatus()
         self._steps: dict[Phase, Callable[[Observation], Setpoint | None]] = {
             Phase.HOME: self._home,
@@ -103,6 +104,7 @@ class Exam:
 
     def step(self, now: Observation) -> Outcome:
         """One planning period. Until the robot has been heard of, the arm is asked for nothing."""
+        self._rate = self._pace.step(now.t)
         if now.reading is None:
             q = np.array(lbr.HOME)
             return Outcome(Setpoint(ControlMode.JOINT, self._kinematics.pose(q), q, limp=True), None)
@@ -115,7 +117,7 @@ class Exam:
         self._contact = self._sense.sense(now.reading)
         self.status.depth_setpoint = self._contact.depth
         self._watch(now)
-        setpoint = self._steps[self.status.phase](now) or self._follower.step()
+        setpoint = self._steps[self.status.phase](now) or self._follower.step(self._rate)
         return Outcome(setpoint, self._contact, self._trigger, self._path)
 
     # --- transitions --------------------------------------------------------------------------------------------------
@@ -195,7 +197,7 @@ class Exam:
                 self._abort(now, f"nobody released it within {waited:g} s: {now.stop}")
             elif self._soft and self._palpation is not None and self._held_in in PALPATING:
                 if self._palpation.free_goal is None:
-                    return self._palpation.step(self._contact).setpoint
+                    return self._palpation.step(self._contact, self._rate).setpoint
             elif not self._soft:
                 self._follower.hold(now.reading.q)  # the driver holds without stiffness: nothing is to pull when it lets go
             return None
@@ -317,7 +319,7 @@ class Exam:
 
     def _palpate(self, now: Observation) -> Setpoint | None:
         assert now.reading is not None and self._palpation is not None
-        progress = self._palpation.step(self._contact)
+        progress = self._palpation.step(self._contact, self._rate)
         self._report(progress, now.t)
         self._sense.surface.offset = self._palpation.offset
         if progress.doing is Doing.DONE:

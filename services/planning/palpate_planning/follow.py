@@ -23,11 +23,11 @@ class Follower:
     def hold(self, q: Array) -> None:
         """Stays at q."""
         self._trajectory = JointTrajectory(np.array(q, dtype=float)[None], np.zeros((1, 7)))
-        self._k = 0
+        self._k = 0.0
 
     def start(self, trajectory: JointTrajectory) -> None:
         """Follows a trajectory from the next step on."""
-        self._trajectory, self._k = trajectory, 0
+        self._trajectory, self._k = trajectory, 0.0
 
     @property
     def arrived(self) -> bool:
@@ -37,10 +37,10 @@ class Follower:
     @property
     def q(self) -> Array:
         """The posture set last [rad], shape (7,)."""
-        return np.asarray(self._trajectory.q[self._k])
+        return self._trajectory.at(self._k)[0]
 
-    def step(self) -> Setpoint:
-        """The set-point of this period."""
-        self._k = min(self._k + 1, len(self._trajectory) - 1)
-        q = self._trajectory.q[self._k]
-        return Setpoint(ControlMode.JOINT, self._kinematics.pose(q), q, qd=self._trajectory.qd[self._k])
+    def step(self, rate: float = 1.0) -> Setpoint:
+        """The set-point of this period, `rate` samples on; see `Pace`."""
+        self._k = min(self._k + rate, len(self._trajectory) - 1.0)
+        q, qd = self._trajectory.at(self._k)
+        return Setpoint(ControlMode.JOINT, self._kinematics.pose(q), q, qd=rate * qd)

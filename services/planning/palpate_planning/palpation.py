@@ -99,6 +99,7 @@ class Palpation:
         self.skipped: dict[int, str] = {}
         self.failed = ""
         self._k = -1
+        self._rate = 1.0
         self._next_leg()
 
     # --- the sequence -------------------------------------------------------------------------------------------------
@@ -112,7 +113,7 @@ class Palpation:
         leg = self._legs[self._k]
         speed = self._exam.speed_mps if leg.contact else TRANSFER_MPS
         self._limit = leg.path.speed_limit(speed, self._limits)
-        self._free_step = 0
+        self._free_step = 0.0
         self._s = Axis(0.0, 0.2 if leg.contact else 0.8, 2.0 if leg.contact else 8.0)
         self._enter(Doing.DESCEND if leg.contact else Doing.TRANSFER)
 
@@ -174,9 +175,10 @@ class Palpation:
             self._s = Axis(self._s.position, 0.2 if self._legs[self._k].contact else 0.8, 8.0)
             self._regulator.reset(contact.depth)
 
-    def step(self, contact: Contact) -> Progress:
-        """One planning period on, given the measured contact."""
+    def step(self, contact: Contact, rate: float = 1.0) -> Progress:
+        """One planning period on, given the measured contact; free motions go on by `rate` samples, see `Pace`."""
         self._time += PERIOD_S
+        self._rate = rate
         if contact.force > self._limits.force_soft_stop_n and self.doing in (
             Doing.DESCEND,
             Doing.SETTLE,
@@ -269,7 +271,7 @@ class Palpation:
             return
         free = self._legs[self._k].free
         if free is not None:
-            self._free_step += 1
+            self._free_step = min(self._free_step + self._rate, len(free) - 1.0)
             if self._free_step >= len(free) - 1:
                 self._next_leg()
             return
@@ -302,8 +304,8 @@ class Palpation:
     def _progress(self, contact: Contact) -> Progress:
         leg = self._legs[self._k]
         if leg.free is not None:
-            q, qd = leg.free.q[self._free_step], leg.free.qd[self._free_step]
-            setpoint = Setpoint(ControlMode.JOINT, contact.X_WI, q, qd=qd)
+            q, qd = leg.free.at(self._free_step)
+            setpoint = Setpoint(ControlMode.JOINT, contact.X_WI, q, qd=self._rate * qd)
             return Progress(setpoint, self.doing, -HOVER_M, False, False, int(leg.path.targets[-1]))
         place = self._legs[self._k].path.at(self._s.position)
         rate, regulation = self._s.velocity, self._regulation

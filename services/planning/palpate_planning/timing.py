@@ -22,6 +22,10 @@ JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])
 """Joint acceleration of free motion [rad/s^2] [A]: about a third of what the arm's torques allow."""
 RISE_S = 0.15
 """Time in which acceleration builds up: jerk limit = acceleration / RISE_S."""
+LATE_NS = 30_000_000
+"""After so long without a step control has braked the arm to a stand (`MAX_EXTRAPOLATION_NS` there)."""
+RESTART_NS = 300_000_000
+"""Time in which a motion that was interrupted so comes up to its speed again [A]."""
 
 
 class Axis:
@@ -50,6 +54,27 @@ class Axis:
         return bool(result == ruckig.Result.Finished)
 
 
+class Pace:
+    """How fast motions go on: as planned, and from a stand after steps were missed. Nothing is skipped to make up for time."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._restarted: int | None = None
+
+    def step(self, t: int) -> float:
+        """Samples of a trajectory by which to go on in the step at `t` [ns]: exactly 1, less after steps were missed."""
+        if self._last is not None and t - self._last > LATE_NS:
+            self._restarted = t
+        self._last = t
+        if self._restarted is None:
+            return 1.0
+        rate = (t - self._restarted) / RESTART_NS
+        if rate < 1.0:
+            return rate
+        self._restarted = None
+        return 1.0
+
+
 class SpeedLimit:
     """Speed allowed along a path, lowered ahead of slow places so that braking at `acceleration` suffices."""
 
@@ -74,6 +99,15 @@ class JointTrajectory:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    def at(self, k: float) -> tuple[Array, Array]:
+        """Position and velocity, shapes (7,), at sample `k` within 0..len - 1, between samples interpolated."""
+        i = int(k)
+        part = k - i
+        if not part:
+            return np.asarray(self.q[i]), np.asarray(self.qd[i])
+        q, qd = self.q[i : i + 2], self.qd[i : i + 2]
+        return np.asarray(q[0] + part * (q[1] - q[0])), np.asarray(qd[0] + part * (qd[1] - qd[0]))
 
 
 def rounded(points: Array, blend: float) -> Array:

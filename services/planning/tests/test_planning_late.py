@@ -1,0 +1,121 @@
+"""Planning that was kept from its steps: control has braked meanwhile, so a motion goes on from a stand, where it was."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from palpate_models.scenario import Exam as ExamSettings
+from palpate_models.scenario import Limits
+from palpate_planning.follow import Follower
+from palpate_planning.kinematics import Kinematics
+from palpate_planning.legs import Leg
+from palpate_planning.measure import Contact
+from palpate_planning.palpation import Palpation
+from palpate_planning.path import SurfacePath
+from palpate_planning.setpoint import Setpoint
+from palpate_planning.status import Phase
+from palpate_planning.timing import JOINT_ACCELERATION, LATE_NS, PERIOD_S, RESTART_NS, JointTrajectory, Pace, joint_trajectory
+from planning_fakes import BASE, World, known
+
+MS = 1_000_000
+KINEMATICS = Kinematics(BASE, Limits())
+START = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.0, 0.0])
+GOAL = START + np.array([0.9, -0.2, 0.1, 0.3, 0.0, -0.2, 0.5])
+MOTION = joint_trajectory(KINEMATICS, np.array([START, GOAL]), Limits())
+DOWN, ONE = np.diag([1.0, -1.0, -1.0]), np.zeros(1, dtype=int)
+PLACE = SurfacePath(np.zeros(1), np.zeros((1, 3)), -DOWN[None, 2], DOWN[None], GOAL[None], ONE, ONE)
+ABOVE = Contact(np.eye(4), np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]), -0.02, 0.0, False)
+
+
+def ticks(late_at: int, late: int, count: int) -> list[int]:
+    """Times of steps [ns], 10 ms apart but for one that comes `late` [ns] after the one before."""
+    gaps = [10 * MS] * count
+    gaps[late_at] = late
+    return np.cumsum(gaps).tolist()
+
+
+def followed(times: list[int]) -> list[Setpoint]:
+    """Set-points of a follower on `MOTION`."""
+    follower, pace = Follower(KINEMATICS, START), Pace()
+    follower.start(MOTION)
+    return [follower.step(pace.step(t)) for t in times]
+
+
+def palpated(times: list[int]) -> list[Setpoint]:
+    """Set-points of a palpation on a leg that is `MOTION`."""
+    leg = Leg(PLACE, contact=False, free=MOTION)
+    palpation, pace = Palpation((leg, leg), ExamSettings(), Limits(), BASE.indenter_radius_m), Pace()
+    return [palpation.step(ABOVE, pace.step(t)).setpoint for t in times[: len(MOTION) - 1]]
+
+
+MOVERS = {"follower": followed, "free leg": palpated}
+
+
+def test_a_pace_is_one_on_time_and_comes_up_from_none_after_a_gap() -> None:
+    pace = Pace()
+    assert [pace.step(t) for t in ticks(5, LATE_NS, 10)] == [1.0] * 10
+    pace = Pace()
+    rates = [pace.step(t) for t in ticks(5, LATE_NS + 10 * MS, 50)]
+    ramp = RESTART_NS // (10 * MS)
+    assert rates[:5] == [1.0] * 5
+    assert rates[5 : 5 + ramp] == pytest.approx(np.arange(ramp) / ramp)
+    assert rates[5 + ramp :] == [1.0] * (45 - ramp)
+
+
+@pytest.mark.parametrize("mover", MOVERS)
+def test_on_time_every_sample_is_taken_as_it_is(mover: str) -> None:
+    setpoints = MOVERS[mover](ticks(0, 10 * MS, len(MOTION) - 2))
+    for k, setpoint in enumerate(setpoints, start=1):
+        assert np.array_equal(setpoint.q, MOTION.q[k])
+        assert np.array_equal(setpoint.qd, MOTION.qd[k])
+
+
+@pytest.mark.parametrize("late", [40 * MS, 190 * MS])
+@pytest.mark.parametrize("mover", MOVERS)
+def test_after_a_gap_a_motion_goes_on_from_a_stand_where_it_was(mover: str, late: int) -> None:
+    middle = len(MOTION) // 2
+    setpoints = MOVERS[mover](ticks(middle, late, len(MOTION) + 30))
+    before, first = setpoints[middle - 1 : middle + 1]
+    assert np.abs(before.qd).max() > 0.3, "the motion is under way"
+    assert np.array_equal(first.q, before.q), "nothing is skipped"
+    assert not first.qd.any()
+    for a, b in pairwise(setpoints[middle:]):
+        step = 0.5 * PERIOD_S * (a.qd + b.qd)
+        assert b.q - a.q == pytest.approx(step, abs=4e-4), "position and velocity belong together"
+        assert (np.abs(b.qd - a.qd) / PERIOD_S <= 1.5 * JOINT_ACCELERATION).all()
+    along = np.array([s.q[0] for s in setpoints])
+    assert (np.diff(along) >= 0.0).all()
+
+
+def test_after_a_gap_the_follower_arrives_at_its_goal_to_the_bit() -> None:
+    follower, pace = Follower(KINEMATICS, START), Pace()
+    follower.start(MOTION)
+    for t in ticks(20, 90 * MS, len(MOTION) + 30):
+        last = follower.step(pace.step(t))
+    assert follower.arrived
+    assert np.array_equal(last.q, MOTION.q[-1])
+    assert not last.qd.any()
+
+
+def test_between_samples_a_trajectory_is_interpolated() -> None:
+    trajectory = JointTrajectory(np.array([[0.0] * 7, [1.0] * 7]), np.array([[2.0] * 7, [4.0] * 7]))
+    q, qd = trajectory.at(0.25)
+    assert q == pytest.approx(np.full(7, 0.25))
+    assert qd == pytest.approx(np.full(7, 2.5))
+
+
+def test_an_examination_that_is_kept_waiting_starts_its_motion_anew() -> None:
+    world = World(known(region_m=(0.025, 0.0125)))
+    world.q = world.q + np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    world.run(
+        lambda: world.exam.status.phase is Phase.HOME and bool(world.setpoints) and np.abs(world.setpoints[-1].qd).max() > 0.2
+    )
+    before = world.setpoints[-1]
+    world.t += 60 * MS
+    world.step()
+    assert np.array_equal(world.setpoints[-1].q, before.q)
+    assert not world.setpoints[-1].qd.any()
+    world.run()
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
