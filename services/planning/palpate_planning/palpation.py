@@ -49,6 +49,10 @@ CREEP = 0.1
 SOFT_STOPS_MAX = 3
 MOVED_M = 0.02
 """An arm that was pushed further aside than this while it was held does not go on where it was."""
+CLEAR_M = 0.003
+"""So far above the surface nothing is touched: an arm that was pushed aside may go back sideways."""
+UNMOVED_M = 1e-6
+"""Less is no offset."""
 
 
 class Doing(Enum):
@@ -77,6 +81,34 @@ class Progress:
     """Index of the latest target reached."""
 
 
+class Aside:
+    """Where an arm that was pushed is against its path, and its way back."""
+
+    def __init__(self, gap: Array) -> None:
+        """`gap` [m], world axes, shape (3,): the arm's centre less the one that the path asks for; not zero."""
+        length = float(np.linalg.norm(gap))
+        self._direction = gap / length
+        self._length = Axis(length, 0.8, 8.0)
+
+    @property
+    def offset(self) -> Array:
+        """What is left of the gap [m], shape (3,)."""
+        return self._direction * self._length.position
+
+    @property
+    def velocity(self) -> Array:
+        """Its rate [m/s], shape (3,)."""
+        return self._direction * self._length.velocity
+
+    def fade(self) -> bool:
+        """One period of the way back; returns whether it is made."""
+        return self._length.step(0.0, TRANSFER_MPS)
+
+    def stand(self) -> None:
+        """Stays where it is."""
+        self._length.velocity = self._length.acceleration = 0.0
+
+
 class Palpation:
     """Executes the legs of a plan; one `step` each planning period until `doing` is DONE.
 
@@ -96,6 +128,7 @@ class Palpation:
         self._soft_stops = 0
         self._resume: float | None = None
         self._paused = False
+        self._aside: Aside | None = None
         self.skipped: dict[int, str] = {}
         self.failed = ""
         self._k = -1
@@ -162,7 +195,10 @@ class Palpation:
             self._enter(Doing.LIFT)
 
     def resume(self, contact: Contact) -> None:
-        """Goes on after a pause, from where the arm is now: while the driver held, the tissue has pushed it."""
+        """Goes on after a pause, from where the arm is now: while the driver held, the tissue has pushed it.
+
+        Sideways too: what is on the path may be deep in the tissue, and the arm is not to be drawn through it.
+        """
         self._paused = False
         path = self._legs[self._k].path
         if self._legs[self._k].free is None:
@@ -174,11 +210,14 @@ class Palpation:
             self._depth = Axis(contact.depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05)
             self._s = Axis(self._s.position, 0.2 if self._legs[self._k].contact else 0.8, 8.0)
             self._regulator.reset(contact.depth)
+            gap = contact.X_WI[:3, 3] - centre(place.p, place.n, self._radius + self.offset, contact.depth)
+            self._aside = Aside(gap) if float(np.linalg.norm(gap)) > UNMOVED_M else None
 
     def step(self, contact: Contact, rate: float = 1.0) -> Progress:
         """One planning period on, given the measured contact; free motions go on by `rate` samples, see `Pace`."""
         self._time += PERIOD_S
         self._rate = rate
+        self._come_back(contact)
         if contact.force > self._limits.force_soft_stop_n and self.doing in (
             Doing.DESCEND,
             Doing.SETTLE,
@@ -204,6 +243,15 @@ class Palpation:
             self._depth.position, contact.depth, contact.force, contact.touching and not lifting
         )
         return self._progress(contact)
+
+    def _come_back(self, contact: Contact) -> None:
+        """An arm that was pushed aside goes back over its path when it is clear of the skin, unless this is given up."""
+        if self._aside is None:
+            return
+        if self.failed or self._paused or contact.depth > -CLEAR_M:
+            self._aside.stand()
+        elif self._aside.fade():
+            self._aside = None
 
     def _slow_down(self, full: float, none: float, floor: float) -> float:
         """Part of the speed that the expected force leaves: all below `full` of the limit, none at `none`, yet `floor`."""
@@ -260,6 +308,8 @@ class Palpation:
             return
         if self.failed:
             self._enter(Doing.DONE)
+        elif self._aside is not None:
+            return
         elif self._resume is not None:
             self._enter(Doing.TRANSFER)
         else:
@@ -274,6 +324,9 @@ class Palpation:
             self._free_step = min(self._free_step + self._rate, len(free) - 1.0)
             if self._free_step >= len(free) - 1:
                 self._next_leg()
+            return
+        if self._aside is not None:
+            self._depth.step(min(-HOP_M, self._depth.position), LIFT_MPS)
             return
         path = self._legs[self._k].path
         goal = path.length if self._resume is None else self._resume
@@ -311,9 +364,12 @@ class Palpation:
         rate, regulation = self._s.velocity, self._regulation
         arm = self._radius + self.offset - regulation.depth
         linear = (place.dp + place.dn * arm) * rate - place.n * regulation.rate
+        p_W = centre(place.p, place.n, self._radius + self.offset, regulation.depth)
+        if self._aside is not None:
+            p_W, linear = p_W + self._aside.offset, linear + self._aside.velocity
         setpoint = Setpoint(
             ControlMode.CARTESIAN,
-            pose(place.R, centre(place.p, place.n, self._radius + self.offset, regulation.depth)),
+            pose(place.R, p_W),
             place.q,
             np.concatenate((linear, place.w * rate)),
             -place.n * regulation.force,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from palpate_models import lbr
+from palpate_planning.palpation import Doing
 from palpate_planning.setpoint import ControlMode
 from palpate_planning.status import Phase
 from planning_fakes import World, known
@@ -97,13 +98,65 @@ def test_nobody_releases_it() -> None:
     assert world.t == pytest.approx(status.end_tick - 1_000_000_000 + 10_000_000)
 
 
+def drawn_sideways(world: World) -> float:
+    """Runs to the end; how far [m] a set-point is from an arm that is in the tissue, across the normal, at most."""
+    begun, worst = len(world.rows), 0.0
+    while world.exam.status.end_tick < 0 and len(world.rows) < begun + 500:
+        p_W = world.kinematics.pose(world.q)[:3, 3]
+        _, n, distance = world.truth.nearest(p_W)
+        setpoint = world.step().setpoint
+        if world.settings.robot.indenter_radius_m > distance and setpoint.mode is ControlMode.CARTESIAN:
+            gap = setpoint.X_WI[:3, 3] - p_W
+            worst = max(worst, float(np.linalg.norm(gap - (gap @ n) * n)))
+    world.run()
+    return worst
+
+
+def push(world: World, aside: float, down: float) -> None:
+    """Moves the arm along y and down [m]."""
+    X = world.kinematics.pose(world.q)
+    X[:3, 3] += (0.0, aside, -down)
+    solution = world.kinematics.solve(X, world.q, world.q)
+    assert solution.ok
+    world.q = solution.q
+
+
 def test_an_arm_that_was_pushed_aside_does_not_go_on_pressing() -> None:
     world = stopped_in(Phase.SCAN, soft=False)
     world.q = world.q + np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     world.stop = ""
-    world.run()
+    assert drawn_sideways(world) < 0.002
     assert world.exam.status.phase is Phase.ABORTED
     assert "aside" in world.exam.status.message
+
+
+@pytest.mark.parametrize("phase", [Phase.SCAN, Phase.RETRACT], ids=lambda phase: phase.name)
+@pytest.mark.parametrize("deeper", [False, True], ids=["as deep", "deeper"])
+def test_an_arm_that_was_pushed_a_little_aside_lifts_before_it_goes_back(phase: Phase, deeper: bool) -> None:
+    world = stopped_in(phase, soft=False)
+    push(world, 0.015, 0.004 if deeper else 0.0)
+    world.stop = ""
+    assert drawn_sideways(world) < 0.002
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.exam.status.targets_skipped == 0
+
+
+def test_an_arm_that_was_pushed_into_the_tissue_between_two_strokes_lifts_before_it_goes_on() -> None:
+    world = World(known(region_m=(0.025, 0.025), pattern="raster"))
+    world.run(lambda: getattr(world.exam._palpation, "doing", None) is Doing.TRANSFER)
+    assert world.exam._palpation is not None
+    assert world.exam._palpation.free_goal is None
+    world.step()
+    world.stop = "force 41 N"
+    for _ in range(50):
+        world.step()
+    push(world, 0.01, 0.007 - world.depth)
+    world.stop = ""
+    world.step()
+    assert world.depth > 0.005, "it is in the tissue"
+    assert drawn_sideways(world) < 0.002
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.exam.status.targets_skipped == 0
 
 
 def test_lost_perception_while_held_ends_it() -> None:
