@@ -1,6 +1,6 @@
 """How an operator's word reaches a run: a query that its conductor answers once the supervisor confirms it.
 
-Asked by `palpate stop`, `palpate release`, and by the keys of `palpate dashboard` and `palpate run`.
+Asked by `palpate stop`, `release`, `pause`, `resume` and `step`, and by the keys of `palpate dashboard` and `palpate run`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ WORDS = {
     "release": OperatorRequest.RELEASE,
     "end": OperatorRequest.END,
 }
-"""What can be asked, with the request it is passed on as."""
+"""What can be asked of the examination, with the request it is passed on as."""
+PACE = ("pause", "resume", "step")
+"""What can be asked of the conductor of a lockstep run: to grant no more time, to grant it again, to grant a little."""
 
 
 class NotAnswered(RuntimeError):
@@ -31,12 +33,12 @@ def desk_key(domain: int) -> str:
     return f"{domain}/palpate/operator"
 
 
-def ask(session: zenoh.Session, domain: int, word: str, reason: str) -> tuple[str, float]:
-    """Says a word of `WORDS` to the run on this bus; returns its answer and how long the confirmation took [ms].
+def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0) -> tuple[str, float]:
+    """Says a word of `WORDS` or `PACE` to the run on this bus; returns its answer and how long the confirmation took [ms].
 
-    Raises NotAnswered.
+    `ms` is for `step`: the simulated time to grant. Raises NotAnswered.
     """
-    payload = json.dumps({"word": word, "reason": reason})
+    payload = json.dumps({"word": word, "reason": reason, "ms": ms})
     for reply in session.get(desk_key(domain), payload=payload, timeout=2 * CONFIRM_S):
         if reply.ok is None:
             continue

@@ -27,7 +27,7 @@ from palpate_bus.observer import ObserverNode
 from palpate_bus.recording import RawRecorder, RecorderNode
 from palpate_bus.service import Service
 from palpate_bus.wallclock import WallClockNode
-from palpate_bus.zenoh_config import close_session, open_session
+from palpate_bus.zenoh_config import BusConfigError, close_session, domain_from_env, open_session
 
 EXIT_FAILED = 3
 RUNTIMES: dict[str, type[LockstepNode] | type[WallClockNode]] = {"lockstep": LockstepNode, "wallclock": WallClockNode}
@@ -50,6 +50,14 @@ def runtime() -> str:
     return name
 
 
+def _scenario() -> str:
+    """The scenario file. Raises BusConfigError when the environment names none."""
+    try:
+        return os.environ["PALPATE_SCENARIO"]
+    except KeyError:
+        raise BusConfigError("PALPATE_SCENARIO is not set; want a scenario file, as `palpate prepare` writes it") from None
+
+
 def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]) -> None:
     """Runs the service of `role` to its end and leaves with status 0, or 3 when the run failed or was aborted.
 
@@ -64,8 +72,8 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
     session = None
     try:
         rules = contract()
-        domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
-        service = create(load(os.environ["PALPATE_SCENARIO"]))
+        domain = domain_from_env()
+        service = create(load(_scenario()))
         session = open_session()
         member = Member(session, role, rules, domain)
         node_type(service, rules)(service, member).run()
@@ -74,6 +82,9 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         logging.getLogger(role).warning("run ended early: %s", aborted)
         status = EXIT_FAILED
     except KeyboardInterrupt:
+        status = EXIT_FAILED
+    except BusConfigError as error:
+        logging.getLogger(role).error("%s", error)
         status = EXIT_FAILED
     except Exception:
         logging.getLogger(role).exception("%s failed", role)

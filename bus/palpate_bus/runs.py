@@ -51,13 +51,18 @@ class Run:
     router: str | None = None
     out: str = ""
     """The results folder."""
+    keys: str | None = None
+    """Of a secure run: the folder of everyone's certificates."""
     pid: int = field(default_factory=os.getpid)
     started: float = field(default_factory=time.time)
     """Wall time [s]."""
     versions: Mapping[str, str] = field(default_factory=versions)
 
-    def options(self) -> BusOptions:
-        """How a tool joins: as a peer of everyone, listening nowhere."""
+    def options(self, member: str = "viewer") -> BusOptions:
+        """How a tool joins: as a peer of everyone, listening nowhere; in a secure run as its router's client, as that member."""
+        if self.keys is not None:
+            router = next(iter(self.endpoints.values()))
+            return BusOptions(mode="client", router=router, tls=Path(self.keys) / member, shared_memory=False)
         return BusOptions(connect=tuple(self.endpoints.values()), router=self.router)
 
 
@@ -94,6 +99,11 @@ def folder() -> Path:
     if path.stat().st_uid != os.getuid():
         raise PermissionError(f"{path} belongs to another user; set PALPATE_RUNS to a folder of yours")
     return path
+
+
+def matching(chosen: str | None) -> list[Run]:
+    """The live runs that a user means by a process id or a part of a name, oldest first; all of them for None."""
+    return [run for run in live() if chosen is None or chosen == str(run.pid) or chosen in run.name]
 
 
 def live() -> list[Run]:

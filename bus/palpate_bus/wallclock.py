@@ -2,9 +2,9 @@
 
 A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
 A late step is counted as an overrun. A critical role has physics, which has to keep time: it catches up tick by tick, up to
-`CATCH_UP`, unless its service drives real hardware, whose physics keeps its own. Whoever else is late, and who is later than that, goes on at the present tick: what should
-have been commanded a while ago helps nobody, and stamps stay on the common clock. Nothing waits for anybody. Expiry
-protects those who depend on a late sample.
+`CATCH_UP`, unless its service drives real hardware, whose physics keeps its own. Whoever else is late, and who is later than
+that, goes on at the present tick: what should have been commanded a while ago helps nobody, and stamps stay on the common
+clock. Nothing waits for anybody. Expiry protects those who depend on a late sample.
 """
 
 from __future__ import annotations

@@ -61,6 +61,10 @@ LOCKSTEP_DROP_WAIT_US = 1_000_000
 WALL_CLOCK_DROP_WAIT_US = 1_000
 
 
+DOMAIN_MAX = 232
+"""Of ROS 2 with the default port range of DDS; zenoh itself knows no limit."""
+
+
 class BusConfigError(ValueError):
     """A bus configuration that cannot work. Names the variable or field, its value and what is allowed."""
 
@@ -135,6 +139,14 @@ class BusOptions:
             "PALPATE_ZENOH_CONFIG": str(self.file) if self.file else "",
             "PALPATE_TLS": str(self.tls) if self.tls else "",
         }
+
+
+def domain_from_env(environ: Mapping[str, str] = os.environ) -> int:
+    """The ROS domain, ROS_DOMAIN_ID, 0 by default. Raises BusConfigError."""
+    text = environ.get("ROS_DOMAIN_ID") or "0"
+    if not (text.isascii() and text.isdigit() and int(text) <= DOMAIN_MAX):
+        raise BusConfigError(f"ROS_DOMAIN_ID is {text!r}; want a whole number from 0 to {DOMAIN_MAX}")
+    return int(text)
 
 
 def _split(text: str) -> tuple[str, ...]:

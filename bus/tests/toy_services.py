@@ -186,7 +186,7 @@ class Supervisor(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         depth = min(0.1, abs(float(inbox.latest("robot/status").position[0])))
-        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0)}
+        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0, 0)}
 
 
 EVERY = (Robot, Control, Tissue, Planning, Assessment, Camera, Perception, Supervisor)

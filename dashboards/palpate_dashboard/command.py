@@ -15,7 +15,7 @@ from typing import Annotated, NoReturn
 
 import typer
 from palpate_bus.operator_keys import HINT, OperatorKeys
-from palpate_bus.runs import Run, live
+from palpate_bus.runs import Run, live, matching
 from palpate_bus.zenoh_config import BusConfigError
 from palpate_models.load import ScenarioError, load_scenario
 from rich.console import Console
@@ -84,11 +84,10 @@ def _fail(console: Console, message: str) -> NoReturn:
 
 def _the_run(chosen: str | None) -> Run:
     """The newest run that is on, or the newest that `chosen` names. Raises NothingToShow."""
-    runs = live()
-    found = [run for run in runs if chosen is None or chosen == str(run.pid) or chosen in run.name]
+    found = matching(chosen)
     if found:
         return found[-1]
-    if runs:
+    if runs := live():
         names = ", ".join(f"{run.name} ({run.pid})" for run in runs)
         raise NothingToShow(f"--run {chosen}: no run on this machine is called so; there are {names}")
     raise NothingToShow("no run is on: start one with `palpate run`, or give a results folder, a .rrd or a .mcap file")

@@ -32,7 +32,9 @@ def main() -> None:
     if "--secure" not in sys.argv:
         share_addresses()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # `docker stop`, systemd: what Ctrl-C does
-    from palpate_conductor.cli import main as run  # noqa: PLC0415
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, signal.default_int_handler)  # the terminal was closed
+    from palpate_conductor.commands import main as run  # noqa: PLC0415
 
     run()
 

@@ -1,13 +1,11 @@
-"""The `palpate` command."""
+"""The commands of `palpate` that start, conduct and measure runs; other packages add theirs (see `commands`)."""
 
 from __future__ import annotations
 
 import json
-import sys
 from contextlib import nullcontext
 from datetime import datetime
 from functools import partial
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -157,7 +155,7 @@ def run(
                     result = run_distributed(
                         chosen, folder.resolve(), display.tell, observers, pace, wallclock, None, bus, own, handover, absent
                     )
-    except (ProcessListError, OwnServiceError, BusConfigError, KeysError, OSError) as error:
+    except (ProcessListError, OwnServiceError, JoinError, BusConfigError, KeysError, OSError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     except RunFailed as error:
         _fail(console, EXIT_FAILED, str(error))
@@ -209,14 +207,18 @@ def conduct(
 ) -> None:
     """Conduct services that are started by others (containers, other machines) and write the report."""
     console = Console(stderr=True)
+    watching = tuple(name for name in observers.split(",") if name)
+    for name in watching:
+        if name not in OBSERVERS:
+            _fail(console, EXIT_BAD_INPUT, f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
     try:
         chosen = load_scenario(str(out / "scenario.yaml"))
+        if chosen.tissue.implementation == NONE and not wallclock:
+            _fail(console, EXIT_BAD_INPUT, NEEDS_WALLCLOCK)
         session = open_session()
     except (ScenarioError, BusConfigError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
-    if chosen.tissue.implementation == NONE and not wallclock:
-        _fail(console, EXIT_BAD_INPUT, NEEDS_WALLCLOCK)
-    roles = (*workers(chosen), *(name for name in observers.split(",") if name))
+    roles = (*workers(chosen), *watching)
     with RunDisplay(console, quiet) as display:
         pace, tree = 1.0 if realtime else None, FrameTree(exam_input(chosen))
         result = run_conduct(session, roles, display.tell, realtime=pace, wallclock=wallclock, tree=tree)
@@ -310,20 +312,3 @@ def router(
         serve(listen or (DEFAULT_ENDPOINT,), ready=console.print)
     except BusConfigError as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
-
-
-def main() -> None:
-    """Entry point: our commands, and those that other packages register under `palpate.commands`: a Typer app or a function."""
-    for point in sorted(entry_points(group="palpate.commands"), key=lambda point: point.name):
-        try:
-            command = point.load()
-            if isinstance(command, typer.Typer):
-                app.add_typer(command, name=point.name)
-            else:
-                app.command(point.name)(command)
-        except ImportError as error:
-            print(f"palpate: the command {point.name} of {point.value} cannot be loaded: {error}", file=sys.stderr)
-    try:
-        app(prog_name="palpate")
-    except BrokenPipeError:
-        sys.exit(1)

@@ -119,7 +119,7 @@ class Conductor:
         self._roles = roles
         self._collector = collector
         self._observed = ObservedService(collector, member, lossless=True)
-        self._desk = OperatorDesk(session, domain, self.request)
+        self._desk = OperatorDesk(session, domain, self.request, self.pace)
         self._patience = patience or Patience()
         self._realtime = realtime
         self._limit = limit
@@ -138,10 +138,11 @@ class Conductor:
         self._contract = ContractWatch(session, rules, domain, wallclock)
         collector.diagnose = self._diagnose
         self.horizon = NEVER
-        self.paused = False
+        self._paused = False
         self._last = False
         self._granted_at = 0.0
         self._started_at = 0.0
+        self._paced_since, self._paced_from = 0.0, 0
         self._complained = False
         self.started_at_perf = 0.0
 
@@ -205,7 +206,7 @@ class Conductor:
             self.outcome.interrupted = True
             self.abort("interrupted")
             raise RunFailed("interrupted before the first tick") from None
-        self._started_at = monotonic()
+        self._started_at = self._paced_since = monotonic()
         self.started_at_perf = perf_counter()
         self.watchdog.forgive()
         self._epoch = time_ns() + WALLCLOCK_LEAD
@@ -236,6 +237,8 @@ class Conductor:
             for role, message, detail in self._heard():
                 if message.state == ServiceReport.FAILED:
                     raise RunFailed(f"{role} failed at start: {detail.get('error')}")
+                if message.state != ServiceReport.READY:
+                    continue
                 ready[role] = [name for name in detail.get("missing", []) if not self._absent(name)]
             for role, how in died().items():
                 self.abort(f"{role} died at start")
@@ -263,6 +266,7 @@ class Conductor:
             self._observed.drain_and_step()
             for role, message, detail in self._heard():
                 if self._places.take(role):
+                    self.watchdog.progress[role].moved = monotonic()  # the time before is nobody's
                     self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
                 if message.state == ServiceReport.FINISHED:
                     finished.add(role)
@@ -301,9 +305,9 @@ class Conductor:
             if role == "recorder" and role not in self.outcome.lost:
                 tick = min(tick, self.watchdog.progress[role].tick + RECORDER_WINDOW)
         if self._realtime is not None:
-            tick = min(tick, int((monotonic() - self._started_at) * self._realtime * NS))
+            tick = min(tick, self._paced_from + int((monotonic() - self._paced_since) * self._realtime * NS))
         tick -= tick % MS
-        if self.paused:
+        if self._paused:
             self.watchdog.forgive()
             tick = self.horizon
         if end is not None and end <= max(tick, self.horizon):
@@ -320,17 +324,37 @@ class Conductor:
         elif end is not None:
             self._grant(end, last=True)
 
-    def step(self, ticks: int = 1) -> None:
-        """Grants single ticks [ms] of a paused run."""
-        self._grant(self.horizon + ticks * MS)
+    def pace(self, word: str, ms: int) -> str:
+        """Does a word of `desk.PACE` and says what came of it; `ms` of simulated time for `step`.
+
+        Raises ValueError when it cannot be done.
+        """
+        if self._wallclock:
+            raise ValueError("time is the wall's in this run: nothing can hold it")
+        if self._last:
+            raise ValueError("the run is ending")
+        if word == "pause":
+            self._paused = True
+        elif not self._paused:
+            raise ValueError("the run is not paused")
+        elif word == "resume":
+            self._paused = False
+            self._paced_from, self._paced_since = self.horizon, monotonic()
+            return "goes on"
+        elif not 0 < ms <= WINDOW // MS:
+            raise ValueError(f"a step of {ms} ms: want 1 to {WINDOW // MS}")
+        else:
+            self._grant(self.horizon + ms * MS)
+        return f"stands at {(self.horizon + MS) / NS:.3f} s as soon as that is reached"
 
     def _watch(self) -> None:
-        stalled = self.watchdog.longest_stall() if self._wallclock else self.watchdog.stalled_for()
+        judged = [role for role in self._workers if role not in self.outcome.lost and role not in self._places.empty]
+        stalled = self.watchdog.longest_stall(judged) if self._wallclock else self.watchdog.stalled_for()
         if stalled > self._patience.hard:
-            role, sentence = self.watchdog.culprit()
+            role, sentence = self.watchdog.culprit(judged)
             raise RunFailed(f"{role} blocks the run for {stalled:.0f} s: {sentence}")
         if stalled > self._patience.soft and not self._complained:
-            log.warning("no tick for %.0f s: %s", stalled, self.watchdog.culprit()[1])
+            log.warning("no tick for %.0f s: %s", stalled, self.watchdog.culprit(judged)[1])
         self._complained = stalled > self._patience.soft
 
     def _missing(self, died: Callable[[], Mapping[str, str]]) -> dict[str, str]:
@@ -343,7 +367,6 @@ class Conductor:
         if not self._places.keeps(role) or role in self.outcome.lost:
             self._lose(role, how)
             return
-        self.watchdog.progress[role].moved = monotonic()  # an empty place blocks nobody
         if self._places.leave(role, how):
             tick = max(self.watchdog.progress[role].tick, 0) / NS
             self._tell(f"{role} left at {tick:.3f} s: {how}; its place is kept for {self._places.patience_s:.0f} s")

@@ -5,7 +5,7 @@ another language. The run waits for it at its start.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -41,6 +41,12 @@ class Absent:
         for role in self.roles:
             if role not in known:
                 raise JoinError(f"--without {role}: allowed are {', '.join(known)}")
+
+    def check(self, roles: Collection[str]) -> None:
+        """Raises JoinError for one that this run does not have."""
+        for role in self.roles:
+            if role not in roles:
+                raise JoinError(f"--without {role}: this run has no {role}, but {', '.join(roles)}")
 
     def call(self, out: Path, processes: Mapping[str, tuple[Sequence[str], Mapping[str, str]]]) -> None:
         """Says who is awaited; `processes` gives command and environment of each."""

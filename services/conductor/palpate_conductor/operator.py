@@ -13,7 +13,7 @@ from time import monotonic
 from typing import Any
 
 import zenoh
-from palpate_bus.desk import CONFIRM_S, WORDS, desk_key
+from palpate_bus.desk import CONFIRM_S, PACE, WORDS, desk_key
 from palpate_bus.messages import SupervisorState
 
 
@@ -23,13 +23,20 @@ class _Pending:
     word: str
     since: float
     releases: int
+    refusals: int
 
 
 class OperatorDesk:
     """The conductor's side. `attend` it often."""
 
-    def __init__(self, session: zenoh.Session, domain: int, send: Callable[[int, str], None]) -> None:
-        """`send(request, reason)` passes a request on, see `palpation_msgs/OperatorRequest`."""
+    def __init__(
+        self, session: zenoh.Session, domain: int, send: Callable[[int, str], None], pace: Callable[[str, int], str]
+    ) -> None:
+        """`send(request, reason)` passes a request on, see `palpation_msgs/OperatorRequest`.
+
+        `pace(word, ms)` does a word of `desk.PACE` and says what came of it, or raises ValueError with why not.
+        """
+        self._pace = pace
         self._key = desk_key(domain)
         self._send = send
         self._asked: SimpleQueue[Any] = SimpleQueue()
@@ -43,23 +50,30 @@ class OperatorDesk:
                 query = self._asked.get_nowait()
             except Empty:
                 break
-            self._take(query, 0 if supervisor is None else int(supervisor.releases))
+            self._take(query, supervisor)
         for pending in list(self._pending):
             answer = _answer(pending, supervisor)
             if answer is not None:
                 self._reply(pending.query, *answer, monotonic() - pending.since)
                 self._pending.remove(pending)
 
-    def _take(self, query: Any, releases: int) -> None:
+    def _take(self, query: Any, supervisor: Any | None) -> None:
         try:
             asked = json.loads(query.payload.to_bytes())
-            word, reason = asked["word"], str(asked["reason"])
-            request = WORDS[word]
+            word, reason, ms = asked["word"], str(asked["reason"]), int(asked.get("ms", 0))
+            request = None if word in PACE else WORDS[word]
         except (AttributeError, KeyError, TypeError, ValueError):
-            self._reply(query, False, f"no request: want a word out of {', '.join(WORDS)} and a reason", 0.0)
+            self._reply(query, False, f"no request: want a word out of {', '.join((*WORDS, *PACE))} and a reason", 0.0)
+            return
+        if request is None:
+            try:
+                self._reply(query, True, self._pace(word, ms), 0.0)
+            except ValueError as error:
+                self._reply(query, False, str(error), 0.0)
             return
         self._send(request, reason)
-        self._pending.append(_Pending(query, word, monotonic(), releases))
+        before = (0, 0) if supervisor is None else (int(supervisor.releases), int(supervisor.refusals))
+        self._pending.append(_Pending(query, word, monotonic(), *before))
 
     def _reply(self, query: Any, done: bool, words: str, after_s: float) -> None:
         query.reply(self._key, json.dumps({"done": done, "words": words, "after_ms": round(after_s * 1e3, 1)}))
@@ -80,7 +94,7 @@ def _answer(pending: _Pending, supervisor: Any | None) -> tuple[bool, str] | Non
         lifts = pending.word in ("release", "end")
         if lifts and supervisor.releases > pending.releases:
             return True, "released"
-        if lifts and supervisor.reason.startswith("release refused"):
+        if lifts and supervisor.refusals > pending.refusals:
             return False, supervisor.reason
     if monotonic() - pending.since > CONFIRM_S:
         return False, f"passed on, but the supervisor did not confirm it within {CONFIRM_S:g} s"

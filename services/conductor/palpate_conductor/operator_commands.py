@@ -1,15 +1,18 @@
-"""`palpate stop` and `palpate release`: an operator's hand on a run in another terminal."""
+"""`palpate stop`, `release`, `pause`, `resume`, `step`: an operator's hand on a run in another terminal."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from time import monotonic, sleep
 from typing import Annotated
 
 import typer
+import zenoh
 from palpate_bus import runs
+from palpate_bus.access import OPERATOR
 from palpate_bus.desk import NotAnswered, ask
-from palpate_bus.zenoh_config import BusOptions, close_session, open_session
+from palpate_bus.zenoh_config import BusConfigError, BusOptions, domain_from_env, session
 from rich.console import Console
 from rich.markup import escape
 
@@ -17,8 +20,10 @@ EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
 MEET_S = 1.0
 """How long a run may take to be met on the bus."""
+BUS = ("PALPATE_ROUTER", "PALPATE_CONNECT", "PALPATE_ZENOH_CONFIG")
+"""Variables that name a bus in place of a run of this machine."""
 
-Named = Annotated[str | None, typer.Option("--run", help="Which run, by its results folder's name; by default the newest.")]
+Named = Annotated[str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")]
 
 
 def stop(
@@ -28,8 +33,8 @@ def stop(
     ] = False,
     run: Named = None,
 ) -> None:
-    """Stop a run at once: the arm is held safely until `palpate release`."""
-    _say("soft-stop" if soft else "stop", reason, run)
+    """Stop a run at once: the arm is held safely until `palpate release`. Without --run: every run of this machine."""
+    _say("soft-stop" if soft else "stop", reason, run, everyone=True)
 
 
 def release(
@@ -41,40 +46,80 @@ def release(
     _say("end" if end else "release", reason, run)
 
 
-def _say(word: str, reason: str, name: str | None) -> None:
+def pause(run: Named = None) -> None:
+    """Let simulated time stand, within half a simulated second. Not with --wallclock, and no stop: nothing retreats."""
+    _say("pause", "palpate pause", run)
+
+
+def resume(run: Named = None) -> None:
+    """Let the time of a paused run go on."""
+    _say("resume", "palpate resume", run)
+
+
+def step(
+    ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milliseconds.")] = 1,
+    run: Named = None,
+) -> None:
+    """Let a paused run go on for a moment."""
+    _say("step", "palpate step", run, ms=ms)
+
+
+@dataclass(frozen=True)
+class _Bus:
+    """Where a run is asked."""
+
+    title: str
+    options: BusOptions
+    domain: int
+
+
+def _say(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
     console = Console(stderr=True)
-    options, domain, title = _bus(console, name)
-    session = open_session(options)
     try:
-        answer, after_ms = _met(session, domain, word, reason)
-    except NotAnswered as error:
-        console.print(f"[bold red]palpate:[/] {title}: {escape(str(error))}", highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_FAILED) from None
-    finally:
-        close_session(session)
-    console.print(f"{title}: {answer} (confirmed after {after_ms:.0f} ms)", highlight=False, soft_wrap=True)
+        buses = _buses(name, everyone)
+    except (BusConfigError, OSError) as error:
+        console.print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    failed = False
+    for bus in buses:
+        try:
+            with session(bus.options) as joined:
+                answer, after_ms = _met(joined, bus.domain, word, reason, ms)
+        except (NotAnswered, BusConfigError) as error:
+            failed = True
+            console.print(f"[bold red]palpate:[/] {escape(f'{bus.title}: {error}')}", highlight=False, soft_wrap=True)
+        else:
+            words = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
+            console.print(escape(words), highlight=False, soft_wrap=True)
+    if failed:
+        raise typer.Exit(EXIT_FAILED)
 
 
-def _met(session: object, domain: int, word: str, reason: str) -> tuple[str, float]:
+def _met(joined: zenoh.Session, domain: int, word: str, reason: str, ms: int) -> tuple[str, float]:
     """Asks until the run has been met: links to its peers come up one by one."""
     begin = monotonic()
     while True:
         try:
-            return ask(session, domain, word, reason)  # type: ignore[arg-type]
+            return ask(joined, domain, word, reason, ms)
         except NotAnswered as error:
             if "does not answer" not in str(error) or monotonic() - begin > MEET_S:
                 raise
             sleep(0.05)
 
 
-def _bus(console: Console, name: str | None) -> tuple[BusOptions, int, str]:
-    """How to join the run, its ROS domain and its name."""
-    if os.environ.get("PALPATE_ROUTER"):
-        return BusOptions.from_env(), int(os.environ.get("ROS_DOMAIN_ID", "0")), os.environ["PALPATE_ROUTER"]
-    live = [run for run in runs.live() if name is None or run.name == name]
-    if not live:
-        known = ", ".join(run.name for run in runs.live()) or "there is none"
-        wanted = "no run is on" if name is None else f"no run {name!r}"
-        console.print(f"[bold red]palpate:[/] {wanted}; on this machine: {known}. In containers set PALPATE_ROUTER")
-        raise typer.Exit(EXIT_BAD_INPUT)
-    return live[-1].options(), live[-1].domain, live[-1].name
+def _buses(name: str | None, everyone: bool) -> list[_Bus]:
+    """The runs that are meant: by `--run`, else by the environment, else those of this machine.
+
+    Several only with `everyone`: who is in a hurry to stop an arm should not have to look up which. Raises BusConfigError.
+    """
+    if name is None and any(os.environ.get(variable) for variable in BUS):
+        options = BusOptions.from_env()
+        return [_Bus(options.router or ", ".join(options.connect) or "bus", options, domain_from_env())]
+    found = runs.matching(name)
+    if found and (everyone or len(found) == 1):
+        return [_Bus(run.name, run.options(OPERATOR), run.domain) for run in found]
+    known = ", ".join(f"{run.name} (process {run.pid})" for run in runs.live()) or "there is none"
+    if found:
+        raise BusConfigError(f"{len(found)} runs are meant; choose one with --run: {known}")
+    wanted = "no run is on" if name is None else f"no run {name!r}"
+    raise BusConfigError(f"{wanted}; on this machine: {known}. In containers set PALPATE_ROUTER")

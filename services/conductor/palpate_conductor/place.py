@@ -17,7 +17,7 @@ EXIT_BAD_INPUT = 2
 
 Implementation = Annotated[str, typer.Option(help="An installed implementation, as in `--set <role>.implementation`.")]
 OwnService = Annotated[Path | None, typer.Option(metavar="FILE.py", help="A service of one's own instead.")]
-RunName = Annotated[str | None, typer.Option(help="Which run, by its results folder's name; by default the newest.")]
+RunName = Annotated[str | None, typer.Option(help="Which run: its process id, or part of its name; by default the newest.")]
 
 
 class PlaceError(ValueError):
@@ -25,13 +25,12 @@ class PlaceError(ValueError):
 
 
 def live_run(name: str | None) -> runs.Run:
-    """The newest live run, or the one of that name. Raises PlaceError that names those there are."""
-    live = runs.live()
-    matching = [run for run in live if name is None or run.name == name]
-    if not matching:
-        there = ", ".join(run.name for run in live) or "none"
+    """The newest live run, or the newest that `name` means. Raises PlaceError that names those there are."""
+    found = runs.matching(name)
+    if not found:
+        there = ", ".join(run.name for run in runs.live()) or "none"
         raise PlaceError(f"no run{f' {name}' if name else ''} is on; on this machine: {there}")
-    return matching[-1]
+    return found[-1]
 
 
 def refuse(error: Exception) -> NoReturn:

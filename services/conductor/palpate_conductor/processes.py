@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import yaml
 from palpate_bus.runs import Announcement, Run
-from palpate_bus.zenoh_config import mesh
+from palpate_bus.zenoh_config import domain_from_env, mesh
 
 from palpate_conductor.__main__ import FIXED
 from palpate_conductor.forks import Child, Forks
@@ -90,8 +90,10 @@ def _services(path: Path) -> dict[str, Any]:
 
 
 def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceProcess | None) -> ServiceProcess:
+    if not isinstance(service, dict):
+        raise ProcessListError(f"{path}: services.{role} = {service!r}: want a mapping")
     command = service.get("command", None if earlier is None else list(earlier.command))
-    if not isinstance(command, list) or not all(isinstance(word, str) for word in command):
+    if not command or not isinstance(command, list) or not all(isinstance(word, str) for word in command):
         raise ProcessListError(f"{path}: services.{role}.command = {command!r}: want a list of words")
     environment = service.get("environment") or {}
     if not isinstance(environment, dict):
@@ -129,15 +131,17 @@ class LocalProcesses:
         if secure is not None:
             self.bus = {role: secure.options(role) for role in bus}
             endpoints = dict.fromkeys(bus, secure.endpoint)
+        domain = domain_from_env()
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
         self._announcement = Announcement(
             Run(
                 name=out.name,
                 endpoints=endpoints,
-                domain=int(os.environ.get("ROS_DOMAIN_ID", "0")),
+                domain=domain,
                 runtime=self._extra.get("PALPATE_RUNTIME", "lockstep"),
                 router=router,
                 out=str(out),
+                keys=None if secure is None else str(secure.keys),
             )
         )
         self._logs: list[IO[bytes]] = []

@@ -17,7 +17,7 @@ from palpate_bus.messages import ExamState
 from palpate_bus.recording import RawRecorder
 from palpate_bus.service import Service
 from palpate_bus.stamps import NS
-from palpate_bus.zenoh_config import close_session, open_session
+from palpate_bus.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, domain_from_env, open_session
 from palpate_models.load import dump_scenario, exam_input, redacted
 from palpate_models.scenario import Scenario
 
@@ -28,6 +28,7 @@ from palpate_conductor.join import Absent
 from palpate_conductor.own import in_place, load
 from palpate_conductor.processes import LocalProcesses, compose_file, override_files, read_processes
 from palpate_conductor.secure import SecureBus
+from palpate_conductor.takeover import keep_places
 from palpate_conductor.tree import FrameTree
 
 WORKERS = ("robot", "tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
@@ -115,6 +116,8 @@ def run_distributed(
     """
     begin = perf_counter()
     roles = (*workers(scenario), *observers)
+    if absent is not None:
+        absent.check(roles)
     files = write_scenario_files(scenario, out)
     listed = read_processes(compose_file(), roles, override_files())
     processes = in_place(chosen_processes(scenario, listed), own or {})
@@ -123,9 +126,12 @@ def run_distributed(
         "PALPATE_RECORD": str(int("recorder" in observers)),
         **chosen_environment(scenario),
     }
+    if handover_s:
+        keep_places(out, processes)
     local = LocalProcesses(roles, out, files, extra, secure)
     try:
-        session = open_session(local.bus["conductor"])
+        options = local.bus["conductor"]
+        session = open_session(replace(options, drop_wait_us=WALL_CLOCK_DROP_WAIT_US) if wallclock else options)
         for role in roles:
             if absent is None or role not in absent.roles:
                 local.start(processes[role])
@@ -167,7 +173,7 @@ def conduct(
     """
     begin = perf_counter() if begin is None else begin
     collector = Collector(tree=tree)
-    domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
+    domain = domain_from_env()
     rules = contract()
     conductor = Conductor(session, rules, domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock, handover_s)
 

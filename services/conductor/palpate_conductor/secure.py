@@ -50,9 +50,13 @@ class SecureBus:
 
     def __enter__(self) -> Self:
         """Starts the router. Raises BusConfigError."""
-        if self._own is not None:
-            init(self._own, days=2)
-        self._guard = Guard(self.keys / ROUTER, self.endpoint).__enter__()
+        try:
+            if self._own is not None:
+                init(self._own, days=2)
+            self._guard = Guard(self.keys / ROUTER, self.endpoint).__enter__()
+        except BaseException:
+            self._throw_away()
+            raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -61,6 +65,10 @@ class SecureBus:
         if self.denials:
             text = json.dumps([denial.as_dict() for denial in self.denials], indent=2)
             (self._out / DENIALS_FILE).write_text(text + "\n", encoding="utf-8")
+        self._throw_away()
+
+    def _throw_away(self) -> None:
+        """Removes keys that were made for this run alone."""
         if self._own is not None:
             shutil.rmtree(self._own, ignore_errors=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from time import monotonic
 
@@ -43,9 +44,9 @@ class Watchdog:
         """Seconds since any service finished a tick."""
         return monotonic() - max(progress.moved for progress in self.progress.values())
 
-    def longest_stall(self) -> float:
-        """Seconds since the service that is furthest behind its own clock finished a tick (wall-clock runs)."""
-        return monotonic() - min(progress.moved for progress in self.progress.values())
+    def longest_stall(self, roles: Collection[str]) -> float:
+        """Seconds since that one of `roles` which is furthest behind its own clock finished a tick (wall-clock runs)."""
+        return monotonic() - min((self.progress[role].moved for role in roles), default=monotonic())
 
     def forgive(self) -> None:
         """Starts the stall anew: while the run is paused nobody is to blame."""
@@ -53,18 +54,18 @@ class Watchdog:
         for progress in self.progress.values():
             progress.moved = now
 
-    def culprit(self) -> tuple[str, str]:
-        """The role that blocks, and a sentence that says whom.
+    def culprit(self, roles: Collection[str]) -> tuple[str, str]:
+        """The one of `roles` that blocks, and a sentence that says whom.
 
         Follows who-waits-for-whom from the slowest waiting service to one that waits for nobody; a circle is named as one.
         """
         waiting = {
             role: self._producers[p.waiting_for]
             for role, p in self.progress.items()
-            if p.waiting_for in self._producers and self._producers[p.waiting_for] in self.progress
+            if role in roles and self._producers.get(p.waiting_for) in roles
         }
         if not waiting:
-            role = min(self.progress, key=lambda name: self.progress[name].moved)
+            role = min(roles, key=lambda name: self.progress[name].moved)
             return (
                 role,
                 f"{role} has not finished a tick since {self.progress[role].tick / 1e9:.3f} s; nobody waits for it",

@@ -3,10 +3,11 @@
 from palpate_conductor.watchdog import Watchdog
 
 PRODUCERS = {"joint_states": "robot", "control/joint_torque": "control", "sim/contact_wrench": "tissue", "exam/state": "planning"}
+ROLES = ("robot", "control", "tissue", "planning", "assessment")
 
 
 def watchdog() -> Watchdog:
-    return Watchdog(("robot", "control", "tissue", "planning", "assessment"), PRODUCERS)
+    return Watchdog((*ROLES, "dashboard"), PRODUCERS)
 
 
 def test_the_one_that_waits_for_nobody_is_the_culprit() -> None:
@@ -14,7 +15,7 @@ def test_the_one_that_waits_for_nobody_is_the_culprit() -> None:
     w.report("control", 5_000_000, "joint_states")
     w.report("robot", 5_000_000, "sim/contact_wrench")
     w.report("tissue", 4_000_000, "")
-    role, sentence = w.culprit()
+    role, sentence = w.culprit(ROLES)
     assert role == "tissue"
     assert "control (for joint_states)" in sentence
     assert "robot (for sim/contact_wrench)" in sentence
@@ -24,13 +25,13 @@ def test_a_circle_is_named_as_one() -> None:
     w = watchdog()
     w.report("control", 1, "joint_states")
     w.report("robot", 1, "control/joint_torque")
-    assert "circle of waiting" in w.culprit()[1]
+    assert "circle of waiting" in w.culprit(ROLES)[1]
 
 
 def test_waiting_for_a_grant_is_waiting_for_nobody() -> None:
     w = watchdog()
     w.report("robot", 1, "grant")
-    assert "nobody waits for it" in w.culprit()[1]
+    assert "nobody waits for it" in w.culprit(ROLES)[1]
 
 
 def test_only_a_finished_tick_counts_as_movement() -> None:
@@ -40,3 +41,15 @@ def test_only_a_finished_tick_counts_as_movement() -> None:
     w.report("robot", 1_000_000, "control/joint_torque")
     assert w.progress["robot"].moved == before
     w.report("nobody", 5, "")
+
+
+def test_who_is_not_asked_about_blocks_nobody() -> None:
+    w = watchdog()
+    for progress in w.progress.values():
+        progress.moved -= 100.0
+    for role in ROLES:
+        w.report(role, 1_000_000, "")
+    assert w.longest_stall((*ROLES, "dashboard")) > 99.0
+    assert w.longest_stall(ROLES) < 50.0
+    assert w.longest_stall(()) < 1.0
+    assert w.culprit(ROLES)[0] != "dashboard"

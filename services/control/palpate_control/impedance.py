@@ -77,7 +77,6 @@ class ImpedanceController:
         """
         if q.shape != (DOF,) or qd.shape != (DOF,) or not isfinite(q.dot(q) + qd.dot(qd)):
             raise ValueError(f"joint_states: position = {q}, velocity = {qd}: must be {DOF} finite values each")
-        self.model.update(q, qd)
         raw = self._cartesian(q, qd, reference) if reference.mode is Mode.CARTESIAN else self._joint(q, qd, reference)
         push = self._repulsion.torque(q)
         return self._shaper.shape(raw if push is None else raw + push, self.model.gravity)
@@ -89,6 +88,7 @@ class ImpedanceController:
 
     def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
         model = self.model
+        model.update_gravity(q)
         stiffness = reference.joint_stiffness
         damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(stiffness * model.inertia_diagonal(q))
         error = np.minimum(np.maximum(reference.q - q, -JOINT_CLIP_RAD), JOINT_CLIP_RAD)
@@ -97,6 +97,7 @@ class ImpedanceController:
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
         model = self.model
+        model.update(q, qd)
         R_WD = np.ascontiguousarray(reference.R_WD)
         kernel.task_space(R_WD, model.J_W, model.slow_mobility, REGULARISATION, self._J, self._JW, self._slow_inertia)
         if reference.stiffness is not self._designed_for or self._design_age >= DESIGN_TICKS:
@@ -135,7 +136,8 @@ class ImpedanceController:
     def _design(self, reference: Reference) -> None:
         """Gains for this set-point and posture: stiffness that sampling can bear and the damping that goes with it."""
         J = self._J
-        mobility = J.dot(self.model.mobility).dot(J.T)
+        joint_mobility = self.model.mobility
+        mobility = J.dot(joint_mobility).dot(J.T)
         inertia = _inverse(mobility).diagonal()
         friction = (self._slow_inertia.diagonal() - inertia) / SLOW_S
         # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
@@ -143,7 +145,7 @@ class ImpedanceController:
         self._stiffness = np.minimum(reference.stiffness, np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S)))
         damping = 2 * reference.damping_ratio * np.sqrt(self._stiffness * mass)
         self._damping = np.maximum(damping - friction, LEAST_DAMPING * damping)
-        free = self.model.mobility.diagonal()
+        free = joint_mobility.diagonal()
         self._posture_damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(reference.joint_stiffness / free)
         self._designed_for, self._design_age = reference.stiffness, 0
 

@@ -21,7 +21,6 @@ class ArmModel:
         R_WI: rotation of the indenter frame I in world, shape (3, 3).
         p_WI: origin of I in world [m], shape (3,).
         J_W: Jacobian of V_WI_W (linear first, then angular, world axes, at I's origin), shape (6, 7).
-        mobility: inverse of the joint-space inertia matrix [1/(kg m^2)], shape (7, 7).
         slow_mobility: the same with friction, (M + D SLOW_S)^-1: displacement over SLOW_S rather than acceleration, (7, 7).
         gravity: torques that hold the arm against gravity [N m], shape (7,).
         coriolis: Coriolis and centrifugal torques C(q, qd) qd [N m], shape (7,).
@@ -30,7 +29,6 @@ class ArmModel:
     R_WI: Array
     p_WI: Array
     J_W: Array
-    mobility: Array
     slow_mobility: Array
     gravity: Array
     coriolis: Array
@@ -47,6 +45,7 @@ class ArmModel:
         self._slow_model.armature = self._slow_model.armature + SLOW_S * self._model.damping
         self._slow_data = self._slow_model.createData()
         self._frame = self._model.getFrameId(frame)
+        self._q = np.zeros(DOF)
         self.position_lower: Array = self._model.lowerPositionLimit.copy()
         self.position_upper: Array = self._model.upperPositionLimit.copy()
         self.velocity_limit: Array = self._model.velocityLimit.copy()
@@ -56,16 +55,25 @@ class ArmModel:
 
     def update(self, q: Array, qd: Array) -> None:
         """Evaluates the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (7,)."""
-        model, data = self._model, self._data
-        pin.computeMinverse(model, data, q)  # also places the joints and fills data.J
-        pose = pin.updateFramePlacement(model, data, self._frame)
+        self.update_gravity(q)
+        slow, data = self._slow_model, self._slow_data
+        self.slow_mobility = np.ascontiguousarray(pin.computeMinverse(slow, data, q))  # also places the joints and fills data.J
+        pose = pin.updateFramePlacement(slow, data, self._frame)
         self.R_WI = np.ascontiguousarray(pose.rotation)
         self.p_WI = pose.translation
-        self.J_W = np.ascontiguousarray(pin.getFrameJacobian(model, data, self._frame, _AXES))
-        self.mobility = data.Minv
-        self.slow_mobility = np.ascontiguousarray(pin.computeMinverse(self._slow_model, self._slow_data, q))
-        self.gravity = pin.computeGeneralizedGravity(model, data, q)
-        self.coriolis = pin.nonLinearEffects(model, data, q, qd) - self.gravity
+        self.J_W = np.ascontiguousarray(pin.getFrameJacobian(slow, data, self._frame, _AXES))
+        self.coriolis = pin.nonLinearEffects(self._model, self._data, q, qd) - self.gravity
+
+    def update_gravity(self, q: Array) -> None:
+        """Evaluates `gravity` alone: what joint-space control needs besides its own calls."""
+        self._q = q
+        self.gravity = pin.computeGeneralizedGravity(self._model, self._data, q)
+
+    @property
+    def mobility(self) -> Array:
+        """Inverse of the joint-space inertia matrix [1/(kg m^2)], shape (7, 7), computed when it is asked for."""
+        inverse: Array = pin.computeMinverse(self._model, self._data, self._q)
+        return inverse
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Torques without gravity and friction that give accelerations `qdd` [rad/s^2], shape (7,). After `update`."""

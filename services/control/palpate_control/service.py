@@ -17,7 +17,7 @@ from palpate_models.scenario import Limits, Robot, Scenario
 
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import DOF, ArmModel
-from palpate_control.reference import Extrapolator, Mode, Setpoint, rotation_from_quaternion
+from palpate_control.reference import MAX_EXTRAPOLATION_NS, Extrapolator, Mode, Setpoint, rotation_from_quaternion
 
 _NAMES = list(JOINT_NAMES)
 
@@ -73,27 +73,39 @@ class ControlService(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One control tick."""
-        for message in inbox.new("planning/setpoint"):
-            self._accept(message, t)
         joints = inbox.latest("joint_states")
+        measured = t if joints is None else self._measured(t, inbox, joints)
+        followed = max(measured, t - MAX_EXTRAPOLATION_NS)
+        for message in inbox.new("planning/setpoint"):
+            self._accept(message, followed)
         if self._expires is None or joints is None:
             return self._command(t, np.zeros(DOF), self._valid)
         if self._ceased or t > self._expires:
             expired = f"the last planning/setpoint expired {(t - self._expires) / MS:.0f} ms ago"
             return self._cease(t, self._ceased or self._refused or expired)
-        received = inbox.stamp("joint_states")
-        if received is not None and t - received > self._joint_states_age:
-            age, limit = (t - received) / MS, self._joint_states_age / MS
+        if t - measured > self._joint_states_age:
+            age, limit = (t - measured) / MS, self._joint_states_age / MS
             return self._stand(t, f"joint_states are {age:.0f} ms old, limit {limit:.0f} ms")
         if joints.name != _NAMES:
             return self._reject_joints(t, f"joint_states: name = {joints.name}: must be {_NAMES}")
         try:
-            torque = self._controller.torque(np.array(joints.position), np.array(joints.velocity), self._reference.at(t))
+            reference = self._reference.at(followed)
+            torque = self._controller.torque(np.array(joints.position), np.array(joints.velocity), reference)
         except ValueError as error:
             return self._reject_joints(t, str(error))
         np.maximum(self._peak, np.abs(torque), out=self._peak)
         self._torque, self._until = torque, t + self._validity
         return self._command(t, torque, self._valid)
+
+    @staticmethod
+    def _measured(t: int, inbox: Inbox, joints: Message) -> int:
+        """When the arm was where `joints` says [ns]: their stamp, but not after they were received.
+
+        The law compares the reference of this very moment with them. With the present one a late measurement would look like
+        an error that grows with the speed, and wind the spring up: 17 mrad after 20 ms at 0.86 rad/s.
+        """
+        received = inbox.stamp("joint_states")
+        return min(t if received is None else received, nanoseconds(joints.header.stamp), t)
 
     def finish(self) -> Mapping[str, Any]:
         """Counts of set-points and rejections, the last problem, and the largest torque of each joint [N m]."""

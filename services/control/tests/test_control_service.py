@@ -216,3 +216,38 @@ def test_same_messages_same_torques() -> None:
         return b"".join(out)
 
     assert run() == run()
+
+
+def moving(t: int) -> np.ndarray:
+    """Joint 1 at 0.8 rad/s from HOME, the others at rest."""
+    return np.array(HOME) + 0.8 * 1e-9 * t * np.eye(7)[0]
+
+
+def peak_on_the_way(delay: int) -> float:
+    """Largest torque of joint 1 [N m] while the arm moves as it should and its states arrive `delay` [ns] late for 15 ms."""
+    rig, peak = Rig(), 0.0
+    speed = 0.8 * np.eye(7)[0]
+    for _ in range(150):
+        if rig.t % (10 * MS) == 0:
+            rig.send(setpoint(rig.t, joint_position=moving(rig.t), joint_velocity=speed, joint_stiffness=np.full(7, 800.0)))
+        late = delay if rig.t >= 100 * MS else 0
+        measured = max(rig.t - late, 0)
+        if rig.t - measured <= 15 * MS:
+            state = JointState(header(measured), list(JOINT_NAMES), moving(measured), speed, np.zeros(7))
+        torque = rig.tick(1, message=state).torque[0]
+        peak = max(peak, abs(torque)) if rig.t > 60 * MS else 0.0
+    return peak
+
+
+def test_late_states_wind_no_spring_up() -> None:
+    """15 ms at 0.8 rad/s would be 12 mrad, times 800 N m/rad: 10 N m more."""
+    assert peak_on_the_way(15 * MS) < peak_on_the_way(0) + 1.0
+
+
+def test_states_with_an_old_stamp_are_old_however_new_they_came(rig: Rig) -> None:
+    rig.send(setpoint(0))
+    rig.tick(10)
+    frozen = joints(rig.t)
+    for _ in range(22):
+        command = rig.tick(1, message=frozen)
+    assert "joint_states are 21 ms old, limit 20 ms" in command.problem

@@ -204,7 +204,7 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     elif cause == "operator":
         inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
     elif cause == "soft":
-        soft = SupervisorState(header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0)
+        soft = SupervisorState(header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0)
         inbox.put("supervisor/state", soft)
     else:
         inbox.gone.add("robot")

@@ -66,7 +66,7 @@ class Count:
     bytes: int = 0
     missing: int = 0
     """Messages that never came, by the gaps in the sequence numbers."""
-    last: int | None = field(default=None, repr=False)
+    last: int = field(default=0, repr=False)
 
 
 @dataclass
@@ -164,7 +164,7 @@ class BagWriter:
         count = self.counts[topic]
         count.messages += 1
         count.bytes += len(payload)
-        if count.last is not None and sequence > count.last + 1:
+        if sequence > count.last + 1:
             count.missing += sequence - count.last - 1
         count.last = sequence
         self._file.take(stamp)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection
 from time import monotonic_ns, sleep
 from types import TracebackType
@@ -15,7 +14,7 @@ from palpate_bus.member import Member
 from palpate_bus.messages import Clock
 from palpate_bus.stamps import NS, time_message
 from palpate_bus.transport import Publisher
-from palpate_bus.zenoh_config import BusOptions, close_session, open_session
+from palpate_bus.zenoh_config import BusOptions, close_session, domain_from_env, open_session
 
 from palpate_replay.recording import Recording
 
@@ -57,7 +56,7 @@ class Player:
         self.where = f"on {', '.join(options.listen)}" if options.listen else "on the bus of the environment"
         self._session = open_session(options)
         try:
-            domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
+            domain = domain_from_env()
             self._graph = GraphWatch(self._session, domain)
             begin = monotonic_ns()
             while monotonic_ns() - begin < LOOK_NS:  # peers that are there find us within retries of a tenth of a second

@@ -143,18 +143,19 @@ class Plant:
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
         self._free, self._look_in = 0.0, 0
 
-    def step(self, torque: Array, force_W: Array, moment_W: Array, damping: Array) -> None:
+    def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advances 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
         `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
-        centre, in world axes, and is held over the step.
+        centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
         viscous, coulomb = self._viscous, self._coulomb
         for set_damping, v, extra in zip(self._set_damping, self.v.tolist(), damping.tolist(), strict=True):
             set_damping(viscous + extra + coulomb / max(v, -v, STICK_RADPS))
         self._arm.setForces(torque)
-        self._indenter.addExtForce(force_W, self._origin, False, True)
-        self._indenter.addExtTorque(moment_W, False)
+        if force_W is not None:
+            self._indenter.addExtForce(force_W, self._origin, False, True)
+            self._indenter.addExtTorque(moment_W, False)
         if self._is_clear():
             arm = self._arm
             arm.computeForwardDynamics()

@@ -72,6 +72,7 @@ class RobotService(Service):
         self._command_message: Message | None = None
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
+        self._pressed = False
         self._applied = np.zeros(7)
         self._sums = np.zeros(20)  # of position, velocity and F/T reading since the last status
         self._summed = 0
@@ -137,7 +138,7 @@ class RobotService(Service):
             gravity = plant.gravity_torque()
             torque = driver.update(t, plant.q, plant.v, gravity, self._external_force, command, lost=inbox.lost("control"))
             damping = driver.damping(plant.v, gravity)
-            plant.step(gravity + torque, self._force_W, self._moment_W, damping)
+            plant.step(gravity + torque, self._force_W if self._pressed else None, self._moment_W, damping)
             self._applied = torque if driver.mode is Mode.ACTIVE else -damping * plant.v
 
     def _newest_command(self, inbox: Inbox) -> Command | None:
@@ -153,11 +154,13 @@ class RobotService(Service):
         message = inbox.latest("sim/contact_wrench")
         force, moment = self._force_W, self._moment_W
         if message is None or inbox.lost("tissue"):
-            force[:] = moment[:] = 0.0
+            self._pressed = False
             return
-        wrench = message.wrench
-        force[0], force[1], force[2] = wrench.force.x, wrench.force.y, wrench.force.z
-        moment[0], moment[1], moment[2] = wrench.torque.x, wrench.torque.y, wrench.torque.z
+        f, m = message.wrench.force, message.wrench.torque
+        self._pressed = bool(f.x or f.y or f.z or m.x or m.y or m.z)
+        if self._pressed:
+            force[0], force[1], force[2] = f.x, f.y, f.z
+            moment[0], moment[1], moment[2] = m.x, m.y, m.z
 
     def _joint_state(self, stamp: Message) -> Message:
         if self._row == len(self._noise):

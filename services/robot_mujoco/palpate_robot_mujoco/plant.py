@@ -85,7 +85,7 @@ class Plant:
         mujoco.mj_forward(model, data)  # so that the sensor reads the tool's weight before the first step
         self.q, self.v = self._qpos.copy(), self._qvel.copy()
 
-    def step(self, torque: Array, force_W: Array, moment_W: Array, damping: Array) -> None:
+    def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advances 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
         `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
@@ -93,8 +93,8 @@ class Plant:
         """
         model, data, v = self._model, self._data, self._qvel
         self._joint_torque[:] = torque
-        self._force_W[:] = force_W
-        self._moment_W[:] = moment_W
+        self._force_W[:] = 0.0 if force_W is None else force_W
+        self._moment_W[:] = 0.0 if force_W is None else moment_W
         viscous = self._viscous + damping
         for _ in range(SUBSTEPS):
             before = v.copy()

@@ -33,6 +33,7 @@ class Latch:
         self.reason = ""
         self.releases = 0
         """Granted so far."""
+        self.refusals = 0
         self.stops: list[Stop] = []
         """Every stop so far; one that grew worse counts again."""
         self._since = 0
@@ -66,6 +67,7 @@ class Latch:
         """Grants a release unless something that motion cannot mend still stands; returns what is still to be judged."""
         against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not Cause.DRIVER]
         if against:
+            self.refusals += 1
             self.reason = f"release refused: {against[0].reason}"
             return standing
         self._recovering = {breach.cause for breach in standing} & RECOVERABLE

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate_bus.contract import MS
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, header
+from palpate_bus.stamps import NS, header, nanoseconds
 from palpate_models.frames import inverse
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
@@ -69,8 +69,9 @@ class SupervisorService(Service):
         self._latch.update(t, breaches, release)
         latch, tool = self._latch, self._tool
         state = SupervisorState(
-            header(t), int(latch.level), int(latch.cause), latch.reason, latch.releases, tool.force, self._depth, tool.speed
-        )
+            header(t), int(latch.level), int(latch.cause), latch.reason, latch.releases, tool.force, self._depth, tool.speed,
+            latch.refusals,
+        )  # fmt: skip
         return {"supervisor/state": state}
 
     def finish(self) -> Mapping[str, Any]:
@@ -103,11 +104,11 @@ class SupervisorService(Service):
         return found
 
     def _perceive(self, mesh: Any) -> list[Breach]:
-        vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
-        normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
-        if not len(vertices):
+        if not len(mesh.vertices):
             return []
         try:
+            vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
+            normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
             self._surface = RestSurface(vertices, normals, self._radius)
         except ValueError as error:
             return [Breach(Level.SOFT_STOP, Cause.INVALID, f"perception/surface: {error}")]
@@ -125,7 +126,7 @@ class SupervisorService(Service):
         self._peak_speed = max(self._peak_speed, tool.speed)
         depth = None if self._surface is None else self._surface.depth(tool.p_W)
         self._depth = NOWHERE if depth is None else min(max(depth, NOWHERE), 0.2)
-        found = self._watch.judge(tool, depth)
+        found = self._watch.judge(tool, depth, nanoseconds(status.header.stamp))
         if status.mode == RobotStatus.MODE_SAFE_HOLD:
             found.append(Breach(Level.EMERGENCY, Cause.DRIVER, f"the driver holds safely: {status.reason}"))
         return found

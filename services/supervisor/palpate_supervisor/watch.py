@@ -14,7 +14,6 @@ from palpate_supervisor.tool import Tool
 
 Array = NDArray[np.float64]
 
-PERIOD_S = 0.01
 LOOKAHEAD_S = 0.1
 """A force that will be over its limit so much later counts as over it: a retreat takes 30 to 50 ms to begin, a hold that follows
 a retreat that nobody began as much again."""
@@ -25,9 +24,9 @@ HEED_RISING = 40_000_000
 FAST_NPS = 30.0
 """Only a force that rises faster than this is judged by where it will be [N/s]; slower ones planning can deal with."""
 RATE_SAMPLES = 3
-"""The rate of force is taken over so many periods."""
-PATIENCE_S = 0.05
-"""Planning retreats by itself at the soft limit; the supervisor steps in when the force stays over it for so long."""
+"""The rate of force is taken over so many measurements."""
+PATIENCE = 50_000_000
+"""Planning retreats by itself at the soft limit; the supervisor steps in when the force stays over it for so long [ns]."""
 SPEED_MARGIN = 1.3
 """Free motion is planned to reach `speed_mps`; the arm overshoots it by some percent."""
 DEPTH_MARGIN_M = 0.005
@@ -72,33 +71,40 @@ class Breach:
 
 
 class Watch:
-    """Judges the tool, once a period."""
+    """Judges the tool, at every measurement."""
 
     def __init__(self, limits: Limits, X_AW: Array) -> None:
         """`X_AW`: world in the abdomen frame, in which the workspace is given, shape (4, 4)."""
         self._limits = limits
         self._X_AW = X_AW
-        self._forces: deque[float] = deque(maxlen=RATE_SAMPLES + 1)
-        self._over_s = 0.0
+        self._forces: deque[tuple[int, float]] = deque(maxlen=RATE_SAMPLES + 1)
+        self._over_since: int | None = None
 
-    def judge(self, tool: Tool, depth: float | None) -> list[Breach]:
-        """Breaches of this period; `depth` [m] below the perceived surface, None while none is known."""
-        found = [*self._force(tool.force), *self._speed(tool), *self._workspace(tool.p_W)]
+    def judge(self, tool: Tool, depth: float | None, t: int) -> list[Breach]:
+        """Breaches of what was measured at `t` [ns]; `depth` [m] below the perceived surface, None while none is known."""
+        found = [*self._force(tool.force, t), *self._speed(tool), *self._workspace(tool.p_W)]
         if depth is not None:
             found += self._depth(depth, tool.force)
         return found
 
-    def _force(self, force: float) -> list[Breach]:
+    def _force(self, force: float, t: int) -> list[Breach]:
         limits, forces = self._limits, self._forces
-        forces.append(force)
-        rate = (forces[-1] - forces[0]) / ((len(forces) - 1) * PERIOD_S) if len(forces) > RATE_SAMPLES else 0.0
+        if forces and t <= forces[-1][0]:  # the same measurement again, or a clock that was set back: nothing to take a rate from
+            forces.clear()
+            self._over_since = None
+        forces.append((t, force))
+        begin, before = forces[0]
+        rate = (force - before) / ((t - begin) / 1e9) if len(forces) > RATE_SAMPLES else 0.0
         soon = force + (rate * LOOKAHEAD_S if rate > FAST_NPS else 0.0)
-        self._over_s = self._over_s + PERIOD_S if force > limits.force_soft_stop_n else 0.0
+        if force <= limits.force_soft_stop_n:
+            self._over_since = None
+        elif self._over_since is None:
+            self._over_since = t
         words = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
         if soon > limits.force_emergency_n:
             return [Breach(Level.EMERGENCY, Cause.FORCE, f"{words}, emergency limit {limits.force_emergency_n:g} N")]
         rising = soon > limits.force_soft_stop_n and rate > FAST_NPS
-        if self._over_s > PATIENCE_S or rising:
+        if rising or (self._over_since is not None and t - self._over_since >= PATIENCE):
             heed = HEED_RISING if rising else HEED
             return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{words}, soft-stop limit {limits.force_soft_stop_n:g} N", heed)]
         return []

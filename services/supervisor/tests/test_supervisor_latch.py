@@ -62,8 +62,10 @@ def test_a_release_is_refused_while_the_cause_stands() -> None:
     latch.update(10 * MS, [EMERGENCY], True)
     assert latch.level is Level.EMERGENCY
     assert latch.reason == "release refused: 41 N"
-    latch.update(20 * MS, [], True)
-    assert latch.level is Level.OK
+    latch.update(20 * MS, [], False)
+    assert (latch.level, latch.refusals, latch.releases) == (Level.EMERGENCY, 1, 0)
+    latch.update(30 * MS, [], True)
+    assert (latch.level, latch.refusals, latch.releases) == (Level.OK, 1, 1)
 
 
 def test_what_only_motion_can_mend_is_passed_over_until_it_is_mended() -> None:

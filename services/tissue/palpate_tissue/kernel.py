@@ -21,10 +21,10 @@ def relax(indptr: Index, indices: Index, rate: Array, branches: Array, strain: A
     """The field as it moves by itself over a step: u += A (u - sum_k y_k), A in CSR form, `branches` of shape (k, n)."""
     n = u.shape[0]
     for i in range(n):
-        total = u[i]
-        for k in range(branches.shape[0]):
-            total -= branches[k, i]
-        strain[i] = total
+        strain[i] = u[i]
+    for k in range(branches.shape[0]):
+        for i in range(n):
+            strain[i] -= branches[k, i]
     for i in range(n):
         total = u[i]
         for j in range(indptr[i], indptr[i + 1]):

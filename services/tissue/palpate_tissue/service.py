@@ -34,6 +34,8 @@ _Wrench: Any = message_type("geometry_msgs/msg/Wrench")
 _WrenchStamped: Any = message_type("geometry_msgs/msg/WrenchStamped")
 
 _OUT_OF_REACH_M = -3.0
+_NOTHING = np.zeros(3)
+_NOTHING.flags.writeable = False
 """Depth before the first tool state: the lower end of the contract's range."""
 
 _log = logging.getLogger("palpate.tissue")
@@ -88,7 +90,7 @@ class TissueService(Service):
         tool = inbox.latest("sim/tool_state")
         if tool is None:
             self._tissue.idle(t / NS)
-            force_W = torque_W = np.zeros(3)
+            force_W = torque_W = _NOTHING
         else:
             position, linear, angular = tool.pose.position, tool.twist.linear, tool.twist.angular
             motion_W = np.array(
@@ -101,7 +103,10 @@ class TissueService(Service):
             motion_W[0] -= self._p_WA
             p_A, v_A, w_A = motion_W @ self._R_WA
             force_A, torque_A = self._tissue.step(t / NS, p_A, v_A, float(tool.radius), w_A)
-            force_W, torque_W = self._R_WA @ force_A, self._R_WA @ torque_A
+            if self._tissue.touching:
+                force_W, torque_W = self._R_WA @ force_A, self._R_WA @ torque_A
+            else:
+                force_W = torque_W = _NOTHING
         wrench = _Wrench(_Vector3(*force_W.tolist()), _Vector3(*torque_W.tolist()))
         yield {"sim/contact_wrench": _WrenchStamped(header(t, "world"), wrench)}
         if tool is not None:

@@ -11,6 +11,7 @@ from typing import Any
 import typer
 from palpate_bus.zenoh_config import BusConfigError
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from palpate_tools.joining import NoBus
@@ -50,7 +51,7 @@ def command() -> Iterator[None]:
     try:
         yield
     except (NoBus, BusConfigError) as error:
-        Console(stderr=True, highlight=False).print(f"[bold red]palpate:[/] {error}", soft_wrap=True)
+        Console(stderr=True, highlight=False).print(f"[bold red]palpate:[/] {escape(str(error))}", soft_wrap=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
     except KeyboardInterrupt:
         sys.stdout.flush()

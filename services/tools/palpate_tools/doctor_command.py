@@ -9,6 +9,7 @@ import typer
 from palpate_bus.contract import contract
 from palpate_bus.health import TopicHealth, Violation
 from palpate_bus.live import LiveMonitor
+from rich.markup import escape
 
 from palpate_tools.console import EXIT_TROUBLE, bandwidth, command, console, number, print_json, print_line, table
 from palpate_tools.doctor import POLL_S, Diagnosis, Level, examine
@@ -52,7 +53,7 @@ def _watch(live: LiveMonitor, as_json: bool) -> None:
                 if as_json:
                     print_line({"after_s": round(monotonic() - began, 3), **_facts(violation)})
                 else:
-                    console().print(f"[dim]{monotonic() - began:8.2f} s[/]  [red]{violation}[/]", soft_wrap=True)
+                    console().print(f"[dim]{monotonic() - began:8.2f} s[/]  [red]{escape(str(violation))}[/]", soft_wrap=True)
             sleep(POLL_S)
     finally:
         live.close()
@@ -72,7 +73,7 @@ def _print(diagnosis: Diagnosis) -> None:
     for finding in diagnosis.findings:
         about = "" if finding.about == said else finding.about
         said = finding.about
-        listed.add_row(f"[bold]{about}[/]", f"[{_COLOURS[finding.level]}]{finding.level}[/]", finding.text)
+        listed.add_row(f"[bold]{about}[/]", f"[{_COLOURS[finding.level]}]{finding.level}[/]", escape(finding.text))
     listed.show_header = False
     out.print(listed)
     out.print()
@@ -83,7 +84,7 @@ def _print(diagnosis: Diagnosis) -> None:
     out.print()
     for violation, count in diagnosis.violations:
         times = f" ({count} times)" if count > 1 else ""
-        out.print(f"[bold red]violation[/]  {violation}{times}", soft_wrap=True)
+        out.print(f"[bold red]violation[/]  {escape(str(violation))}{times}", soft_wrap=True)
     if not diagnosis.violations:
         out.print("[green]no violation of the contract[/]")
 

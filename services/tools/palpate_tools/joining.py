@@ -15,8 +15,8 @@ from typing import Annotated
 
 import typer
 import zenoh
-from palpate_bus.runs import Run, folder, live
-from palpate_bus.zenoh_config import BusConfigError, BusOptions, session
+from palpate_bus.runs import Run, folder, live, matching
+from palpate_bus.zenoh_config import BusConfigError, BusOptions, domain_from_env, session
 
 FIND_S = 1.0
 """How long a tool waits for its links before it goes on with those that it has."""
@@ -59,20 +59,19 @@ class Joined:
 
 def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> Target:
     """The bus that the user means. Raises NoBus when there is none or more than one."""
-    fallback = int(os.environ.get("ROS_DOMAIN_ID", "0")) if domain is None else domain
+    fallback = domain_from_env() if domain is None else domain
     if connect:
         return Target(BusOptions(connect=tuple(connect)), fallback)
     if chosen is None and any(os.environ.get(name) for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG")):
         return Target(BusOptions.from_env(), fallback)
-    runs = live()
-    found = [run for run in runs if chosen is None or chosen == str(run.pid) or chosen in run.name]
+    found = matching(chosen)
     if len(found) == 1:
         return Target(found[0].options(), found[0].domain if domain is None else domain, found[0])
     if found:
         names = ", ".join(f"{run.name} (process {run.pid})" for run in found)
         raise NoBus(f"{len(found)} runs are on: {names}; choose one with --run NAME or --run PROCESS")
     if chosen is not None:
-        names = ", ".join(f"{run.name} (process {run.pid})" for run in runs) or "none"
+        names = ", ".join(f"{run.name} (process {run.pid})" for run in live()) or "none"
         raise NoBus(f"no run {chosen!r} is on; on are: {names}")
     raise NoBus(
         f"no run is on (looked in {folder()}); start one with `palpate run`, or name a bus: --connect ENDPOINT, or "

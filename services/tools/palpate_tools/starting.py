@@ -8,11 +8,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from palpate_models.load import dump_scenario, redacted
 
+from palpate_tools.joining import NoBus
 from palpate_tools.rig import Settings
 
 
@@ -31,13 +32,18 @@ def started(words: str | None, role: str, settings: Settings, endpoint: str, dom
             "PALPATE_OUT": folder, "PALPATE_RECORD": "0", "ROS_DOMAIN_ID": str(domain),
         }  # fmt: skip
         split = shlex.split(words)
-        child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)
+        try:
+            child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)
+        except OSError as error:
+            raise NoBus(f"--start {words}: {error}") from error
         try:
             yield
             child.wait(timeout=5)
         except subprocess.TimeoutExpired:
             pass
         finally:
-            if child.poll() is None:
-                child.terminate()
-                child.wait()
+            for end in (child.terminate, child.kill):
+                if child.poll() is None:
+                    end()
+                    with suppress(subprocess.TimeoutExpired):
+                        child.wait(timeout=5)
