@@ -25,6 +25,8 @@ class Collected:
 
     exam_states: list[Any] = field(default_factory=list)
     indentation: list[Any] = field(default_factory=list)
+    exam_time: int = -1
+    """Simulated time [ns] of the newest exam state, -1 before the first: by its number: no clock can spoil that."""
     samples: list[Any] = field(default_factory=list)
     status_changes: list[Any] = field(default_factory=list)
     supervisor: Any | None = None
@@ -39,11 +41,6 @@ class Collected:
     def exam(self) -> Any | None:
         """The newest exam state."""
         return self.exam_states[-1] if self.exam_states else None
-
-    @property
-    def exam_time(self) -> int:
-        """Its simulated time [ns], -1 before the first."""
-        return nanoseconds(self.exam.header.stamp) if self.exam is not None else -1
 
     @property
     def end_tick(self) -> int | None:
@@ -70,6 +67,8 @@ class Collector(Service):
         """Takes everything new and publishes the clock."""
         c = self.collected
         c.exam_states.extend(inbox.new("exam/state"))
+        seen = inbox.stamp("exam/state")
+        c.exam_time = -1 if seen is None else seen
         c.indentation.extend(inbox.new("truth/indentation"))
         c.samples.extend(inbox.new("assessment/samples"))
         for status in inbox.new("robot/status"):

@@ -64,6 +64,8 @@ class Watchdog:
             for role, p in self.progress.items()
             if role in roles and self._producers.get(p.waiting_for) in roles
         }
+        if all(self.progress[role].waiting_for == "grant" for role in roles):
+            return "conductor", "everyone waits for the conductor to grant time: planning or the recorder has fallen behind"
         if not waiting:
             role = min(roles, key=lambda name: self.progress[name].moved)
             return (

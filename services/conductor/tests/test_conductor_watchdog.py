@@ -53,3 +53,10 @@ def test_who_is_not_asked_about_blocks_nobody() -> None:
     assert w.longest_stall(ROLES) < 50.0
     assert w.longest_stall(()) < 1.0
     assert w.culprit(ROLES)[0] != "dashboard"
+
+
+def test_when_all_wait_for_a_grant_none_of_them_blocks() -> None:
+    w = watchdog()
+    for role in ROLES:
+        w.report(role, 1_000_000, "grant")
+    assert w.culprit(ROLES)[0] == "conductor"

@@ -314,7 +314,7 @@ def test_a_burst_without_frames_is_answered_in_words() -> None:
     (answer,) = [outbox for outbox in sent if outbox]
     targets = answer["perception/targets"]
     assert (len(targets.positions), targets.coverage, targets.frames_fused) == (0, 0.0, 0)
-    assert "no depth frame within 1 s" in targets.message
+    assert "no frame on camera/depth/image_raw within 1 s" in targets.message
 
 
 def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
