@@ -180,11 +180,6 @@ class LocalProcesses:
         """Exit status of every process that has ended, by role; negative is a signal's number."""
         return {role: code for role, child in self.running.items() if (code := child.poll()) is not None}
 
-    def log_tail(self, role: str, lines: int = 15) -> str:
-        """The last lines of a role's log."""
-        text = (self._out / "logs" / f"{role}.log").read_text(encoding="utf-8", errors="replace")
-        return "\n".join(text.splitlines()[-lines:])
-
     def stop(self, patience_s: float = 5.0) -> None:
         """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets."""
         for send in (None, signal.SIGTERM, signal.SIGKILL):
