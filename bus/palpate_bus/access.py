@@ -83,10 +83,10 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
         made.allow(role, "sends", sends, True, data)
         made.allow(role, "gets", gets, False, data)
         made.allow(role, "lives", _tokens(role), True, presence)
-    public = _public(rules)
-    made.allow(WATCHER, "watches", [key for name in public for key in _keys(name)], False, data)
+    shown = public(rules)
+    made.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
-        made.allow(guest, "gets", [key for name in (*public, *_VIEWED) for key in _keys(name)], False, data)
+        made.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
     made.allow("conductor", "serves", [OPERATOR_DESK], True, data)
     made.allow(OPERATOR, "orders", [OPERATOR_DESK], False, data)
     for member in (*rules.roles, VIEWER, OPERATOR):
@@ -105,11 +105,12 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
 def watched(rules: Contract) -> list[str]:
     """Topics that the contract's monitor of a run may hear, in the contract's order."""
     own = {topic.name for topic, _ in rules.inputs(WATCHER)}
-    public = set(_public(rules))
-    return [name for name in rules.topics if name in own or name in public]
+    shown = set(public(rules))
+    return [name for name in rules.topics if name in own or name in shown]
 
 
-def _public(rules: Contract) -> list[str]:
+def public(rules: Contract) -> list[str]:
+    """Topics that everyone may hear, in the contract's order."""
     return [topic.name for topic in rules.topics.values() if topic.visibility is Visibility.PUBLIC]
 
 

@@ -10,6 +10,7 @@ clock. Nothing waits for anybody. Expiry protects those who depend on a late sam
 from __future__ import annotations
 
 import logging
+import os
 from contextlib import suppress
 from time import monotonic_ns, perf_counter_ns, sleep, time_ns
 from typing import Any
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 CATCH_UP = 200 * MS
 """Lag [ns] beyond which a critical role gives up catching up."""
 HANDSHAKE_POLL_S = 0.02
+NICENESS = ((100 * MS, 10), (10 * MS, 5))
+"""Who is slower gives way (rate-monotonic): niceness from a period [ns] on."""
 READ_NS = 100_000
 """Two clocks read within this time [ns] were read at once."""
 
@@ -42,6 +45,12 @@ def _on_monotonic_clock(wall: int) -> int:
         before, now, after = monotonic_ns(), time_ns(), monotonic_ns()
         if after - before < READ_NS:
             return (before + after) // 2 + wall - now
+
+
+def _give_way(period: int) -> None:
+    """Lowers this process's priority by its period [ns], where the system lets it."""
+    with suppress(OSError):
+        os.nice(next((niceness for least, niceness in NICENESS if period >= least), 0))
 
 
 class WallClockNode:
@@ -68,6 +77,7 @@ class WallClockNode:
     def run(self) -> None:
         """Runs until the conductor ends the run."""
         try:
+            _give_way(self._stepper.role.period)
             epoch = self._await_start()
             latched = self._stepper.start()
             self._outlet.send(latched)

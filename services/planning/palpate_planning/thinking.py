@@ -8,13 +8,25 @@ nothing waits: the result is taken up when it is there, but not before its time.
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-_ONE_AT_A_TIME = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
+NICENESS = 15
+"""Of the worker thread: a planner that takes a core for seconds must not keep the 1 kHz loop from the others."""
+
+
+def _give_way() -> None:
+    with suppress(OSError, AttributeError):  # niceness of one thread is Linux's
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+
+
+_ONE_AT_A_TIME = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning", initializer=_give_way)
 """A thought that is not wanted any more goes on to its end; the next must not start beside it on the same planner."""
 
 

@@ -77,7 +77,7 @@ class Diagnosis:
 def examine(bus: Joined, rules: Contract, seconds: float, tell: Callable[[Violation], None] = lambda _: None) -> Diagnosis:
     """Looks at a bus for `seconds`; every violation is told as soon as it is seen."""
     wallclock = bus.target.run is not None and bus.target.run.runtime == "wallclock"
-    live = LiveMonitor(bus.session, rules, bus.domain, wallclock=wallclock)
+    live = LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), wallclock)
     end = monotonic() + seconds
     try:
         while monotonic() < end:
@@ -122,7 +122,7 @@ def _endpoints(bus: Joined, live: LiveMonitor) -> list[Finding]:
     run, options = bus.target.run, bus.target.options
     links = {str(zid) for zid in (*bus.session.info.peers_zid(), *bus.session.info.routers_zid())}
     there = {entity.node: entity.zid for entity in live.graph.alive.values()}
-    if run is None:
+    if run is None or options.mode == "client":
         where = ", ".join((*options.connect, *([options.router] if options.router else [])))
         return [Finding("endpoints", Level.OK if links else Level.BAD, f"{where}: {len(links)} links, domain {bus.domain}")]
     findings = []

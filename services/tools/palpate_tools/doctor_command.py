@@ -34,7 +34,7 @@ def doctor(
         rules = contract()
         if watch:
             wallclock = bus.target.run is not None and bus.target.run.runtime == "wallclock"
-            _watch(LiveMonitor(bus.session, rules, bus.domain, wallclock=wallclock), as_json)
+            _watch(LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), wallclock), as_json)
             return
         diagnosis = examine(bus, rules, seconds)
     if as_json:

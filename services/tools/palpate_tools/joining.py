@@ -15,6 +15,8 @@ from typing import Annotated
 
 import typer
 import zenoh
+from palpate_bus.access import public
+from palpate_bus.contract import Contract
 from palpate_bus.runs import Run, folder, live, matching
 from palpate_bus.zenoh_config import BusConfigError, BusOptions, domain_from_env, session
 
@@ -55,6 +57,10 @@ class Joined:
     def domain(self) -> int:
         """ROS domain."""
         return self.target.domain
+
+    def audible(self, rules: Contract) -> list[str]:
+        """The topics that may be heard: where the bus is secure, the public ones."""
+        return list(rules.topics) if self.target.options.tls is None else public(rules)
 
 
 def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> Target:
