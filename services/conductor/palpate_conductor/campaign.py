@@ -42,6 +42,7 @@ CONTACT_S: Final = 0.3
 FORCE_LIMIT_N: Final = 25.0
 PROCESS_KINDS: Final = ("kill", "freeze", "jump")
 MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
+KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS)
 WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
 COMPLETE: Final = "complete"
 UNHARMED: Final = (COMPLETE, WENT_ON)

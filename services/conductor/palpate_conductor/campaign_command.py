@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
-from palpate_conductor.campaign import MESSAGE_KINDS, PROCESS_KINDS, Finding, as_json, cases, forks, run_case
+from palpate_conductor.campaign import KINDS, Finding, as_json, cases, forks, run_case
+from palpate_conductor.campaign_tables import markdown, table
 from palpate_conductor.case_display import CaseDisplay
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
-KINDS = (*PROCESS_KINDS, *MESSAGE_KINDS)
 WIDE = 200
 BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 
@@ -76,34 +74,3 @@ def _load(path: Path) -> list[Finding]:
     rows = json.loads(path.read_text(encoding="utf-8"))
     found = [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
     return [finding for finding in found if finding.injected_s is not None]  # those that never began are tried again
-
-
-def _row(finding: Finding) -> tuple[str, ...]:
-    after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
-    force = f"{finding.peak_force_before_n:.1f}, {finding.peak_force_n:.1f} N"
-    return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
-
-
-COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
-
-
-def table(findings: Sequence[Finding]) -> Table:
-    """For a terminal."""
-    shown = Table(*COLUMNS, box=None)
-    for finding in _sorted(findings):
-        shown.add_row(*map(escape, _row(finding)), style=None if finding.good else "bold red")
-    return shown
-
-
-def markdown(findings: Sequence[Finding]) -> str:
-    """For the documentation."""
-    lines = [f"{sum(f.good for f in findings)} of {len(findings)} as they should be.", ""]
-    lines += ["| | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for finding in _sorted(findings):
-        cells = [cell.replace("|", "/").replace("\n", " ") for cell in _row(finding)]
-        lines.append(f"| {'' if finding.good else '**!**'} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _sorted(findings: Sequence[Finding]) -> list[Finding]:
-    return sorted(findings, key=lambda f: (f.mode, KINDS.index(f.kind), f.where))

@@ -9,6 +9,7 @@ import pytest
 from conductor_messages import collected, result
 from palpate_bus.messages import ExamState
 from palpate_conductor.campaign import COMPLETE, WENT_ON, Case, CaseOver, Finding, _conclude, _Watch
+from palpate_conductor.campaign_tables import markdown
 from palpate_conductor.run import Progress
 
 
@@ -53,3 +54,12 @@ def test_an_end_that_names_nobody_is_bad() -> None:
     case = watch()
     _conclude(case.finding, case, result(collected(), failure="something went wrong"))
     assert not case.finding.good
+
+
+def test_the_page_sums_up_and_marks_what_is_bad() -> None:
+    fine = Finding("kill", "robot", "lockstep", 8.0, 20.0, "robot lost", "run ended", 5.0, 5.5, "robot lost", True)
+    slow = Finding("kill", "tissue", "lockstep", 8.0, 40.0, "tissue lost", "run ended", 5.0, 26.0, "tissue lost", True)
+    page = markdown([fine, slow])
+    assert "1 of 2 as they should be; the largest force was 26.0 N." in page
+    assert "| lockstep | kill | 2 | 1 | 2 | 30, 40 | 26.0 | run ended 2 |" in page
+    assert "| **!** | lockstep | kill | tissue |" in page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -17,7 +18,7 @@ from palpate_models.scenario import Limits, Robot, Scenario
 
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import DOF, ArmModel
-from palpate_control.reference import MAX_EXTRAPOLATION_NS, Extrapolator, Mode, Setpoint, rotation_from_quaternion
+from palpate_control.reference import Extrapolator, Mode, Setpoint, rotation_from_quaternion
 
 _NAMES = list(JOINT_NAMES)
 
@@ -29,6 +30,8 @@ class ControlService(Service):
     set-point has expired, or joint states are not finite, it sends commands that have expired already, and says why: the
     driver then holds safely by itself, which is better than anything that could be commanded blindly. While joint states
     are stale the last torque stands, no longer than it was valid anyway: late states are then what a late command is.
+
+    A set-point counts in the time of the arm: one that is later than the newest measurement waits for it.
     """
 
     role: ClassVar[str] = "control"
@@ -44,6 +47,7 @@ class ControlService(Service):
         self._valid = duration_message(self._validity)
         self._expired = duration_message(0)
         self._expires: int | None = None
+        self._coming: deque[Setpoint] = deque()
         self._facts = dict.fromkeys(
             ("setpoints", "setpoints_rejected", "joint_states_rejected", "ticks_without_joint_states", "ticks_without_command"), 0
         )
@@ -79,16 +83,19 @@ class ControlService(Service):
         measured = t if joints is None else min(nanoseconds(joints.header.stamp), received, t)
         # The law compares the reference with a measurement, so it takes that of the same moment. With the present one a late
         # state would look like an error that grows with the speed, and wind the spring up: 17 mrad after 20 ms at 0.86 rad/s.
-        followed = max(measured, t - MAX_EXTRAPOLATION_NS)
+        followed = max(measured, t - self._setpoint_expiry)
         for message in inbox.new("planning/setpoint"):
-            self._accept(message, followed)
+            self._take(message, t)
+        while self._coming and self._coming[0].stamp <= followed:
+            self._reference.accept(self._coming.popleft(), followed)
         if self._expires is None or joints is None:
             return self._command(t, np.zeros(DOF), self._valid)
         if self._ceased or t > self._expires:
             expired = f"the last planning/setpoint expired {(t - self._expires) / MS:.0f} ms ago"
             return self._cease(t, self._ceased or self._refused or expired)
-        if t - received > self._joint_states_age or t - measured > self._validity:
-            return self._stand(t, self._stale(t - received, t - measured))
+        if t - received > self._joint_states_age:
+            age, limit = (t - received) / MS, self._joint_states_age / MS
+            return self._stand(t, f"joint_states are {age:.0f} ms old, limit {limit:.0f} ms")
         if joints.name != _NAMES:
             return self._reject_joints(t, f"joint_states: name = {joints.name}: must be {_NAMES}")
         try:
@@ -100,18 +107,12 @@ class ControlService(Service):
         self._torque, self._until = torque, t + self._validity
         return self._command(t, torque, self._valid)
 
-    def _stale(self, received: int, measured: int) -> str:
-        """Which age [ns] of the joint states is too high."""
-        limit = self._joint_states_age
-        if received > limit:
-            return f"joint_states are {received / MS:.0f} ms old, limit {limit / MS:.0f} ms"
-        return f"joint_states were measured {measured / MS:.0f} ms ago, limit {self._validity / MS:.0f} ms"
-
     def finish(self) -> Mapping[str, Any]:
         """Counts of set-points and rejections, the last problem, and the largest torque of each joint [N m]."""
         return {**self._facts, "problem": self._problem, "peak_torque_nm": [round(float(x), 3) for x in self._peak]}
 
-    def _accept(self, message: Message, t: int) -> None:
+    def _take(self, message: Message, t: int) -> None:
+        """Checks a set-point; it is followed once the arm was measured at its time, the very first one at once."""
         try:
             setpoint = setpoint_from(message)
         except ValueError as error:
@@ -121,7 +122,10 @@ class ControlService(Service):
             return
         self._refused = self._ceased = ""
         self._facts["setpoints"] += 1
-        self._reference.accept(setpoint, t)
+        if self._reference.current is None and not self._coming:
+            self._reference.accept(setpoint, t)
+        else:
+            self._coming.append(setpoint)
         self._expires = setpoint.stamp + min(nanoseconds(message.valid_for), self._setpoint_expiry)
 
     def _stand(self, t: int, problem: str) -> Outbox:
@@ -140,6 +144,7 @@ class ControlService(Service):
         self._problem = f"at {t} ns: {problem}"
         self._controller.reset()
         self._reference.clear()
+        self._coming.clear()
         return self._command(t, np.zeros(DOF), self._expired, problem)
 
     def _reject_joints(self, t: int, problem: str) -> Outbox:

@@ -223,16 +223,20 @@ def moving(t: int) -> np.ndarray:
     return np.array(HOME) + 0.8 * 1e-9 * t * np.eye(7)[0]
 
 
-def peak_on_the_way(delay: int) -> float:
-    """Largest torque of joint 1 [N m] while the arm moves as it should and its states arrive `delay` [ns] late for 15 ms."""
+def peak_on_the_way(delay: int, *, lagging: bool = False) -> float:
+    """Largest torque of joint 1 [N m] while the arm moves as it should and its states arrive `delay` [ns] late after 100 ms.
+
+    They stay away while they would be older than 15 ms. A `lagging` arm takes two ticks for one from then on.
+    """
     rig, peak = Rig(), 0.0
     speed = 0.8 * np.eye(7)[0]
-    for _ in range(150):
+    for _ in range(300):
         if rig.t % (10 * MS) == 0:
             rig.send(setpoint(rig.t, joint_position=moving(rig.t), joint_velocity=speed, joint_stiffness=np.full(7, 800.0)))
-        late = delay if rig.t >= 100 * MS else 0
+        late = (rig.t - 100 * MS) // 2 // MS * MS if lagging else delay
+        late = late if rig.t >= 100 * MS else 0
         measured = max(rig.t - late, 0)
-        if rig.t - measured <= 15 * MS:
+        if lagging or rig.t - measured <= 15 * MS:
             state = JointState(header(measured), list(JOINT_NAMES), moving(measured), speed, np.zeros(7))
         torque = rig.tick(1, message=state).torque[0]
         peak = max(peak, abs(torque)) if rig.t > 60 * MS else 0.0
@@ -244,11 +248,6 @@ def test_late_states_wind_no_spring_up() -> None:
     assert peak_on_the_way(15 * MS) < peak_on_the_way(0) + 1.0
 
 
-def test_states_with_an_old_stamp_are_old_however_new_they_came(rig: Rig) -> None:
-    rig.send(setpoint(0))
-    rig.tick(10)
-    frozen = joints(rig.t)
-    command = rig.tick(51, message=frozen)
-    assert not command.problem
-    command = rig.tick(1, message=frozen)
-    assert "joint_states were measured 51 ms ago, limit 50 ms" in command.problem
+def test_an_arm_that_lags_by_more_than_a_setpoints_spacing_is_followed_in_its_own_time() -> None:
+    """A plant on a busy machine falls behind tick by tick, here to 100 ms: nothing of that is an error of the arm."""
+    assert peak_on_the_way(0, lagging=True) < peak_on_the_way(0) + 1.0

@@ -157,9 +157,10 @@ class Driver:
 
     def _take(self, t: int, command: Command, gravity: Array) -> None:
         """Judges a command: obey it, ignore it (already expired while IDLE), or hold."""
-        if t > command.expires:
+        given_up = command.expires <= command.stamp  # however far its sender's clock is ahead of ours
+        if given_up or t > command.expires:
             if self.mode is Mode.ACTIVE:
-                late = (t - command.expires) / 1e6
+                late = max(t - command.expires, 0) / 1e6
                 words = f"the last command of control expired {late:.0f} ms ago, none came after it"
                 self.hold(t, Cause.COMMAND_EXPIRED, f"control gives up: {command.problem}" if command.problem else words)
             return

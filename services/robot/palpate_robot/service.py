@@ -41,6 +41,7 @@ _Request: Any = message_type("palpation_msgs/msg/OperatorRequest")
 _TICK = round(DT * NS)
 _STATUS_PERIOD = 10 * _TICK
 _LINKS_PERIOD = 50 * _TICK
+_CONTACT_AGE = 100 * _TICK
 _MOST_STEPS = 50
 """Steps of the plant that one tick may catch up with, in wall-clock mode after an overrun."""
 _NOISE_BLOCK = 1024
@@ -133,7 +134,7 @@ class RobotService(Service):
         steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
         self._t = t
         command = self._newest_command(inbox)
-        self._read_contact(inbox)
+        self._read_contact(t, inbox)
         for _ in range(steps):
             gravity = plant.gravity_torque()
             torque = driver.update(t, plant.q, plant.v, gravity, self._external_force, command, lost=inbox.lost("control"))
@@ -149,13 +150,21 @@ class RobotService(Service):
             self._command_message = message
         return self._command
 
-    def _read_contact(self, inbox: Inbox) -> None:
-        """The tissue's wrench; none before its first message, and none once the tissue is gone."""
+    def _read_contact(self, t: int, inbox: Inbox) -> None:
+        """The tissue's wrench; none before its first message, and none once the tissue is gone.
+
+        Tissue that stands still while the arm moves on would be met all at once later: in contact the driver holds (wall clock).
+        """
         message = inbox.latest("sim/contact_wrench")
         force, moment = self._force_W, self._moment_W
         if message is None or inbox.lost("tissue"):
             self._pressed = False
             return
+        received = inbox.stamp("sim/contact_wrench")
+        if self._pressed and received is not None and t - received > _CONTACT_AGE:
+            age, limit = (t - received) / 1e6, _CONTACT_AGE / 1e6
+            words = f"nothing on sim/contact_wrench for {age:.0f} ms, limit {limit:.0f} ms: tissue is late"
+            self._driver.hold(t, Cause.DEVICE, words)
         f, m = message.wrench.force, message.wrench.torque
         self._pressed = bool(f.x or f.y or f.z or m.x or m.y or m.z)
         if self._pressed:

@@ -28,6 +28,7 @@ class FakeInbox:
         self.messages: dict[str, Any] = {}
         self.events: dict[str, list[Any]] = {}
         self.gone: set[str] = set()
+        self.stamps: dict[str, int] = {}
 
     def latest(self, topic: str) -> Any:
         return self.messages.get(topic)
@@ -36,7 +37,7 @@ class FakeInbox:
         return self.events.pop(topic, [])
 
     def stamp(self, topic: str) -> int | None:
-        return None
+        return self.stamps.get(topic)
 
     def lost(self, role: str) -> bool:
         return role in self.gone
@@ -238,6 +239,29 @@ def test_working_force_does_not_hold(rig: Rig) -> None:
     rig.press(0.0, 0.0, 15.0)
     rig.servo(100)
     assert rig.mode[0] == STATUS.MODE_ACTIVE
+
+
+def test_in_contact_with_tissue_that_stands_still_it_holds(rig: Rig) -> None:
+    rig.servo(50)
+    rig.inbox.stamps["sim/contact_wrench"] = rig.t
+    rig.servo(150)
+    assert rig.mode[0] == STATUS.MODE_ACTIVE, "no contact, nothing to be met"
+    rig.press(0.0, 0.0, 5.0)
+    rig.inbox.stamps["sim/contact_wrench"] = rig.t
+    rig.servo(100)
+    assert rig.mode[0] == STATUS.MODE_ACTIVE
+    rig.servo(12)
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_DEVICE)
+    assert "nothing on sim/contact_wrench for 101 ms" in rig.status.reason
+
+
+def test_a_controller_that_gives_up_is_heard_however_far_its_clock_is_ahead(rig: Rig) -> None:
+    rig.servo(50)
+    late = COMMAND(header(rig.t + 180 * MS), np.zeros(7), duration_message(0), "joint_states are 34 ms old")
+    rig.inbox.messages["control/joint_torque"] = late
+    rig.tick(20)
+    assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_COMMAND_EXPIRED)
+    assert rig.status.reason == "control gives up: joint_states are 34 ms old"
 
 
 def test_runaway_command_is_stopped_at_a_limit(rig: Rig) -> None:
