@@ -267,6 +267,14 @@ def test_wall_clock_runs_the_same_services_to_the_announced_end() -> None:
     assert 0.1 * toy_services.END / MS < steps <= outcome.last_tick / MS + 1, "who is late goes on at the present tick"
 
 
+def test_a_wall_clock_run_of_which_nobody_would_say_the_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("palpate_conductor.conductor.EXAM_SILENT_S", 1.0)
+    fault = {"PALPATE_FAULT": "exam/state:drop", "PALPATE_FAULT_AT": "0.5", "PALPATE_FAULT_COUNT": "0", "TOY_END_S": "30"}
+    outcome = run_toys(environment=fault, wallclock=True)
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("planning has sent nothing on exam/state since 0.")
+
+
 def test_a_peer_with_another_definition_of_a_message_is_named_within_a_second() -> None:
     done: list[bool] = []
     tokens: list[NodeTokens] = []

@@ -41,6 +41,8 @@ POLL_S = 0.01
 WALLCLOCK_LEAD = 200 * MS
 """Between the word to start and the common start [ns]."""
 REGRANT_S = 0.5
+EXAM_SILENT_S = 10.0
+"""Without a new exam state for so long a wall-clock run is ended: nobody would say its end."""
 OBSERVERS_FINISH_S = 60.0
 
 
@@ -144,6 +146,7 @@ class Conductor:
         self._started_at = 0.0
         self._paced_since, self._paced_from = 0.0, 0
         self._complained = False
+        self._exam_seen, self._exam_seen_at = -1, 0.0
         self.started_at_perf = 0.0
 
     @property
@@ -318,7 +321,11 @@ class Conductor:
             self._grant(max(tick, self.horizon))
 
     def _extend_wallclock(self) -> None:
-        end = self._collector.collected.end_tick
+        end, seen = self._collector.collected.end_tick, self._collector.collected.exam_time
+        if seen != self._exam_seen:
+            self._exam_seen, self._exam_seen_at = seen, monotonic()
+        elif end is None and self._exam_seen_at and monotonic() - self._exam_seen_at > EXAM_SILENT_S:
+            raise RunFailed(f"planning has sent nothing on exam/state since {seen / NS:.3f} s, for {EXAM_SILENT_S:.0f} s")
         if self._last or (end is None and monotonic() - self._granted_at > REGRANT_S):
             self._grant(self.horizon, self._last)
         elif end is not None:
