@@ -51,7 +51,7 @@ def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[
 
 def _summary(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
     """One row a mode and kind."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for mode, kind in sorted({(f.mode, f.kind) for f in findings}, key=lambda key: (key[0], KINDS.index(key[1]))):
         cases = [f for f in findings if (f.mode, f.kind) == (mode, kind)]
         after = [f.detected_ms for f in cases if f.detected_ms is not None]
