@@ -9,7 +9,6 @@ nothing waits: the result is taken up when it is there, but not before its time.
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -22,8 +21,8 @@ NICENESS = 15
 
 
 def _give_way() -> None:
-    with suppress(OSError, AttributeError):  # niceness of one thread is Linux's
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)  # to Linux 0 is the thread that calls
 
 
 _ONE_AT_A_TIME = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning", initializer=_give_way)
