@@ -173,7 +173,7 @@ def parametric_surface(size_m: tuple[float, float, float], edge_m: float) -> Sha
     spacing = edge_m
     for _ in range(2):  # the second lattice allows for how much the first one was stretched
         plan, inner = _plan(body, spacing)
-        # Rounded: four points of the rings lie on a circle, and the last bit would choose the diagonal, another on each processor.
+        # Rounded: points of a ring lie on a circle, where the last bit, another on each processor, would choose the diagonal.
         skin = Delaunay(np.round(plan, 7)).simplices.astype(np.int32)
         vertices = body(plan[:, 0], plan[:, 1])
         fine = (np.abs(vertices[:, :2]) <= EXAMINED_HALF_M - edge_m).all(axis=1) & (vertices[:, 2] > -size_m[2] / 2)
