@@ -25,7 +25,8 @@ from palpate_bus.transport import Subscription
 from palpate_bus.wire import topic_key
 from palpate_bus.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
-from palpate_conductor.conductor import Conductor, Outcome, Patience, RunFailed
+from palpate_conductor.conductor import Conductor
+from palpate_conductor.outcome import Outcome, Patience, RunFailed
 from palpate_dashboard.replay import draw
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live
@@ -146,12 +147,12 @@ def test_a_paused_run_stands_goes_on_by_steps_and_ends_with_the_same_hash() -> N
     def pause(running: Running) -> None:
         conductor, robot = running.conductor, running.conductor.watchdog.progress["robot"]
         if at(running, 0.3, done):
-            conductor.pace("pause", 0)
+            conductor.grants.pace("pause", 0)
             with pytest.raises(ValueError, match="want 1 to 500"):
-                conductor.pace("step", 501)
-        elif done and len(stood) < 3 and robot.tick == conductor.horizon:
-            stood.append((robot.tick, conductor.horizon))
-            conductor.pace("step" if len(stood) < 3 else "resume", 2)
+                conductor.grants.pace("step", 501)
+        elif done and len(stood) < 3 and robot.tick == conductor.grants.horizon:
+            stood.append((robot.tick, conductor.grants.horizon))
+            conductor.grants.pace("step" if len(stood) < 3 else "resume", 2)
 
     outcome = run_toys(pause)
     assert outcome.failure is None
@@ -268,7 +269,7 @@ def test_wall_clock_runs_the_same_services_to_the_announced_end() -> None:
 
 
 def test_a_wall_clock_run_of_which_nobody_would_say_the_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate_conductor.conductor.EXAM_SILENT_S", 1.0)
+    monkeypatch.setattr("palpate_conductor.grants.EXAM_SILENT_S", 1.0)
     fault = {"PALPATE_FAULT": "exam/state:drop", "PALPATE_FAULT_AT": "0.5", "PALPATE_FAULT_COUNT": "0", "TOY_END_S": "30"}
     outcome = run_toys(environment=fault, wallclock=True)
     assert outcome.failure is not None

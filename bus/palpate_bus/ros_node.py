@@ -59,22 +59,28 @@ class RosSubscription:
         else:
             self._subscriber = session.declare_subscriber(key, channel)
         self._try = self._subscriber.handler.try_recv
-        self.sender = b""
-        """GID of the publisher of the newest message."""
         self.garbage = 0
         """Messages that could not be read."""
 
-    def take(self) -> list[Any]:
-        """What came since last time, oldest first; at most `RING`."""
-        messages = []
+    def heard(self) -> list[tuple[bytes, Any]]:
+        """What came since last time with its publisher's GID, oldest first; at most `RING`."""
+        pairs = []
         while (sample := self._try()) is not None:
             try:
                 attachment: Any = sample.attachment
-                _, _, self.sender = unpack(attachment.to_bytes())
-                messages.append(self._decode(sample.payload.to_bytes()))
+                _, _, sender = unpack(attachment.to_bytes())
+                pairs.append((sender, self._decode(sample.payload.to_bytes())))
             except (WireError, AttributeError, codec.CodecError):
                 self.garbage += 1
-        return messages
+        return pairs
+
+    def take(self) -> list[Any]:
+        """The messages of `heard`."""
+        return [message for _, message in self.heard()]
+
+    def others(self, own: bytes) -> list[bytes]:
+        """GIDs of the publishers of `heard`, without `own`."""
+        return [sender for sender, _ in self.heard() if sender != own]
 
     def newest(self) -> Any | None:
         """The newest message since last time, None without one."""

@@ -16,7 +16,6 @@ import logging
 import os
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import zenoh
@@ -25,6 +24,7 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.distributed import LockstepNode, RunAborted
 from palpate_bus.member import Member
 from palpate_bus.observer import ObserverNode
+from palpate_bus.priority import when_idle
 from palpate_bus.recording import RawRecorder, RecorderNode
 from palpate_bus.service import Service
 from palpate_bus.wallclock import WallClockNode
@@ -51,15 +51,6 @@ def runtime() -> str:
     return name
 
 
-def _watch_quietly() -> None:
-    """Leaves the cores to those who work: an observer runs when they would idle, in every thread that it starts from now on.
-
-    With the usual policy one that has just been woken may keep a core for milliseconds, of which a tick has less than one.
-    """
-    with suppress(OSError, AttributeError):  # SCHED_IDLE is Linux's
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-
-
 def _scenario() -> str:
     """The scenario file. Raises BusConfigError when the environment names none."""
     try:
@@ -84,7 +75,7 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         rules = contract()
         domain = domain_from_env()
         if rules.roles[role].observer:
-            _watch_quietly()
+            when_idle()
         service = create(load(_scenario()))
         session = open_session()
         member = Member(session, role, rules, domain)

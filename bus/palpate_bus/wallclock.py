@@ -10,7 +10,6 @@ clock. Nothing waits for anybody. Expiry protects those who depend on a late sam
 from __future__ import annotations
 
 import logging
-import os
 from contextlib import suppress
 from time import monotonic_ns, perf_counter_ns, sleep, time_ns
 from typing import Any
@@ -23,6 +22,7 @@ from palpate_bus.lockstep import NEVER, Received, Sent, Stepper
 from palpate_bus.member import Member
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.outlet import Outlet
+from palpate_bus.priority import by_period, give_way
 from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
@@ -30,8 +30,6 @@ log = logging.getLogger(__name__)
 CATCH_UP = 200 * MS
 """Lag [ns] beyond which a critical role gives up catching up."""
 HANDSHAKE_POLL_S = 0.02
-NICENESS = ((100 * MS, 10), (10 * MS, 5))
-"""Who is slower gives way (rate-monotonic): niceness from a period [ns] on."""
 READ_NS = 100_000
 """Two clocks read within this time [ns] were read at once."""
 
@@ -45,12 +43,6 @@ def _on_monotonic_clock(wall: int) -> int:
         before, now, after = monotonic_ns(), time_ns(), monotonic_ns()
         if after - before < READ_NS:
             return (before + after) // 2 + wall - now
-
-
-def _give_way(period: int) -> None:
-    """Lowers this process's priority by its period [ns], where the system lets it."""
-    with suppress(OSError):
-        os.nice(next((niceness for least, niceness in NICENESS if period >= least), 0))
 
 
 class WallClockNode:
@@ -77,7 +69,7 @@ class WallClockNode:
     def run(self) -> None:
         """Runs until the conductor ends the run."""
         try:
-            _give_way(self._stepper.role.period)
+            give_way(by_period(self._stepper.role.period))
             epoch = self._await_start()
             latched = self._stepper.start()
             self._outlet.send(latched)

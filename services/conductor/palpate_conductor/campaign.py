@@ -22,8 +22,8 @@ from palpate_bus.stamps import NS, nanoseconds
 from palpate_bus.zenoh_config import close_session, open_session
 from palpate_models.load import load_scenario
 
-from palpate_conductor.conductor import Patience, RunFailed
 from palpate_conductor.forks import Forks
+from palpate_conductor.outcome import Patience, RunFailed
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
 from palpate_conductor.run import WORKERS, Progress, RunResult, conduct, write_scenario_files
 

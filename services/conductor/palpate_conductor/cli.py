@@ -24,12 +24,12 @@ from rich.table import Table
 from palpate_conductor.bench import GROUPS
 from palpate_conductor.bench import bench as run_bench
 from palpate_conductor.case_display import CaseDisplay
-from palpate_conductor.conductor import RunFailed
 from palpate_conductor.evaluate import DEFAULT_CASES
 from palpate_conductor.evaluate import evaluate as run_evaluation
 from palpate_conductor.evaluate import table as evaluation_table
 from palpate_conductor.implementations import NONE, chosen_services
 from palpate_conductor.join import Absent, JoinError
+from palpate_conductor.outcome import RunFailed
 from palpate_conductor.own import OwnServiceError, own_services
 from palpate_conductor.page import write_page
 from palpate_conductor.processes import ProcessListError

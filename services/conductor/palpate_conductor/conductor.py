@@ -1,23 +1,17 @@
-"""The life of a distributed run: hello, grants, watch, end. No data passes through here.
-
-Simulated time may go as far as the conductor grants: at most `WINDOW` beyond the exam state it has seen, so that the end tick,
-which planning announces a second ahead, is never overrun; at most a second beyond what the recorder has written; and, in real
-time, not beyond the wall clock.
-"""
+"""The life of a distributed run: hello, grants (`grants`), watch, end. No data passes through here."""
 
 from __future__ import annotations
 
 import json
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from time import monotonic, perf_counter, sleep, time_ns
+from time import monotonic, perf_counter, sleep
 from typing import Any
 
 import zenoh
 from palpate_bus import codec
 from palpate_bus.contract import MS, Contract
-from palpate_bus.lockstep import NEVER, run_hash
+from palpate_bus.lockstep import NEVER
 from palpate_bus.member import Member
 from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport
 from palpate_bus.observer import ObservedService
@@ -25,70 +19,19 @@ from palpate_bus.stamps import NS, header
 
 from palpate_conductor.collector import Collector
 from palpate_conductor.contract_watch import ContractWatch
+from palpate_conductor.grants import Grants
 from palpate_conductor.handover import Places
 from palpate_conductor.operator import OperatorDesk
+from palpate_conductor.outcome import Outcome, Patience, RunFailed
 from palpate_conductor.service_health import service_statuses
 from palpate_conductor.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
 
-WINDOW = 500 * MS
-"""Simulated time granted beyond the newest exam state; less than the second by which planning announces the end."""
-RECORDER_WINDOW = NS
 AFTER_LOSS = NS
 """Simulated time that survivors run after a loss, so that the safe reaction is simulated and recorded."""
 POLL_S = 0.01
-WALLCLOCK_LEAD = 200 * MS
-"""Between the word to start and the common start [ns]."""
-REGRANT_S = 0.5
-EXAM_SILENT_S = 10.0
-"""Without a new exam state for so long a wall-clock run is ended: nobody would say its end."""
 OBSERVERS_FINISH_S = 60.0
-
-
-@dataclass(frozen=True)
-class Patience:
-    """How long the conductor waits [s], by wall clock."""
-
-    start: float = 90.0
-    """For every service to answer on every edge."""
-    soft: float = 5.0
-    """Without a finished tick before it says who blocks."""
-    hard: float = 120.0
-    """Without a finished tick before it ends the run."""
-    absent: tuple[str, ...] = ()
-    """Roles that somebody else starts ..."""
-    join: float = 300.0
-    """... and how long after all others have answered."""
-
-
-@dataclass
-class Outcome:
-    """How a run went."""
-
-    digests: dict[str, str] = field(default_factory=dict)
-    reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
-    """What each service reported at its end: blame, counters, facts."""
-    first_tick_wall: float = 0.0
-    wall_time_s: float = 0.0
-    last_tick: int = NEVER
-    trouble: list[str] = field(default_factory=list)
-    """A sentence for each loss."""
-    lost: dict[str, int] = field(default_factory=dict)
-    """Tick [ns] at which each lost service fell silent."""
-    failure: str | None = None
-    """Service and cause, None when the run completed."""
-    interrupted: bool = False
-    """Whether it was ended by Ctrl-C or SIGTERM."""
-
-    @property
-    def run_hash(self) -> str | None:
-        """The run hash, None for a run that did not complete."""
-        return None if self.failure else run_hash(self.digests)
-
-
-class RunFailed(RuntimeError):
-    """The run ended early. Names the service and the cause."""
 
 
 class Conductor:
@@ -121,13 +64,9 @@ class Conductor:
         self._roles = roles
         self._collector = collector
         self._observed = ObservedService(collector, member, lossless=True)
-        self._desk = OperatorDesk(session, domain, self.request, self.pace)
         self._patience = patience or Patience()
-        self._realtime = realtime
-        self._limit = limit
         self._wallclock = wallclock
         self._places = Places(handover_s if wallclock else 0.0)
-        self._epoch = 0
         self._control = member.internal_publisher("palpate/control", "palpation_msgs/msg/RunControl", "event")
         self._encode = codec.encoder("palpation_msgs/msg/RunControl")
         self._decode = codec.decoder("palpation_msgs/msg/ServiceReport")
@@ -139,14 +78,10 @@ class Conductor:
         self.outcome = Outcome()
         self._contract = ContractWatch(session, rules, domain, wallclock)
         collector.diagnose = self._diagnose
-        self.horizon = NEVER
-        self._paused = False
-        self._last = False
-        self._granted_at = 0.0
+        self.grants = Grants(lambda tick, last: self._say(RunControl.GRANT, tick, last), realtime, limit, wallclock)
+        self._desk = OperatorDesk(session, domain, self.request, self.grants.pace)
         self._started_at = 0.0
-        self._paced_since, self._paced_from = 0.0, 0
         self._complained = False
-        self._exam_seen, self._exam_seen_at = -1, 0.0
         self.started_at_perf = 0.0
 
     @property
@@ -159,12 +94,6 @@ class Conductor:
     def _say(self, command: int, tick: int = 0, last: bool = False, role: str = "", reason: str = "") -> None:
         self._sequence += 1
         self._control.put(self._encode(RunControl(command, tick, last, role, reason)), self._sequence)
-
-    def _grant(self, tick: int, last: bool = False) -> None:
-        self.horizon = tick
-        self._last = last
-        self._granted_at = monotonic()
-        self._say(RunControl.GRANT, tick, last)
 
     def request(self, request: int, reason: str) -> None:
         """Passes an operator's request on to robot, supervisor and planning; see `palpation_msgs/OperatorRequest`."""
@@ -209,11 +138,10 @@ class Conductor:
             self.outcome.interrupted = True
             self.abort("interrupted")
             raise RunFailed("interrupted before the first tick") from None
-        self._started_at = self._paced_since = monotonic()
+        self._started_at = monotonic()
         self.started_at_perf = perf_counter()
         self.watchdog.forgive()
-        self._epoch = time_ns() + WALLCLOCK_LEAD
-        self._grant(self._epoch if self._wallclock else WINDOW - MS)
+        self.grants.begin()
         try:
             self._conduct(died, tell)
             self.outcome.wall_time_s = monotonic() - self._started_at
@@ -293,66 +221,11 @@ class Conductor:
 
     def _extend(self) -> None:
         """Grants as much time as may be granted."""
-        if self._wallclock:
-            self._extend_wallclock()
-            return
-        if self._last:
-            if monotonic() - self._granted_at > REGRANT_S:
-                self._grant(self.horizon, last=True)
-            return
-        end = self._collector.collected.end_tick
-        if end is None and self._limit is not None and self._collector.collected.exam_time + WINDOW >= self._limit:
-            end = self._limit
-        tick = max(self._collector.collected.exam_time, 0) + WINDOW
-        for role in self._observers:
-            if role == "recorder" and role not in self.outcome.lost:
-                tick = min(tick, self.watchdog.progress[role].tick + RECORDER_WINDOW)
-        if self._realtime is not None:
-            tick = min(tick, self._paced_from + int((monotonic() - self._paced_since) * self._realtime * NS))
-        tick -= tick % MS
-        if self._paused:
+        if self.grants.paused:
             self.watchdog.forgive()
-            tick = self.horizon
-        if end is not None and end <= max(tick, self.horizon):
-            if end < self.horizon:
-                raise RunFailed(f"planning announced the end at {end} ns after {self.horizon} ns had been granted")
-            self._grant(end, last=True)
-        elif tick > self.horizon or monotonic() - self._granted_at > REGRANT_S:
-            self._grant(max(tick, self.horizon))
-
-    def _extend_wallclock(self) -> None:
-        end, seen = self._collector.collected.end_tick, self._collector.collected.exam_time
-        if seen != self._exam_seen:
-            self._exam_seen, self._exam_seen_at = seen, monotonic()
-        elif end is None and self._exam_seen_at and monotonic() - self._exam_seen_at > EXAM_SILENT_S:
-            raise RunFailed(f"planning has sent nothing on exam/state since {seen / NS:.3f} s, for {EXAM_SILENT_S:.0f} s")
-        if self._last or (end is None and monotonic() - self._granted_at > REGRANT_S):
-            self._grant(self.horizon, self._last)
-        elif end is not None:
-            self._grant(end, last=True)
-
-    def pace(self, word: str, ms: int) -> str:
-        """Does a word of `desk.PACE` and says what came of it; `ms` of simulated time for `step`.
-
-        Raises ValueError when it cannot be done.
-        """
-        if self._wallclock:
-            raise ValueError("time is the wall's in this run: nothing can hold it")
-        if self._last:
-            raise ValueError("the run is ending")
-        if word == "pause":
-            self._paused = True
-        elif not self._paused:
-            raise ValueError("the run is not paused")
-        elif word == "resume":
-            self._paused = False
-            self._paced_from, self._paced_since = self.horizon, monotonic()
-            return "goes on"
-        elif not 0 < ms <= WINDOW // MS:
-            raise ValueError(f"a step of {ms} ms: want 1 to {WINDOW // MS}")
-        else:
-            self._grant(self.horizon + ms * MS)
-        return f"stands at {(self.horizon + MS) / NS:.3f} s as soon as that is reached"
+        seen = self._collector.collected
+        records = "recorder" in self._observers and "recorder" not in self.outcome.lost
+        self.grants.extend(seen.exam_time, seen.end_tick, self.watchdog.progress["recorder"].tick if records else None)
 
     def _watch(self) -> None:
         judged = [role for role in self._workers if role not in self.outcome.lost and role not in self._places.empty]
@@ -400,7 +273,7 @@ class Conductor:
             raise RunFailed(sentence)
         self._say(RunControl.LOST, tick, role=role, reason=how)
         reached = max(progress.tick for progress in self.watchdog.progress.values())
-        self._grant(reached - reached % MS + AFTER_LOSS, last=True)
+        self.grants.grant(reached - reached % MS + AFTER_LOSS, last=True)
 
     def _close(self, role: str, detail: dict[str, Any]) -> None:
         self.outcome.reports[role] = detail

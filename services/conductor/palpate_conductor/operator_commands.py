@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass
 from time import monotonic, sleep
 from typing import Annotated
 
 import typer
 import zenoh
-from palpate_bus import runs
-from palpate_bus.access import OPERATOR
 from palpate_bus.desk import NotAnswered, ask
-from palpate_bus.zenoh_config import BusConfigError, BusOptions, domain_from_env, session
+from palpate_bus.joining import NoBus, find, find_all
+from palpate_bus.zenoh_config import BusConfigError, session
 from rich.console import Console
 from rich.markup import escape
 
@@ -20,8 +17,6 @@ EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
 MEET_S = 1.0
 """How long a run may take to be met on the bus."""
-BUS = ("PALPATE_ROUTER", "PALPATE_CONNECT", "PALPATE_ZENOH_CONFIG")
-"""Variables that name a bus in place of a run of this machine."""
 
 Named = Annotated[str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")]
 
@@ -64,26 +59,17 @@ def step(
     _say("step", "palpate step", run, ms=ms)
 
 
-@dataclass(frozen=True)
-class _Bus:
-    """Where a run is asked."""
-
-    title: str
-    options: BusOptions
-    domain: int
-
-
 def _say(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
     console = Console(stderr=True)
     try:
-        buses = _buses(name, everyone)
-    except (BusConfigError, OSError) as error:
+        buses = find_all(chosen=name) if everyone else [find(chosen=name)]
+    except (NoBus, BusConfigError, OSError) as error:
         console.print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
     failed = False
     for bus in buses:
         try:
-            with session(bus.options) as joined:
+            with session(bus.operator()) as joined:
                 answer, after_ms = _met(joined, bus.domain, word, reason, ms)
         except (NotAnswered, BusConfigError) as error:
             failed = True
@@ -105,21 +91,3 @@ def _met(joined: zenoh.Session, domain: int, word: str, reason: str, ms: int) ->
             if "does not answer" not in str(error) or monotonic() - begin > MEET_S:
                 raise
             sleep(0.05)
-
-
-def _buses(name: str | None, everyone: bool) -> list[_Bus]:
-    """The runs that are meant: by `--run`, else by the environment, else those of this machine.
-
-    Several only with `everyone`: who is in a hurry to stop an arm should not have to look up which. Raises BusConfigError.
-    """
-    if name is None and any(os.environ.get(variable) for variable in BUS):
-        options = BusOptions.from_env()
-        return [_Bus(options.router or ", ".join(options.connect) or "bus", options, domain_from_env())]
-    found = runs.matching(name)
-    if found and (everyone or len(found) == 1):
-        return [_Bus(run.name, run.options(OPERATOR), run.domain) for run in found]
-    known = ", ".join(f"{run.name} (process {run.pid})" for run in runs.live()) or "there is none"
-    if found:
-        raise BusConfigError(f"{len(found)} runs are meant; choose one with --run: {known}")
-    wanted = "no run is on" if name is None else f"no run {name!r}"
-    raise BusConfigError(f"{wanted}; on this machine: {known}. In containers set PALPATE_ROUTER")

@@ -22,9 +22,10 @@ from palpate_models.load import dump_scenario, exam_input, redacted
 from palpate_models.scenario import Scenario
 
 from palpate_conductor.collector import Collected, Collector
-from palpate_conductor.conductor import Conductor, Patience, RunFailed
+from palpate_conductor.conductor import Conductor
 from palpate_conductor.implementations import NONE, chosen_environment, chosen_processes, chosen_services
 from palpate_conductor.join import Absent
+from palpate_conductor.outcome import Patience, RunFailed
 from palpate_conductor.own import in_place, load
 from palpate_conductor.processes import LocalProcesses, compose_file, override_files, read_processes
 from palpate_conductor.secure import SecureBus

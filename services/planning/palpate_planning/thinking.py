@@ -8,24 +8,15 @@ nothing waits: the result is taken up when it is there, but not before its time.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from typing import Generic, TypeVar
+
+from palpate_bus.priority import WORKER, give_way
 
 T = TypeVar("T")
 
-NICENESS = 15
-"""Of the worker thread: a planner that takes a core for seconds must not keep the 1 kHz loop from the others."""
-
-
-def _give_way() -> None:
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)  # to Linux 0 is the thread that calls
-
-
-_ONE_AT_A_TIME = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning", initializer=_give_way)
+_ONE_AT_A_TIME = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning", initializer=give_way, initargs=(WORKER,))
 """A thought that is not wanted any more goes on to its end; the next must not start beside it on the same planner."""
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from palpate_bus.codec import decode, encode, message_type
 from palpate_bus.contract import contract
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.stamps import duration_message, header, nanoseconds
 from palpate_models import lbr
 from palpate_models.scenario import Robot, Scenario
@@ -23,32 +24,12 @@ PARTS = message_type("geometry_msgs/msg/Wrench")
 VECTOR = message_type("geometry_msgs/msg/Vector3")
 
 
-class FakeInbox:
-    def __init__(self) -> None:
-        self.messages: dict[str, Any] = {}
-        self.events: dict[str, list[Any]] = {}
-        self.gone: set[str] = set()
-        self.stamps: dict[str, int] = {}
-
-    def latest(self, topic: str) -> Any:
-        return self.messages.get(topic)
-
-    def new(self, topic: str) -> list[Any]:
-        return self.events.pop(topic, [])
-
-    def stamp(self, topic: str) -> int | None:
-        return self.stamps.get(topic)
-
-    def lost(self, role: str) -> bool:
-        return role in self.gone
-
-
 class Rig:
     """A robot whose command law and tissue are functions of the last tick's outbox."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.robot: RobotService = create(scenario)
-        self.inbox = FakeInbox()
+        self.inbox = HandInbox()
         self.t = -MS
         self.outbox: Mapping[str, Any] = {}
         self.status: Any = None

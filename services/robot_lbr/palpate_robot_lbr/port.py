@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
+from palpate_bus.ros_node import RosNode
 from palpate_bus.zenoh_config import BusOptions
 from palpate_models.frames import Array
 
-from palpate_robot_lbr.commands import LbrNode
 from palpate_robot_lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand
 from palpate_robot_lbr.settings import Settings
 
@@ -56,11 +56,11 @@ class ZenohPort(LbrPort):
     def __init__(self, settings: Settings) -> None:
         """Joins. Raises BusConfigError."""
         name = settings.namespace
-        self._node = LbrNode("palpate_robot_lbr", settings.domain, BusOptions(router=settings.router))
+        self._node = RosNode("palpate_robot_lbr", settings.domain, BusOptions(router=settings.router))
         self._states = self._node.subscription(f"{name}/state", STATE)
         self._wrenches = self._node.subscription(settings.ft_topic, WRENCH)
         self._command = self._node.publisher(f"{name}/command/torque", TORQUE_COMMAND)
-        self._commands = self._node.commands(f"{name}/command/torque")
+        self._commands = self._node.subscription(f"{name}/command/torque", TORQUE_COMMAND)
         if settings.emulated:
             self._contact = self._node.publisher(CONTACT_TOPIC, WRENCH)
             self._tool = self._node.subscription(TOOL_TOPIC, TOOL_STATE)

@@ -18,11 +18,11 @@ from types import FrameType
 from typing import Any, Final
 
 import numpy as np
+from palpate_bus.ros_node import RosNode
 from palpate_bus.zenoh_config import BusOptions
 from palpate_models.frames import Array
 
 from palpate_robot_lbr.arm import Arm
-from palpate_robot_lbr.commands import LbrNode
 from palpate_robot_lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
 from palpate_robot_lbr.settings import Settings
 
@@ -76,9 +76,9 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    node = LbrNode("palpate_lbr_watchdog", settings.domain, BusOptions(router=settings.router))
+    node = RosNode("palpate_lbr_watchdog", settings.domain, BusOptions(router=settings.router))
     states = node.subscription(f"{settings.namespace}/state", STATE)
-    commands = node.commands(f"{settings.namespace}/command/torque")
+    commands = node.subscription(f"{settings.namespace}/command/torque", TORQUE_COMMAND)
     publisher = node.publisher(f"{settings.namespace}/command/torque", TORQUE_COMMAND)
     watchdog = Watchdog()
     said = False

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from palpate_models.load import exam_input
+from palpate_bus.hand_inbox import HandInbox
+from palpate_bus.messages import JointTorqueCommand, RobotStatus
+from palpate_bus.stamps import duration_message, header
+from palpate_models import lbr
+from palpate_models.load import exam_input, load_scenario
 from palpate_models.scenario import Scenario
 from palpate_robot_lbr.emulator import Emulator, Options
 from palpate_robot_lbr.inner import InnerLoop, load_control
@@ -71,3 +76,48 @@ def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any
     port = DirectPort(Emulator(exam, chosen), chosen.period_ms)
     inner = InnerLoop(load_control(scenario)) if level == "setpoint" else None
     return LbrService(exam, Settings(level=level, emulated=True), port, inner), port
+
+
+SCENARIO = load_scenario("rlq_guarding")
+GAIN = np.array([400.0, 400.0, 300.0, 300.0, 100.0, 60.0, 30.0])
+
+
+class Rig:
+    """Driver, emulated arm, and a joint servo that commands it."""
+
+    def __init__(self, **options: Any) -> None:
+        self.driver: LbrService
+        self.port: DirectPort
+        self.driver, self.port = driver_on_emulator(SCENARIO, **options)
+        self.inbox = HandInbox()
+        self.t = -MS
+        self.outbox: Mapping[str, Any] = {}
+        self.status: Any = None
+        self.target = np.array(lbr.HOME)
+        self.torque = np.zeros(7)
+        self.commanding = True
+
+    @property
+    def plant(self) -> Any:
+        return self.port.emulator._plant
+
+    def tick(self, ticks: int) -> None:
+        for _ in range(ticks):
+            self.t += MS
+            joints = self.outbox.get("joint_states")
+            if joints is not None and self.commanding:
+                error = self.target - joints.position
+                torque = GAIN * error - 0.5 * np.sqrt(GAIN) * joints.velocity
+                self.torque = np.clip(torque, self.torque - 1.0, self.torque + 1.0)  # as the driver wants it
+                command = JointTorqueCommand(header(self.t), self.torque, duration_message(50 * MS), "")
+                self.inbox.messages["control/joint_torque"] = command
+            self.outbox = self.driver.step(self.t, self.inbox)
+            self.status = self.outbox.get("robot/status", self.status)
+
+
+def active_rig() -> Rig:
+    """A rig whose driver obeys commands."""
+    rig = Rig()
+    rig.tick(600)
+    assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason
+    return rig

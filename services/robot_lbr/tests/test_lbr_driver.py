@@ -2,82 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 import pytest
-from lbr_bench import MS, DirectPort, driver_on_emulator
-from palpate_bus.messages import JointTorqueCommand, OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.stamps import duration_message, header
+from lbr_bench import SCENARIO, Rig, active_rig
+from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.stamps import header
 from palpate_models import lbr
-from palpate_models.load import load_scenario
 from palpate_robot_lbr.arm import ArmModel
-from palpate_robot_lbr.service import LbrService
 from palpate_robot_lbr.settings import Settings, SettingsError
-
-SCENARIO = load_scenario("rlq_guarding")
-GAIN = np.array([400.0, 400.0, 300.0, 300.0, 100.0, 60.0, 30.0])
-
-
-class Inbox:
-    def __init__(self) -> None:
-        self.messages: dict[str, Any] = {}
-        self.events: dict[str, list[Any]] = {}
-        self.gone: set[str] = set()
-
-    def latest(self, topic: str) -> Any | None:
-        return self.messages.get(topic)
-
-    def new(self, topic: str) -> list[Any]:
-        return self.events.pop(topic, [])
-
-    def stamp(self, topic: str) -> int | None:
-        return 0 if topic in self.messages else None
-
-    def lost(self, role: str) -> bool:
-        return role in self.gone
-
-
-class Rig:
-    """Driver, emulated arm, and a joint servo that commands it."""
-
-    def __init__(self, **options: Any) -> None:
-        self.driver: LbrService
-        self.port: DirectPort
-        self.driver, self.port = driver_on_emulator(SCENARIO, **options)
-        self.inbox = Inbox()
-        self.t = -MS
-        self.outbox: Mapping[str, Any] = {}
-        self.status: Any = None
-        self.target = np.array(lbr.HOME)
-        self.torque = np.zeros(7)
-        self.commanding = True
-
-    @property
-    def plant(self) -> Any:
-        return self.port.emulator._plant
-
-    def tick(self, ticks: int) -> None:
-        for _ in range(ticks):
-            self.t += MS
-            joints = self.outbox.get("joint_states")
-            if joints is not None and self.commanding:
-                error = self.target - joints.position
-                torque = GAIN * error - 0.5 * np.sqrt(GAIN) * joints.velocity
-                self.torque = np.clip(torque, self.torque - 1.0, self.torque + 1.0)  # as the driver wants it
-                command = JointTorqueCommand(header(self.t), self.torque, duration_message(50 * MS), "")
-                self.inbox.messages["control/joint_torque"] = command
-            self.outbox = self.driver.step(self.t, self.inbox)
-            self.status = self.outbox.get("robot/status", self.status)
 
 
 @pytest.fixture
 def rig() -> Rig:
-    rig = Rig()
-    rig.tick(600)
-    assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason
-    return rig
+    return active_rig()
 
 
 def test_until_the_session_commands_the_driver_waits_and_says_for_what() -> None:

@@ -8,24 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lbr_bench import MS
+from lbr_bench import MS, Rig, active_rig
 from palpate_bus.messages import RobotStatus, SupervisorState
+from palpate_bus.ros_node import RosNode
 from palpate_bus.stamps import header
 from palpate_bus.zenoh_config import BusOptions
-from palpate_robot_lbr.commands import LbrNode
 from palpate_robot_lbr.idl import TORQUE_COMMAND, LBRTorqueCommand
 from palpate_robot_lbr.port import ZenohPort
 from palpate_robot_lbr.service import TAKE_OVER
 from palpate_robot_lbr.settings import Settings
-from test_lbr_driver import Rig
 
 
 @pytest.fixture
 def rig() -> Rig:
-    rig = Rig()
-    rig.tick(600)
-    assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason
-    return rig
+    return active_rig()
 
 
 def release(rig: Rig) -> None:
@@ -75,9 +71,9 @@ def heard(port: Any, count: int) -> list[bytes]:
 
 def test_over_zenoh_the_sender_of_every_command_is_told(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/lbr.sock"
-    node = LbrNode("watchdog", 0, BusOptions(listen=(endpoint,)))
+    node = RosNode("watchdog", 0, BusOptions(listen=(endpoint,)))
     topic, command = "lbr/command/torque", LBRTorqueCommand(np.zeros(7), np.zeros(7))
-    commands = node.commands(topic)
+    commands = node.subscription(topic, TORQUE_COMMAND)
     watchdog, new = node.publisher(topic, TORQUE_COMMAND), node.publisher(topic, TORQUE_COMMAND)
     port = ZenohPort(Settings(router=endpoint))
     try:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from lbr_bench import MS
+from lbr_bench import MS, Rig
 from palpate_bus.stamps import nanoseconds
-from test_lbr_driver import Rig
 
 
 def stamps(rig: Rig, ticks: int, topic: str) -> list[int]:

@@ -7,11 +7,12 @@ from importlib.metadata import entry_points
 from typing import Annotated
 
 import typer
+from palpate_bus.joining import NoBus
 from palpate_bus.zenoh_config import BusOptions, session
 from palpate_models.load import ScenarioError, load_scenario
 
 from palpate_tools.console import EXIT_TROUBLE, command, console, print_json, table
-from palpate_tools.joining import Connect, NoBus
+from palpate_tools.joining import Connect
 from palpate_tools.live_rig import LiveRig
 from palpate_tools.report import Report, Verdict
 from palpate_tools.rig import ServiceRig, Settings

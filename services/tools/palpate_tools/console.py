@@ -9,12 +9,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import typer
+from palpate_bus.joining import NoBus
 from palpate_bus.zenoh_config import BusConfigError
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-
-from palpate_tools.joining import NoBus
 
 EXIT_TROUBLE = 1
 EXIT_BAD_INPUT = 2

@@ -1,12 +1,7 @@
-"""How a tool finds and joins the bus of a run that somebody else started.
-
-In this order: `--connect`; what the environment says (PALPATE_CONNECT, PALPATE_ROUTER, PALPATE_ZENOH_CONFIG); `--run`; the one
-run that is announced on this machine (`palpate_bus.runs`).
-"""
+"""How a tool joins the bus of a run that somebody else started; which one, `palpate_bus.joining` finds."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,8 +12,8 @@ import typer
 import zenoh
 from palpate_bus.access import public
 from palpate_bus.contract import Contract
-from palpate_bus.runs import Run, folder, live, matching
-from palpate_bus.zenoh_config import BusConfigError, BusOptions, domain_from_env, session
+from palpate_bus.joining import NoBus, Target, find
+from palpate_bus.zenoh_config import BusConfigError, BusOptions, session
 
 FIND_S = 1.0
 """How long a tool waits for its links before it goes on with those that it has."""
@@ -30,20 +25,6 @@ Connect = Annotated[
 ChosenRun = Annotated[str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")]
 Domain = Annotated[int | None, typer.Option(help="ROS domain; by default the run's, else ROS_DOMAIN_ID.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-
-
-class NoBus(RuntimeError):
-    """No bus to join. Says what was looked for and what to do."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """The bus to join."""
-
-    options: BusOptions
-    domain: int
-    run: Run | None = None
-    """The run, when it is announced on this machine."""
 
 
 @dataclass(frozen=True)
@@ -61,28 +42,6 @@ class Joined:
     def audible(self, rules: Contract) -> list[str]:
         """The topics that may be heard: where the bus is secure, the public ones."""
         return list(rules.topics) if self.target.options.tls is None else public(rules)
-
-
-def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> Target:
-    """The bus that the user means. Raises NoBus when there is none or more than one."""
-    fallback = domain_from_env() if domain is None else domain
-    if connect:
-        return Target(BusOptions(connect=tuple(connect)), fallback)
-    if chosen is None and any(os.environ.get(name) for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG")):
-        return Target(BusOptions.from_env(), fallback)
-    found = matching(chosen)
-    if len(found) == 1:
-        return Target(found[0].options(), found[0].domain if domain is None else domain, found[0])
-    if found:
-        names = ", ".join(f"{run.name} (process {run.pid})" for run in found)
-        raise NoBus(f"{len(found)} runs are on: {names}; choose one with --run NAME or --run PROCESS")
-    if chosen is not None:
-        names = ", ".join(f"{run.name} (process {run.pid})" for run in live()) or "none"
-        raise NoBus(f"no run {chosen!r} is on; on are: {names}")
-    raise NoBus(
-        f"no run is on (looked in {folder()}); start one with `palpate run`, or name a bus: --connect ENDPOINT, or "
-        "PALPATE_ROUTER=tcp/HOST:7447"
-    )
 
 
 @contextmanager

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import zenoh
 from palpate_bus.contract import Topic
+from palpate_bus.joining import NoBus
 from palpate_bus.transport import HELLO
 from palpate_bus.wire import WireError, topic_key, unpack
-
-from palpate_tools.joining import NoBus
 
 LONG = 12
 """Arrays of more items than this are shortened for people."""

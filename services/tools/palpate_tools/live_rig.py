@@ -7,6 +7,7 @@ grant, a word at least every half second, and the end.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from time import monotonic, sleep, time_ns
 from typing import Any
 
@@ -14,13 +15,13 @@ import zenoh
 from palpate_bus import codec
 from palpate_bus.codec import Message
 from palpate_bus.contract import MS
+from palpate_bus.joining import NoBus
 from palpate_bus.liveliness import GraphWatch, Kind, NodeTokens, gid
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.stamps import NS
 from palpate_bus.transport import Publisher, Subscription
 from palpate_bus.wire import AttachmentWriter, message_key, topic_key
 
-from palpate_tools.joining import NoBus
 from palpate_tools.listening import Listener
 from palpate_tools.report import Report
 from palpate_tools.rig import Feed, Heard, Rig, Settings
@@ -46,7 +47,10 @@ class LiveRig(Rig):
         self.graph = GraphWatch(session, domain)
         self._tokens: dict[str, NodeTokens] = {}
         self._publishers: dict[str, Publisher] = {}
+        self._encoders: dict[str, Callable[[Message], bytes]] = {}
+        """Made now: in the middle of a check an implementation would miss commands meanwhile, and rightly hold."""
         for topic, _ in self.rules.inputs(role):
+            self._encoders[topic.name] = codec.encoder(topic.type)
             tokens = self._tokens.setdefault(topic.producer, NodeTokens(session, topic.producer, domain))
             qos = self.rules.qos[topic.qos]
             self._publishers[topic.name] = Publisher(session, topic_key(topic, domain), qos, tokens.publisher(topic, qos))
@@ -215,7 +219,7 @@ class LiveRig(Rig):
 
     def send(self, topic: str, message: Message) -> None:
         """Publishes a message as its rightful producer."""
-        self._next(topic, codec.encode(message, self.rules.topics[topic].type))
+        self._next(topic, self._encoders[topic](message))
 
     def lose(self, role: str) -> None:
         """Says that a role is lost, as a conductor does."""

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from palpate_bus.joining import NoBus
 from palpate_models.load import dump_scenario, redacted
 
-from palpate_tools.joining import NoBus
 from palpate_tools.rig import Settings
 
 

@@ -12,11 +12,12 @@ import typer
 import yaml
 from palpate_bus import codec
 from palpate_bus.contract import Topic, contract
+from palpate_bus.joining import NoBus
 from rich.console import Console
 
 from palpate_tools import graph
 from palpate_tools.console import bandwidth, command, console, print_json, print_line, table
-from palpate_tools.joining import AsJson, ChosenRun, Connect, Domain, Joined, NoBus, joined
+from palpate_tools.joining import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate_tools.listening import Heard, Listener, plain
 from palpate_tools.statistics import Spacing
 

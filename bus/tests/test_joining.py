@@ -1,0 +1,74 @@
+"""Finding the bus that a user means."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from palpate_bus.joining import BUS, NoBus, find, find_all
+from palpate_bus.runs import Announcement, Run
+from palpate_bus.zenoh_config import TLS_FILES
+
+ENDPOINTS = {"robot": "tcp/127.0.0.1:17999"}
+
+
+@pytest.fixture(autouse=True)
+def _alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
+    for name in (*BUS, "ROS_DOMAIN_ID"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@contextmanager
+def _announced(*runs: Run) -> Iterator[None]:
+    on = [Announcement(run) for run in runs]
+    try:
+        yield
+    finally:
+        for announcement in on:
+            announcement.withdraw()
+
+
+def test_nothing_to_join() -> None:
+    with pytest.raises(NoBus, match="no run is on"):
+        find()
+    with pytest.raises(NoBus, match="no run 'healthy' is on; on are: none"):
+        find(chosen="healthy")
+
+
+def test_the_one_run() -> None:
+    with _announced(Run("healthy", ENDPOINTS, domain=7)):
+        target = find()
+        assert (target.title, target.domain, target.options.connect) == ("healthy", 7, tuple(ENDPOINTS.values()))
+        assert find(domain=3).domain == 3
+
+
+def test_several_runs_are_named_unless_all_are_meant() -> None:
+    with _announced(Run("healthy", ENDPOINTS, pid=1), Run("two_lesions", ENDPOINTS, pid=2)):
+        with pytest.raises(NoBus, match=r"2 runs are on: healthy \(process 1\), two_lesions \(process 2\)"):
+            find()
+        assert {target.title for target in find_all()} == {"healthy", "two_lesions"}
+        assert find(chosen="two").title == "two_lesions"
+
+
+def test_the_environment_goes_before_the_runs_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_ROUTER", "tcp/10.0.0.5:7447")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "5")
+    with _announced(Run("healthy", ENDPOINTS)):
+        target = find()
+        assert (target.title, target.domain, target.run) == ("tcp/10.0.0.5:7447", 5, None)
+        assert find(chosen="healthy").title == "healthy"
+        assert find(connect=["tcp/10.0.0.6:1"]).options.connect == ("tcp/10.0.0.6:1",)
+
+
+def test_an_operator_of_a_secure_run_has_his_own_key(tmp_path: Path) -> None:
+    for member in ("viewer", "operator"):
+        (tmp_path / "keys" / member).mkdir(parents=True)
+        for name in TLS_FILES:
+            (tmp_path / "keys" / member / name).touch()
+    with _announced(Run("healthy", {"router": "tls/127.0.0.1:17998"}, keys=str(tmp_path / "keys"))):
+        target = find()
+    assert target.options.tls == tmp_path / "keys" / "viewer"
+    assert target.operator().tls == tmp_path / "keys" / "operator"

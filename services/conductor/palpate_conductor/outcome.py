@@ -1,0 +1,53 @@
+"""How long a conductor waits, and what came of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from palpate_bus.lockstep import NEVER, run_hash
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long the conductor waits [s], by wall clock."""
+
+    start: float = 90.0
+    """For every service to answer on every edge."""
+    soft: float = 5.0
+    """Without a finished tick before it says who blocks."""
+    hard: float = 120.0
+    """Without a finished tick before it ends the run."""
+    absent: tuple[str, ...] = ()
+    """Roles that somebody else starts ..."""
+    join: float = 300.0
+    """... and how long after all others have answered."""
+
+
+@dataclass
+class Outcome:
+    """How a run went."""
+
+    digests: dict[str, str] = field(default_factory=dict)
+    reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    """What each service reported at its end: blame, counters, facts."""
+    wall_time_s: float = 0.0
+    last_tick: int = NEVER
+    trouble: list[str] = field(default_factory=list)
+    """A sentence for each loss."""
+    lost: dict[str, int] = field(default_factory=dict)
+    """Tick [ns] at which each lost service fell silent."""
+    failure: str | None = None
+    """Service and cause, None when the run completed."""
+    interrupted: bool = False
+    """Whether it was ended by Ctrl-C or SIGTERM."""
+
+    @property
+    def run_hash(self) -> str | None:
+        """The run hash, None for a run that did not complete."""
+        return None if self.failure else run_hash(self.digests)
+
+
+class RunFailed(RuntimeError):
+    """The run ended early. Names the service and the cause."""
