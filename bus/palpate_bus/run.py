@@ -12,6 +12,7 @@ ROS_DOMAIN_ID, and what `zenoh_config` reads.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import sys
@@ -79,6 +80,7 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         service = create(load(_scenario()))
         session = open_session()
         member = Member(session, role, rules, domain)
+        gc.freeze()  # a full collection of all that was loaded would stop the service for some 50 ms in mid-run
         node_type(service, rules)(service, member).run()
         member.leave()
     except RunAborted as aborted:

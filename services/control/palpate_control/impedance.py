@@ -11,6 +11,14 @@ is asked for. N is the null-space projector of Khatib (1987, doi 10.1109/JRA.198
 10 Nms/rad a joint's torque makes it move, not accelerate, and consistency with M alone lets the posture drag the indenter
 along by millimetres. The rotational spring is the gradient of 1/2 phi^T K phi, phi the rotation vector, so the springs
 store energy and never create any.
+
+In joint space, with M = L L^T and L^-1 K L^-T = V diag(w^2) V^T, so that the columns of P = L V decouple inertia and stiffness:
+
+    tau = P diag(w^2) P^T clip(q_d - q) + P diag(max(2 zeta w - b, ..)) P^T (qd_d - qd) + M qdd_d + C(q, qd) qd + friction(qd_d)
+
+the double diagonalisation of Albu-Schaeffer et al. (ICRA 2003): each mode has the damping that its own
+inertia needs. With M_ii joint by joint, two joints of almost one axis are damped as if the whole arm moved when they only turn
+against each other, and then a few milliseconds from measuring to acting shake the arm.
 """
 
 from __future__ import annotations
@@ -64,11 +72,14 @@ class ImpedanceController:
         self._design_age = 0
         self._stiffness = self._damping = np.zeros(6)
         self._posture_damping = np.zeros(DOF)
+        self._joint_designed_for: Array | None = None
+        self._joint_design_age = 0
+        self._joint_stiffness = self._joint_damping = np.zeros((DOF, DOF))
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
         self._shaper.reset()
-        self._designed_for = None
+        self._designed_for = self._joint_designed_for = None
 
     def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
         """Torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s].
@@ -89,11 +100,27 @@ class ImpedanceController:
     def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
         model = self.model
         model.update_gravity(q)
-        stiffness = reference.joint_stiffness
-        damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(stiffness * model.inertia_diagonal(q))
+        if reference.joint_stiffness is not self._joint_designed_for or self._joint_design_age >= DESIGN_TICKS:
+            self._design_joint(q, reference.joint_stiffness)
+        self._joint_design_age += 1
         error = np.minimum(np.maximum(reference.q - q, -JOINT_CLIP_RAD), JOINT_CLIP_RAD)
-        torque: Array = stiffness * error + damping * (reference.qd - qd) + self._friction(reference.qd)
+        torque: Array = (
+            self._joint_stiffness.dot(error) + self._joint_damping.dot(reference.qd - qd) + self._friction(reference.qd)
+        )
         return torque + model.inverse_dynamics(q, qd, reference.qdd)
+
+    def _design_joint(self, q: Array, stiffness: Array) -> None:
+        """Gains of mode JOINT at a posture, mode by mode bounded as in `_design`."""
+        L = np.linalg.cholesky(self.model.inertia(q))
+        L_inverse = np.linalg.inv(L)
+        squared, V = np.linalg.eigh((L_inverse * stiffness).dot(L_inverse.T))
+        P, P_inverse = L.dot(V), V.T.dot(L_inverse)
+        friction = (P_inverse**2).dot(self.model.viscous_friction)
+        squared = np.minimum(np.maximum(squared, 0.0), np.maximum(SPRING_RATE**2, friction / (4 * DEAD_TIME_S)))
+        damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(squared)
+        self._joint_stiffness = (P * squared).dot(P.T)
+        self._joint_damping = (P * np.maximum(damping - friction, LEAST_DAMPING * damping)).dot(P.T)
+        self._joint_designed_for, self._joint_design_age = stiffness, 0
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
         model = self.model

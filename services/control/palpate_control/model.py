@@ -80,7 +80,7 @@ class ArmModel:
         torque: Array = pin.rnea(self._model, self._data, q, qd, qdd) - self.gravity
         return torque
 
-    def inertia_diagonal(self, q: Array) -> Array:
-        """Diagonal of the joint-space inertia matrix [kg m^2], shape (7,)."""
-        diagonal: Array = pin.crba(self._model, self._data, q).diagonal()
-        return diagonal
+    def inertia(self, q: Array) -> Array:
+        """The joint-space inertia matrix [kg m^2], shape (7, 7)."""
+        inertia: Array = pin.crba(self._model, self._data, q)
+        return inertia

@@ -9,6 +9,7 @@ It publishes and takes exactly the stack's messages under rmw_zenoh's keys and k
 from __future__ import annotations
 
 import argparse
+import gc
 import logging
 import signal
 import sys
@@ -243,6 +244,7 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGINT, stop)
     node = RosNode("lbr_emulator", given.domain, BusOptions(listen=(given.listen,)))
     log.info("an LBR at %s, FRI every %d ms", given.listen, options.period_ms)
+    gc.freeze()  # a controller cabinet does not pause for some 50 ms
     try:
         serve(emulator, Graph(node, options), options, running)
     finally:

@@ -6,6 +6,7 @@ grant, a word at least every half second, and the end.
 
 from __future__ import annotations
 
+import gc
 import json
 from collections.abc import Callable
 from time import monotonic, sleep, time_ns
@@ -74,6 +75,7 @@ class LiveRig(Rig):
     def await_implementation(self, seconds: float, report: Report) -> None:
         """Waits for the role to appear, greets it and starts it. Raises NoBus when nobody comes within `seconds`."""
         report.section("protocol")
+        gc.freeze()  # a full collection in mid-check would keep commands back longer than they are valid
         end = monotonic() + seconds
         while self.role.name not in self._others():
             if monotonic() > end:
