@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pytest
 from palpate_bus import codec
 from palpate_bus.contract import MS, contract
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import CameraTrigger, SurfaceMesh, TFMessage
 from palpate_bus.stamps import header, nanoseconds
 from palpate_camera.service import FRAME, CameraService, create, transform
@@ -16,32 +16,6 @@ from palpate_models.frames import look_at
 from palpate_models.load import exam_input
 from palpate_models.scenario import Pose, Scenario
 from scipy.spatial.transform import Rotation
-
-
-class FakeInbox:
-    """New messages of one step, and the latest of all steps."""
-
-    def __init__(self) -> None:
-        self._latest: dict[str, Any] = {}
-        self._new: dict[str, list[Any]] = {}
-
-    def put(self, **messages: Any) -> FakeInbox:
-        """Messages by topic, with __ for /; what was new before no longer is."""
-        self._new = {topic.replace("__", "/"): [message] for topic, message in messages.items()}
-        self._latest |= {topic: items[-1] for topic, items in self._new.items()}
-        return self
-
-    def latest(self, topic: str) -> Any:
-        return self._latest.get(topic)
-
-    def new(self, topic: str) -> Iterable[Any]:
-        return self._new.get(topic, [])
-
-    def stamp(self, topic: str) -> int | None:
-        return None
-
-    def lost(self, role: str) -> bool:
-        return False
 
 
 def scenario(**camera: Any) -> Scenario:
@@ -64,10 +38,10 @@ def depth(message: Any) -> np.ndarray:
 
 
 def test_idle_until_triggered_then_one_frame_a_tick() -> None:
-    camera, inbox = CameraService(exam_input(Scenario())), FakeInbox()
-    assert camera.step(0, inbox.put(sim__surface=plate())) == {}
-    sent = [camera.step(100 * MS, inbox.put(planning__camera_trigger=trigger(3)))]
-    sent += [camera.step(t * MS, inbox.put()) for t in (200, 300, 400, 500)]
+    camera, inbox = CameraService(exam_input(Scenario())), HandInbox()
+    assert camera.step(0, inbox.receive({"sim/surface": plate()})) == {}
+    sent = [camera.step(100 * MS, inbox.receive({"planning/camera_trigger": trigger(3)}))]
+    sent += [camera.step(t * MS, inbox.receive({})) for t in (200, 300, 400, 500)]
     assert [bool(outbox) for outbox in sent] == [True, True, True, False, False]
     stamps = [nanoseconds(outbox["camera/depth/image_raw"].header.stamp) for outbox in sent[:3]]
     assert stamps == [100 * MS, 200 * MS, 300 * MS]
@@ -75,23 +49,23 @@ def test_idle_until_triggered_then_one_frame_a_tick() -> None:
 
 
 def test_a_new_trigger_replaces_the_burst() -> None:
-    camera, inbox = CameraService(exam_input(Scenario())), FakeInbox()
-    camera.step(0, inbox.put(sim__surface=plate(), planning__camera_trigger=trigger(50)))
-    sent = [camera.step(100 * MS, inbox.put(planning__camera_trigger=trigger(2)))]
-    sent += [camera.step(t * MS, inbox.put()) for t in (200, 300)]
+    camera, inbox = CameraService(exam_input(Scenario())), HandInbox()
+    camera.step(0, inbox.receive({"sim/surface": plate(), "planning/camera_trigger": trigger(50)}))
+    sent = [camera.step(100 * MS, inbox.receive({"planning/camera_trigger": trigger(2)}))]
+    sent += [camera.step(t * MS, inbox.receive({})) for t in (200, 300)]
     assert [bool(outbox) for outbox in sent] == [True, True, False]
 
 
 def test_a_burst_waits_for_the_first_surface() -> None:
-    camera, inbox = CameraService(exam_input(Scenario())), FakeInbox()
-    assert camera.step(0, inbox.put(planning__camera_trigger=trigger(1))) == {}
-    assert camera.step(100 * MS, inbox.put(sim__surface=plate()))
+    camera, inbox = CameraService(exam_input(Scenario())), HandInbox()
+    assert camera.step(0, inbox.receive({"planning/camera_trigger": trigger(1)})) == {}
+    assert camera.step(100 * MS, inbox.receive({"sim/surface": plate()}))
 
 
 def test_messages_are_what_the_contract_says() -> None:
     service = create(Scenario())
     tf = service.start()["tf_static"]
-    sent = service.step(0, FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1)))
+    sent = service.step(0, HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(1)}))
     names = {topic.name for topic in contract().outputs("camera")}
     assert {*sent, "tf_static"} == names
     for name, message in {**sent, "tf_static": tf}.items():
@@ -108,7 +82,7 @@ def test_messages_are_what_the_contract_says() -> None:
 
 def test_an_ideal_camera_measures_the_plate_and_the_table() -> None:
     service = CameraService(exam_input(scenario(noise_scale=0.0)))
-    sent = service.step(0, FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1)))
+    sent = service.step(0, HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(1)}))
     image = depth(sent["camera/depth/image_raw"])
     camera = Scenario().camera
     X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
@@ -135,8 +109,8 @@ def test_the_calibrated_pose_has_the_error_and_the_true_one_takes_the_picture() 
     np.testing.assert_allclose(p, Scenario().camera.position_m)
     np.testing.assert_allclose(R.inv().apply(p_told - p), error.xyz_m, atol=1e-12)
     np.testing.assert_allclose((R.inv() * R_told).as_rotvec(), error.rpy_rad, atol=1e-12)
-    inbox = FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1))
-    a, b = (service.step(0, inbox)["camera/depth/image_raw"].data for service in (good, bad))
+    asked = {"sim/surface": plate(), "planning/camera_trigger": trigger(1)}
+    a, b = (service.step(0, HandInbox().receive(asked))["camera/depth/image_raw"].data for service in (good, bad))
     assert a.tobytes() == b.tobytes()
 
 
@@ -145,9 +119,9 @@ def test_a_link_before_the_abdomen_hides_it() -> None:
     X[:3, 3] = 0.6, -0.1, 1.1
     links = TFMessage([transform(0, "world", "lbr_link_4", X)])
     pictures = []
-    for poses in ({}, {"sim__link_poses": links}):
+    for poses in ({}, {"sim/link_poses": links}):
         service = CameraService(exam_input(scenario(noise_scale=0.0)))
-        inbox = FakeInbox().put(sim__surface=plate(), planning__camera_trigger=trigger(1), **poses)
+        inbox = HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(1), **poses})
         pictures.append(depth(service.step(0, inbox)["camera/depth/image_raw"]))
     without, with_link = pictures
     nearer = with_link < without - 0.05
@@ -158,9 +132,9 @@ def test_a_link_before_the_abdomen_hides_it() -> None:
 
 def test_two_cameras_of_one_seed_send_the_same_bytes() -> None:
     def run(seed: int) -> list[bytes]:
-        service, inbox = create(Scenario(seed=seed)), FakeInbox()
-        inbox.put(sim__surface=plate(), planning__camera_trigger=trigger(3))
-        out = [service.step(0, inbox), *(service.step(t * MS, inbox.put()) for t in (100, 200))]
+        service, inbox = create(Scenario(seed=seed)), HandInbox()
+        inbox.receive({"sim/surface": plate(), "planning/camera_trigger": trigger(3)})
+        out = [service.step(0, inbox), *(service.step(t * MS, inbox.receive({})) for t in (100, 200))]
         return [codec.encode(sent["camera/depth/image_raw"], "sensor_msgs/msg/Image") for sent in out]
 
     assert run(5) == run(5)
@@ -170,4 +144,4 @@ def test_two_cameras_of_one_seed_send_the_same_bytes() -> None:
 def test_a_surface_in_another_frame_is_refused() -> None:
     service = create(Scenario())
     with pytest.raises(ValueError, match=r"sim/surface: header.frame_id = 'abdomen', want 'world'"):
-        service.step(0, FakeInbox().put(sim__surface=plate(frame="abdomen"), planning__camera_trigger=trigger(1)))
+        service.step(0, HandInbox().receive({"sim/surface": plate(frame="abdomen"), "planning/camera_trigger": trigger(1)}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from palpate_bus.conformance import violations
 from palpate_bus.contract import contract
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import (
     CameraInfo,
     CameraTrigger,
@@ -70,22 +70,9 @@ class Port(CameraPort):
         return tree
 
 
-class Inbox:
-    def __init__(self, frames: int = 0) -> None:
-        self.frames = frames
-
-    def new(self, topic: str) -> Iterable[Any]:
-        frames, self.frames = self.frames, 0
-        return [CameraTrigger(header(0), frames)] if frames else []
-
-    def latest(self, topic: str) -> Any | None:
-        return None
-
-    def stamp(self, topic: str) -> int | None:
-        return None
-
-    def lost(self, role: str) -> bool:
-        return False
+def asked(frames: int) -> HandInbox:
+    """An inbox with a trigger for so many frames."""
+    return HandInbox().put("planning/camera_trigger", CameraTrigger(header(0), frames))
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
@@ -107,7 +94,7 @@ def test_what_is_no_depth_image_is_named(encoding: str, step: int, words: str) -
 def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
     port = Port()
     service = RosCameraService(port)
-    inbox = Inbox(frames=2)
+    inbox = asked(2)
     port.waiting = [ros_image()]
     assert service.step(0, inbox) == {}, "taken before the trigger"
     for k in (1, 2):
@@ -138,7 +125,7 @@ def test_a_distorted_image_is_refused_and_said_so() -> None:
     port = Port()
     port.intrinsics = ros_info(d=0.1)
     service = RosCameraService(port)
-    inbox = Inbox(frames=1)
+    inbox = asked(1)
     service.step(0, inbox)
     port.waiting = [ros_image()]
     assert service.step(100_000_000, inbox) == {}
@@ -149,7 +136,7 @@ def test_an_image_that_camera_info_is_not_of_is_refused_and_said_so() -> None:
     port = Port()
     port.intrinsics.width, port.intrinsics.height = 6, 4
     service = RosCameraService(port)
-    inbox = Inbox(frames=1)
+    inbox = asked(1)
     service.step(0, inbox)
     port.waiting = [ros_image()]
     assert service.step(100_000_000, inbox) == {}
@@ -166,7 +153,7 @@ def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
     infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
     service = RosCameraService(ZenohCamera({"PALPATE_CAMERA_ROUTER": endpoint}))
-    inbox = Inbox(frames=1)
+    inbox = asked(1)
     service.step(0, inbox)
     out: Any = {}
     for k in range(1, 200):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable
 
 import numpy as np
 from palpate_bus import codec
 from palpate_bus.codec import Message
 from palpate_bus.contract import MS, contract
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.stamps import duration_message, header
 from palpate_models.lbr import HOME, JOINT_NAMES
@@ -20,27 +20,6 @@ from palpate_control.reference import Extrapolator
 from palpate_control.service import create, setpoint_from
 
 SPEED_MPS = 0.03
-
-
-class _Inbox:
-    """The inputs of one tick."""
-
-    def __init__(self) -> None:
-        self.joints: Message = None
-        self.setpoints: list[Message] = []
-
-    def latest(self, topic: str) -> Message | None:
-        return self.joints
-
-    def new(self, topic: str) -> Iterable[Message]:
-        fresh, self.setpoints = self.setpoints, []
-        return fresh
-
-    def stamp(self, topic: str) -> int | None:
-        return None
-
-    def lost(self, role: str) -> bool:
-        return False
 
 
 def _setpoint(t: int, pose: Pose) -> Message:
@@ -104,12 +83,12 @@ def measure(steps: int = 4000) -> dict[str, float]:
 
     kinds = {name: contract().topics[name].type for name in ("joint_states", "control/joint_torque")}
     state = codec.encode(JointState(header(0), list(JOINT_NAMES), q, qd, np.zeros(7)), kinds["joint_states"])
-    inbox = _Inbox()
+    inbox = HandInbox()
     for k in range(steps):
         if k % 10 == 0:
-            inbox.setpoints = [_setpoint(k * MS, pose)]
+            inbox.events["planning/setpoint"] = [_setpoint(k * MS, pose)]
         with decode:
-            inbox.joints = codec.decode(state, kinds["joint_states"])
+            inbox.messages["joint_states"] = codec.decode(state, kinds["joint_states"])
         with step:
             command = service.step(k * MS, inbox)
         with encode:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pytest
 from palpate_bus import codec
 from palpate_bus.contract import MS, contract
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.stamps import duration_message, header, nanoseconds
 from palpate_control.service import ControlService, create
@@ -16,33 +16,6 @@ from palpate_models.lbr import HOME, JOINT_NAMES
 from palpate_models.scenario import Scenario
 
 EXPIRY = 50 * MS
-
-
-class FakeInbox:
-    """An inbox with messages put in by hand."""
-
-    def __init__(self) -> None:
-        self.messages: dict[str, list[Any]] = {}
-        self.stamps: dict[str, int] = {}
-        self.fresh: dict[str, list[Any]] = {}
-
-    def put(self, topic: str, stamp: int, message: Any) -> None:
-        kind = contract().topics[topic].type
-        self.messages[topic] = codec.decode(codec.encode(message, kind), kind)
-        self.stamps[topic] = stamp
-        self.fresh.setdefault(topic, []).append(self.messages[topic])
-
-    def latest(self, topic: str) -> Any:
-        return self.messages.get(topic)
-
-    def new(self, topic: str) -> Iterable[Any]:
-        return self.fresh.pop(topic, [])
-
-    def stamp(self, topic: str) -> int | None:
-        return self.stamps.get(topic)
-
-    def lost(self, role: str) -> bool:
-        return False
 
 
 def joints(t: int, q: np.ndarray = HOME, names: tuple[str, ...] = JOINT_NAMES) -> Any:
@@ -72,19 +45,19 @@ class Rig:
 
     def __init__(self) -> None:
         self.service: ControlService = create(Scenario())
-        self.inbox = FakeInbox()
+        self.inbox = HandInbox()
         self.t = 0
 
     def tick(self, count: int = 1, message: Any = None, **state: Any) -> Any:
         for _ in range(count):
-            self.inbox.put("joint_states", self.t, message or joints(self.t, **state))
+            self.inbox.put("joint_states", message or joints(self.t, **state), self.t)
             outbox = self.service.step(self.t, self.inbox)
             self.t += MS
         assert set(outbox) == {"control/joint_torque"}
         return outbox["control/joint_torque"]
 
     def send(self, message: Any) -> None:
-        self.inbox.put("planning/setpoint", self.t, message)
+        self.inbox.put("planning/setpoint", message, self.t)
 
 
 @pytest.fixture

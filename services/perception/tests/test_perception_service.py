@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from palpate_bus import codec
 from palpate_bus.contract import MS, contract
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import CameraTrigger, Image, SurfaceMesh, TFMessage
 from palpate_bus.stamps import header
 from palpate_camera.service import CameraService, transform
@@ -22,33 +23,6 @@ from palpate_perception.service import PerceptionService, create, depth_in_metre
 from scipy.interpolate import LinearNDInterpolator
 
 TICK = 100 * MS
-
-
-class FakeInbox:
-    """New messages of one step, and the latest of all steps."""
-
-    def __init__(self, **latest: Any) -> None:
-        self._latest = {topic.replace("__", "/"): message for topic, message in latest.items()}
-        self._new: dict[str, list[Any]] = {}
-        self.gone: set[str] = set()
-
-    def put(self, messages: dict[str, Any]) -> FakeInbox:
-        """Messages by topic; what was new before no longer is."""
-        self._new = {topic: [message] for topic, message in messages.items()}
-        self._latest |= messages
-        return self
-
-    def latest(self, topic: str) -> Any:
-        return self._latest.get(topic)
-
-    def new(self, topic: str) -> Iterable[Any]:
-        return self._new.get(topic, [])
-
-    def stamp(self, topic: str) -> int | None:
-        return None
-
-    def lost(self, role: str) -> bool:
-        return role in self.gone
 
 
 @cache
@@ -78,16 +52,16 @@ def look(case: Scenario, frames: int | None = None, links: Any = None, rises: tu
     exam = exam_input(case)
     camera, perception = CameraService(exam), PerceptionService(exam)
     wanted = frames or case.camera.frames
-    seen = FakeInbox(**({"sim__link_poses": links} if links else {}))
-    heard = FakeInbox(tf_static=camera.start()["tf_static"])
+    seen = HandInbox().receive({"sim/link_poses": links} if links else {})
+    heard = HandInbox().receive(camera.start())
     trigger = {"planning/camera_trigger": CameraTrigger(header(5 * MS), wanted)}
     images: dict[str, Any] = {}
     for k in range(1, wanted + 3):
         start = trigger if k == 1 else {}
-        sent = perception.step(k * TICK, heard.put({**start, **images}))
+        sent = perception.step(k * TICK, heard.receive({**start, **images}))
         if sent:
             return dict(sent)
-        images = dict(camera.step(k * TICK, seen.put({"sim/surface": skin(case, rises[k % len(rises)]), **start})))
+        images = dict(camera.step(k * TICK, seen.receive({"sim/surface": skin(case, rises[k % len(rises)]), **start})))
     raise AssertionError("perception published nothing")
 
 
@@ -289,28 +263,28 @@ def test_frames_older_than_the_trigger_do_not_count() -> None:
     case = scenario()
     exam = exam_input(case)
     camera, perception = CameraService(exam), PerceptionService(exam)
-    inbox = FakeInbox(tf_static=camera.start()["tf_static"])
+    inbox = HandInbox().receive(camera.start())
     old = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 9)}
-    stale = dict(camera.step(TICK, FakeInbox().put(old)))
+    stale = dict(camera.step(TICK, HandInbox().receive(old)))
     again = CameraTrigger(header(TICK + 50 * MS), 1)
-    assert perception.step(2 * TICK, inbox.put({**stale, "planning/camera_trigger": again})) == {}
-    fresh = dict(camera.step(2 * TICK, FakeInbox().put({"planning/camera_trigger": again, "sim/surface": skin(case)})))
-    assert perception.step(3 * TICK, inbox.put(fresh))["perception/targets"].frames_fused == 1
+    assert perception.step(2 * TICK, inbox.receive({**stale, "planning/camera_trigger": again})) == {}
+    fresh = dict(camera.step(2 * TICK, HandInbox().receive({"planning/camera_trigger": again, "sim/surface": skin(case)})))
+    assert perception.step(3 * TICK, inbox.receive(fresh))["perception/targets"].frames_fused == 1
 
 
 def test_without_a_trigger_nothing_is_published() -> None:
     perception, camera = PerceptionService(exam_input(scenario())), CameraService(exam_input(scenario()))
-    inbox = FakeInbox(tf_static=camera.start()["tf_static"])
+    inbox = HandInbox().receive(camera.start())
     wake = {"sim/surface": skin(scenario()), "planning/camera_trigger": CameraTrigger(header(0), 2)}
-    frame = dict(camera.step(0, FakeInbox().put(wake)))
-    assert [perception.step(k * TICK, inbox.put(frame)) for k in range(3)] == [{}, {}, {}]
+    frame = dict(camera.step(0, HandInbox().receive(wake)))
+    assert [perception.step(k * TICK, inbox.receive(frame)) for k in range(3)] == [{}, {}, {}]
 
 
 def test_a_burst_without_frames_is_answered_in_words() -> None:
-    perception, inbox = PerceptionService(exam_input(scenario())), FakeInbox()
-    inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 5)})
+    perception, inbox = PerceptionService(exam_input(scenario())), HandInbox()
+    inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 5)})
     sent = [perception.step(TICK, inbox)]
-    sent += [perception.step(k * TICK, inbox.put({})) for k in range(2, 20)]
+    sent += [perception.step(k * TICK, inbox.receive({})) for k in range(2, 20)]
     (answer,) = [outbox for outbox in sent if outbox]
     targets = answer["perception/targets"]
     assert (len(targets.positions), targets.coverage, targets.frames_fused) == (0, 0.0, 0)
@@ -318,10 +292,10 @@ def test_a_burst_without_frames_is_answered_in_words() -> None:
 
 
 def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
-    perception, inbox = PerceptionService(exam_input(scenario())), FakeInbox()
-    perception.step(TICK, inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 5)}))
+    perception, inbox = PerceptionService(exam_input(scenario())), HandInbox()
+    perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 5)}))
     inbox.gone.add("camera")
-    targets = perception.step(2 * TICK, inbox.put({}))["perception/targets"]
+    targets = perception.step(2 * TICK, inbox.receive({}))["perception/targets"]
     assert targets.message == "nothing seen: the camera's service is gone"
 
 
@@ -329,10 +303,10 @@ def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
     case = scenario()
     camera, perception = CameraService(exam_input(case)), create(case)
     wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 1)}
-    frame = dict(camera.step(TICK, FakeInbox().put(wake)))
-    inbox = FakeInbox()
-    sent = [perception.step(TICK, inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
-    sent += [perception.step(k * TICK, inbox.put(frame if k == 2 else {})) for k in range(2, 15)]
+    frame = dict(camera.step(TICK, HandInbox().receive(wake)))
+    inbox = HandInbox()
+    sent = [perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
+    sent += [perception.step(k * TICK, inbox.receive(frame if k == 2 else {})) for k in range(2, 15)]
     (answer,) = [outbox for outbox in sent if outbox]
     assert "no tf_static" in answer["perception/targets"].message
 
@@ -342,16 +316,16 @@ def test_an_image_that_camera_info_is_not_of_is_answered_in_words(larger: str) -
     case = scenario()
     camera, perception = CameraService(exam_input(case)), create(case)
     wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 2)}
-    frame = dict(camera.step(TICK, FakeInbox().put(wake)))
+    frame = dict(camera.step(TICK, HandInbox().receive(wake)))
     depth, info = frame["camera/depth/image_raw"], frame["camera/depth/camera_info"]
     width, height = int(depth.width), int(depth.height)
     if larger == "info":
         info.width, info.height = 2 * width, 2 * height
     else:
         info.width, info.height = width // 2, height // 2
-    inbox = FakeInbox(tf_static=camera.start()["tf_static"])
-    assert perception.step(TICK, inbox.put({"planning/camera_trigger": CameraTrigger(header(0), 2)})) == {}
-    sent = perception.step(2 * TICK, inbox.put(frame))
+    inbox = HandInbox().receive(camera.start())
+    assert perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 2)})) == {}
+    sent = perception.step(2 * TICK, inbox.receive(frame))
     assert set(sent) == {"perception/targets"}, "answered at once: more frames will not help"
     targets = sent["perception/targets"]
     assert len(targets.positions) == 0

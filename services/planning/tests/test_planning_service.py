@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pytest
 from palpate_bus import codec
 from palpate_bus.contract import contract
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import (
     Findings,
     OperatorRequest,
@@ -31,34 +31,6 @@ Vector3 = codec.message_type("geometry_msgs/msg/Vector3")
 Point = codec.message_type("geometry_msgs/msg/Point")
 Wrench = codec.message_type("geometry_msgs/msg/Wrench")
 OUTPUTS = {topic.name: topic for topic in contract().outputs("planning")}
-
-
-class FakeInbox:
-    """Messages by topic, as a step sees them."""
-
-    def __init__(self) -> None:
-        self.fresh: dict[str, list[Any]] = {}
-        self.last: dict[str, Any] = {}
-        self.gone: set[str] = set()
-
-    def put(self, topic: str, message: Any) -> None:
-        type_name = contract().topics[topic].type
-        message = codec.decode(codec.encode(message, type_name), type_name)
-        self.fresh.setdefault(topic, []).append(message)
-        self.last[topic] = message
-
-    def latest(self, topic: str) -> Any:
-        return self.last.get(topic)
-
-    def new(self, topic: str) -> Iterable[Any]:
-        return self.fresh.get(topic, [])
-
-    def stamp(self, topic: str) -> int | None:
-        message = self.last.get(topic)
-        return None if message is None else nanoseconds(message.header.stamp)
-
-    def lost(self, role: str) -> bool:
-        return role in self.gone
 
 
 def status(t: int, q: np.ndarray, w: np.ndarray, mode: int = RobotStatus.MODE_ACTIVE, reason: str = "") -> Any:
@@ -99,13 +71,13 @@ class BusWorld(World):
         super().__init__(settings)
         self.service = PlanningService(settings)
         self.exam = self.service._exam
-        self.inbox = FakeInbox()
+        self.inbox = HandInbox()
         self.states: list[Any] = []
         self.events: list[str] = []
 
     def step(self) -> Outcome:
         inbox, t = self.inbox, self.t
-        inbox.fresh = {}
+        inbox.events = {}
         X_WI, R_WS = self.kinematics.poses(self.q)
         contact = R_WS.T @ self._touch(X_WI)
         w = np.concatenate((contact, np.zeros(3))) + self.weight.wrench(R_WS) + self.bias
@@ -172,7 +144,7 @@ def test_an_examination_over_messages() -> None:
 
 def test_the_first_step_asks_the_arm_for_nothing() -> None:
     service = create(Scenario(robot=BASE, exam=Exam()))
-    out = sent(service.step(0, FakeInbox()))
+    out = sent(service.step(0, HandInbox()))
     assert out["planning/setpoint"].mode == ControlMode.JOINT
     assert not np.any(out["planning/setpoint"].joint_stiffness)
     assert nanoseconds(out["planning/setpoint"].valid_for) == 250_000_000
@@ -182,7 +154,7 @@ def test_the_first_step_asks_the_arm_for_nothing() -> None:
 
 def test_the_arm_is_held_where_it_was_found() -> None:
     service = create(Scenario(robot=BASE))
-    inbox = FakeInbox()
+    inbox = HandInbox()
     q = np.array(lbr.HOME) + 0.2
     inbox.put("robot/status", status(0, q, np.zeros(6)))
     out = sent(service.step(0, inbox))
@@ -193,11 +165,11 @@ def test_the_arm_is_held_where_it_was_found() -> None:
 @pytest.mark.parametrize("cause", ["hold", "operator", "soft", "robot"])
 def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     service = create(Scenario(robot=BASE))
-    inbox = FakeInbox()
+    inbox = HandInbox()
     q = np.array(lbr.HOME)
     inbox.put("robot/status", status(0, q, np.zeros(6)))
     service.step(10_000_000, inbox)
-    inbox.fresh = {}
+    inbox.events = {}
     if cause == "hold":
         hold = status(10_000_000, q, np.zeros(6), RobotStatus.MODE_SAFE_HOLD, "force 41 N, limit 40 N")
         inbox.put("robot/status", hold)
@@ -205,7 +177,7 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
         inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
     elif cause == "soft":
         soft = SupervisorState(header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0)
-        inbox.put("supervisor/state", soft)
+        inbox.put("supervisor/state", soft, 10_000_000)
     else:
         inbox.gone.add("robot")
     state = sent(service.step(20_000_000, inbox))["exam/state"]
@@ -220,7 +192,7 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
 
 def test_values_that_are_none_are_passed_over() -> None:
     service = create(Scenario(robot=BASE))
-    inbox = FakeInbox()
+    inbox = HandInbox()
     q = np.array(lbr.HOME)
     inbox.put("robot/status", status(0, q, np.zeros(6)))
     service.step(0, inbox)

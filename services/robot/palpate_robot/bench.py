@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from palpate_bus.codec import Message, message_type
-from palpate_bus.service import Inbox
+from palpate_bus.codec import message_type
+from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.stamps import duration_message, header
 from palpate_models import lbr
 from palpate_models.scenario import Scenario
@@ -19,25 +19,6 @@ from palpate_robot.service import create
 
 _MS = 1_000_000
 _ROUNDS = 7
-
-
-class _Fed(Inbox):
-    """An inbox with a fresh command and contact wrench at every tick."""
-
-    def __init__(self) -> None:
-        self.messages: dict[str, Message] = {}
-
-    def latest(self, topic: str) -> Message | None:
-        return self.messages.get(topic)
-
-    def new(self, topic: str) -> Sequence[Message]:
-        return ()
-
-    def stamp(self, topic: str) -> int | None:
-        return None
-
-    def lost(self, role: str) -> bool:
-        return False
 
 
 def _best_us(run: Callable[[], None], count: int) -> float:
@@ -65,7 +46,7 @@ def measure(steps: int = 2000) -> dict[str, float]:
         plant.step(plant.gravity_torque(), force, moment, none)
 
     service = create(scenario)
-    inbox = _Fed()
+    inbox = HandInbox()
     command: Any = message_type("palpation_msgs/msg/JointTorqueCommand")
     wrench: Any = message_type("geometry_msgs/msg/WrenchStamped")
     parts: Any = message_type("geometry_msgs/msg/Wrench")
