@@ -40,7 +40,7 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: install  ## what is generated in docs/
+docs: install  ## docs/topics.md, from the contract
 	$(BIN)/python -m palpate_bus.doc
 
 install: $(VENV)/.installed

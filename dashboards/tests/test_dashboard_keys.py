@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import select
 import signal
 import sys
 import termios
@@ -32,6 +33,7 @@ def in_a_terminal(words: list[str]) -> tuple[int, int]:
     """(process, our end of its terminal)"""
     child, end = pty.fork()
     if child == 0:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # what runs in the background of a shell has it ignored
         os.execv(words[0], words)
     return child, end
 
@@ -40,7 +42,7 @@ def read_until(end: int, done: Callable[[str], bool], patience_s: float = 60.0) 
     text = ""
     until = time.monotonic() + patience_s
     while not done(text):
-        assert time.monotonic() < until, text
+        assert select.select([end], [], [], max(0.0, until - time.monotonic()))[0], text
         try:
             text += os.read(end, 1024).decode()
         except OSError:  # the terminal closes with its process

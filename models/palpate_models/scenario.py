@@ -57,7 +57,7 @@ class Background(_Section):
 
 
 class Stiffness(_Section):
-    """Mechanics of the healthy wall (facts: k_w 1.7e5 N/m^3, l = 15 mm; Prony weights after liver)."""
+    """Mechanics of the healthy wall (k_w 1.7e5 N/m^3, l = 15 mm; Prony weights after liver)."""
 
     k_w_n_per_m3: Annotated[float, Field(ge=1e3, le=1e8)] = 1.7e5
     """Instantaneous Winkler foundation modulus."""

@@ -1,6 +1,6 @@
 """Services of one run at the same virtual addresses: more speed in lockstep on two cores.
 
-Seven Python processes take turns on a core every few hundred microseconds. With address-space randomisation each has the same
+The processes of a run take turns on a core every few hundred microseconds. With address-space randomisation each has the same
 interpreter and libraries at other addresses, so what a core's branch predictor has learnt serves one of them only [A].
 Alternating short runs on an idle machine gave 1.66 and 1.68 times real time without randomisation, 1.28 and 1.25 with it; that
 was with one receiving thread in zenoh, where there are two now. It is left on in secure mode.

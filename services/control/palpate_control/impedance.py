@@ -36,7 +36,7 @@ from palpate_control.safety import LimitRepulsion, TorqueShaper
 Array = NDArray[np.float64]
 
 POSITION_CLIP_M = 0.1
-"""Largest position error that stretches the spring, each axis (facts: CRISP, Mayr JOSS 05194)."""
+"""Largest position error that stretches the spring, each axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use the like)."""
 ROTATION_CLIP_RAD = 0.5
 JOINT_CLIP_RAD = 0.25
 """The same for a joint in mode JOINT."""

@@ -5,7 +5,7 @@ surface. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F 
 
     F_ff = a LP(F)                          feed-forward of the measured force, a < 1: positive feedback of gain below one
     d_c  = d_r + k_i integral(d_r - d) - g  a slow integral for what is left: friction, model error
-    d_r  -> min(target, d (F_max/F_p)^(1/1.45))   the depth at which the force would be F_max (F ~ d^1.45, facts.md)
+    d_r  -> min(target, d (F_max/F_p)^(1/1.45))   the depth at which the force would be F_max (F ~ d^1.45)
     g'   = w (F_p - F_max)/K_z, g >= 0      guard that needs no tissue model: a hard surface, a wrong exponent
 
 with F_p = F + tau dF/dt the force expected when the command takes effect.
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 EXPONENT = 1.45
-"""Local exponent of force against depth, 5 to 15 mm (facts.md)."""
+"""Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
 FORCE_FRACTION = 0.9
 """Part of the working force limit at which depth yields."""
 FEED_FORWARD = 0.9

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,7 @@ from palpate_planning.timing import JointTrajectory, Pace
 from palpate_planning.weight import ToolWeight
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -50,8 +53,11 @@ PALPATING = frozenset({Phase.INDENT, Phase.SCAN, Phase.RETRACT})
 class Exam:
     """Runs one examination. `step` each planning period; `status` says where it stands."""
 
-    def __init__(self, known: ExamInput, *, lockstep: bool = True) -> None:
-        """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes."""
+    def __init__(self, known: ExamInput, *, lockstep: bool = True, worker: Executor | None = None) -> None:
+        """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes. `worker` does it, on one
+        thread.
+        """
+        self._worker = worker or ThreadPoolExecutor(max_workers=1)
         self._known = known
         self._lockstep = lockstep
         self._kinematics = Kinematics(known.robot, known.limits)
@@ -235,11 +241,14 @@ class Exam:
             if float(np.abs(self._follower.q - goal).max()) < AT_HOME_RAD:
                 return True
             start, seen = self._follower.q.copy(), self._seen
-            self._motion = Thought(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen), lockstep=self._lockstep)
+            self._motion = self._think(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen))
         elif self._motion.due(now.t):
             self._follower.start(self._motion.result())
             self._motion = None
         return False
+
+    def _think(self, t: int, budget: int, work: Callable[[], T]) -> Thought[T]:
+        return Thought(self._worker, t, budget, work, lockstep=self._lockstep)
 
     # --- phases -------------------------------------------------------------------------------------------------------
 
@@ -288,7 +297,7 @@ class Exam:
         if self._thought is None:
             seen, start = self._seen, self._follower.q.copy()
             assert seen is not None
-            self._thought = Thought(now.t, PLAN_BUDGET, lambda: self._planner.examination(seen, start), lockstep=self._lockstep)
+            self._thought = self._think(now.t, PLAN_BUDGET, lambda: self._planner.examination(seen, start))
         elif self._thought.due(now.t):
             try:
                 plan = self._thought.result()

@@ -1,6 +1,6 @@
 """Where the tissue begins: zero depth from the onset of force, to correct a camera or registration that is off.
 
-While the indenter sinks slowly, F = a (d - d0)^1.45 (facts.md), so F^(1/1.45) is a straight line over depth that meets
+While the indenter sinks slowly, F = a (d - d0)^1.45, so F^(1/1.45) is a straight line over depth that meets
 zero at d0, the depth below the perceived surface at which tissue begins. Viscosity (0.05 s of it) makes d0 appear early
 by about 0.03 s times the speed. The camera alone is the better judge of fine detail; so the surface is shifted only by an
 offset that cannot be noise.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from palpate_bus.codec import Message
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.priority import WORKER, give_way
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import duration_message, header
 from palpate_models.load import exam_input
@@ -44,7 +46,8 @@ class PlanningService(Service):
         """`lockstep` as in `Exam`."""
         self._known = known
         self._X_WA = np.array(known.X_WA)
-        self._exam = Exam(known, lockstep=lockstep)
+        worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning", initializer=give_way, initargs=(WORKER,))
+        self._exam = Exam(known, lockstep=lockstep, worker=worker)
         self._reading: Reading | None = None
         self._surface: Message | None = None
         self._valid = duration_message(VALID_FOR)

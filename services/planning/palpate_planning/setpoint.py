@@ -26,7 +26,7 @@ class ControlMode(IntEnum):
 
 
 NORMAL_STIFFNESS: Final = 5000.0
-"""K_z [N/m] along the tool: with it depth errs by 0.4 to 1.5 mm even before regulation (facts.md, one-process trial)."""
+"""K_z [N/m] along the tool: with it depth errs by 0.4 to 1.5 mm even before regulation."""
 CARTESIAN_STIFFNESS: Final = _fixed([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
 """[N/m, N m/rad] in axes of the indenter: firm along the tool, yielding across it, softest in the spin that does not matter."""
 DAMPING_RATIO: Final = _fixed([0.8] * 6)

@@ -69,7 +69,7 @@ def seen_dome(settings: ExamInput) -> Seen:
 
 
 def hertz(newton_at_10mm: float) -> Callable[[float], float]:
-    """Force [N] by depth [m] as facts.md has it."""
+    """Force [N] by depth [m] as the tissue's foundation has it."""
     return lambda depth: newton_at_10mm * (max(depth, 0.0) / 0.01) ** 1.45
 
 

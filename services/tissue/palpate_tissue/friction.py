@@ -8,7 +8,7 @@ Vector = tuple[float, float, float]
 
 REFERENCE_K_W = 1.7e5
 REFERENCE_E = 1.0e4
-"""A half-space of 10 kPa is the tissue of k_w = 1.7e5 N/m^3 (design facts: Hertz and this foundation agree at 10 mm)."""
+"""A half-space of 10 kPa is the tissue of k_w = 1.7e5 N/m^3 (`palpate validate`: Hertz and this foundation agree at 10 mm)."""
 REFERENCE_RADIUS_M = 0.012
 """Contact radius at 10 mm depth, about sqrt(R d) for indenters of 15 mm."""
 POISSON = 0.49

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 YOUNG_PA = 1.0e4
 POISSON = 0.49
-"""The half-space that the default wall stands for (design facts: 10 kPa)."""
+"""The half-space that the default wall stands for (10 kPa)."""
 CALIBRATED_RADIUS_M = 0.020
 """The indenter for which k_w and l were chosen."""
 TOLERANCE = 0.10

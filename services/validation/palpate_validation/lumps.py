@@ -1,4 +1,4 @@
-"""Lumps: the tissue against the continuum of its own equations, and what the design table of force ratios stands for."""
+"""Lumps: the tissue against the continuum of its own equations, and what the design's force ratios (`DESIGN`) stand for."""
 
 from __future__ import annotations
 
