@@ -54,8 +54,9 @@ class Exam:
     """Runs one examination. `step` each planning period; `status` says where it stands."""
 
     def __init__(self, known: ExamInput, *, lockstep: bool = True, worker: Executor | None = None) -> None:
-        """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes. `worker` does it, on one
-        thread.
+        """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes.
+
+        `worker` does it, one piece at a time.
         """
         self._worker = worker or ThreadPoolExecutor(max_workers=1)
         self._known = known
