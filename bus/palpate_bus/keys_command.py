@@ -22,9 +22,7 @@ EXIT_BAD_INPUT = 2
 def make(
     folder: Folder = DEFAULT,
     host: Annotated[list[str] | None, typer.Option(help="Name or address of the router; may be repeated.")] = None,
-    name: Annotated[
-        list[str] | None, typer.Option(help="For whom; by default all roles, router, viewer and operator.")
-    ] = None,
+    name: Annotated[list[str] | None, typer.Option(help="For whom; by default all roles, router, viewer and operator.")] = None,
     days: Annotated[int, typer.Option(min=1, help="How long certificates hold.")] = DAYS,
 ) -> None:
     """Make an authority and a certificate a role; what is there and still holds is kept."""
