@@ -17,9 +17,10 @@ import pytest
 import zenoh
 from palpate_bus import codec
 from palpate_bus.composed import Composed
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import MS, Topic, contract
 from palpate_bus.liveliness import NodeTokens
 from palpate_bus.messages import DiagnosticStatus
+from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import NS
 from palpate_bus.transport import Subscription
 from palpate_bus.wire import topic_key
@@ -93,6 +94,24 @@ def composed_hash() -> str:
     run = Composed([*(toy() for toy in toy_services.TOYS.values()), collector])
     assert run.run(lambda: collector.collected.end_tick, 60 * NS) == toy_services.END
     return run.run_hash()
+
+
+def test_composed_an_observer_or_a_tap_that_fails_ends_no_run() -> None:
+    class Blind(Service):
+        role = "dashboard"
+
+        def step(self, t: int, inbox: Inbox) -> Outbox:
+            raise ValueError("nothing to draw on")
+
+    def full(topic: Topic, payload: bytes, t: int, sequence: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    collector = Collector()
+    run = Composed([*(toy() for toy in toy_services.TOYS.values()), Blind(), collector], taps=[full])
+    assert run.run(lambda: collector.collected.end_tick, 60 * NS) == toy_services.END
+    assert run.run_hash() == composed_hash()
+    assert set(run.lost) == {"dashboard", "recorder"}
+    assert any("nothing to draw on" in words for words in run.trouble)
 
 
 def test_composed_and_distributed_give_the_same_run_hash() -> None:

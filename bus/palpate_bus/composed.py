@@ -11,25 +11,34 @@ from typing import Any
 from palpate_bus.contract import MS, Contract, Topic, contract
 from palpate_bus.lockstep import InputBuffer, Received, Sent, Stepper, run_hash
 from palpate_bus.service import Service
+from palpate_bus.suspects import failure
 
 Tap = Callable[[Topic, bytes, int, int], None]
 """Called for every message: topic, payload, stamp [ns], sequence."""
 
 
+CONDUCTOR = "conductor"
+"""The one observer without which there is no result."""
+
+
 class ServiceFailed(RuntimeError):
     """A service raised. Names the role and the tick; the cause is chained."""
 
-    def __init__(self, role: str, t: int, cause: BaseException) -> None:
-        super().__init__(f"{role} failed at tick {t / 1e9:.3f} s: {cause}")
-        self.role = role
+    def __init__(self, stepper: Stepper, t: int, cause: Exception) -> None:
+        self.role = stepper.role.name
         self.t = t
+        self.why = failure(cause, stepper.buffers.values())
+        """The cause, with the inputs that are not as they should be."""
+        super().__init__(f"{self.role} failed at tick {t / 1e9:.3f} s: {self.why}")
 
 
 class Composed:
     """A run of services in this process.
 
     run = Composed([RobotService(...), ...])
-    run.run_until(lambda t: run.end_tick)
+    run.run(lambda: end_tick, limit)
+
+    A service that raises ends the run; an observer or a tap that does is left out from then on (`lost`, `trouble`).
     """
 
     def __init__(self, services: Sequence[Service], rules: Contract | None = None, taps: Sequence[Tap] = ()) -> None:
@@ -47,6 +56,10 @@ class Composed:
         self._schedule = tuple((stepper, stepper.role.period) for stepper in self.steppers.values())
         self._started = False
         self.t = 0
+        self.lost: dict[str, int] = {}
+        """Observers that have failed, and at what tick [ns]."""
+        self.trouble: list[str] = []
+        """A sentence for each."""
 
     def _send(self, sent: Sequence[Sent], t: int) -> None:
         for port, payload, sequence in sent:
@@ -54,7 +67,11 @@ class Composed:
             for buffer in self._readers[port.topic.name]:
                 buffer.deliver(received)
             for tap in self._taps:
-                tap(port.topic, payload, t, sequence)
+                try:
+                    tap(port.topic, payload, t, sequence)
+                except Exception as error:
+                    self._taps = tuple(other for other in self._taps if other is not tap)
+                    self._leave_out("recorder", t, f"{type(error).__name__}: {error}")
 
     def start(self) -> None:
         """Sends the latched messages."""
@@ -62,7 +79,7 @@ class Composed:
             try:
                 self._send(stepper.start(), 0)
             except Exception as error:
-                raise ServiceFailed(stepper.role.name, 0, error) from error
+                raise ServiceFailed(stepper, 0, error) from error
         self._started = True
 
     def tick(self) -> None:
@@ -74,10 +91,18 @@ class Composed:
             try:
                 sent = stepper.step(t)
             except Exception as error:
-                raise ServiceFailed(stepper.role.name, t, error) from error
+                if not stepper.role.observer or stepper.role.name == CONDUCTOR:
+                    raise ServiceFailed(stepper, t, error) from error
+                self._schedule = tuple(entry for entry in self._schedule if entry[0] is not stepper)
+                self._leave_out(stepper.role.name, t, failure(error, stepper.buffers.values()))
+                continue
             if sent:
                 self._send(sent, t)
         self.t = t + MS
+
+    def _leave_out(self, role: str, t: int, why: str) -> None:
+        self.lost[role] = t
+        self.trouble.append(f"{role} lost at tick {t / 1e9:.3f} s: {why}")
 
     def run(self, end: Callable[[], int | None], limit: int) -> int:
         """Runs up to and including the tick [ns] that `end()` gives once it knows, at most to `limit`; returns the last tick."""

@@ -21,6 +21,7 @@ from palpate_bus.member import Member
 from palpate_bus.messages import Advance, RunControl, ServiceReport
 from palpate_bus.outlet import Outlet
 from palpate_bus.service import Service
+from palpate_bus.suspects import failure
 from palpate_bus.transport import Sample
 
 log = logging.getLogger(__name__)
@@ -137,7 +138,10 @@ class LockstepNode:
         except Exception as error:
             with suppress(Exception):
                 self._outlet.flush(self._tick)  # what others have heard belongs in the recording
-            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": f"{type(error).__name__}: {error}"})
+            words = failure(error, self._stepper.buffers.values())
+            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
+            with suppress(Exception):
+                self._service.finish()  # what it has open is closed
             raise
 
     def _handshake(self) -> None:

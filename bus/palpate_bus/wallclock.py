@@ -24,6 +24,7 @@ from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.outlet import Outlet
 from palpate_bus.priority import by_period, give_way
 from palpate_bus.service import Service
+from palpate_bus.suspects import failure
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +83,10 @@ class WallClockNode:
         except Exception as error:
             with suppress(Exception):
                 self._outlet.flush(self._tick)  # what others have heard belongs in the recording
-            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": f"{type(error).__name__}: {error}"})
+            words = failure(error, self._stepper.buffers.values())
+            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
+            with suppress(Exception):
+                self._service.finish()  # what it has open is closed
             raise
 
     def _await_start(self) -> int:

@@ -109,7 +109,7 @@ class Tissue(Service):
         x = float(np.cos(inbox.latest("sim/tool_state").pose.position.x))
         out: dict[str, Any] = {"sim/contact_wrench": WrenchStamped(h, wrench(x))}
         if t % (10 * MS) == 0:
-            out["truth/indentation"] = IndentationTruth(h, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
+            out["truth/indentation"] = IndentationTruth(h, 0.0, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
         if t % (50 * MS) == 0:
             vertices = np.full(9000, x, np.float32)
             out["sim/surface"] = SurfaceMesh(h, vertices, np.zeros(0, np.float32), np.zeros(18000, np.uint32))

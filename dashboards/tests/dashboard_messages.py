@@ -233,7 +233,9 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
             "sim/link_poses": transforms(t, poses),
             "sim/surface": surface(t, moved.astype(np.float32), triangles, "world"),
             "exam/state": exam(t, phase, "scanning line 3" if pressing else "", depth, force, int(200 * s)),
-            "truth/indentation": m.IndentationTruth(header(t, "world"), depth, force, 0.3, 9, _Point(0.0, 0.0, 0.0), 1.7e5),
+            "truth/indentation": m.IndentationTruth(
+                header(t, "world"), depth, force, 0.3, force, 9, _Point(0.0, 0.0, 0.0), 1.7e5
+            ),
             "robot/status": robot_status(t, 20.0 * np.sin(6 * s + np.arange(7.0))),
             "clock": message_type("rosgraph_msgs/msg/Clock")(time_message(t)),
         }

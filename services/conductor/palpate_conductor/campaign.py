@@ -91,8 +91,8 @@ class Finding:
     reaction: str = ""
     """What the arm did."""
     peak_force_before_n: float = 0.0
-    peak_force_n: float = 0.0
-    """Highest true force after the damage."""
+    peak_force_n: float | None = 0.0
+    """Highest true contact force after the damage, every step of the tissue counted; None where nothing tells it."""
     ended: str = ""
     """How the run ended: complete, or the cause."""
     named: bool = False
@@ -106,7 +106,7 @@ class Finding:
         return (
             self.injected_s is not None
             and not self.hung
-            and self.peak_force_n <= FORCE_LIMIT_N
+            and (self.peak_force_n or 0.0) <= FORCE_LIMIT_N
             and (self.ended in UNHARMED or self.named)
         )
 
@@ -262,9 +262,10 @@ def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
             finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
             finding.sign = watch.signs[0] if watch.signs else str(result.failure)
     split = (finding.injected_s or 0.0) * NS
-    forces = [(nanoseconds(m.header.stamp), float(m.normal_force)) for m in collected.indentation]
+    forces = [(nanoseconds(m.header.stamp), float(m.peak_force)) for m in collected.indentation]
     finding.peak_force_before_n = round(max((f for t, f in forces if t < split), default=0.0), 2)
-    finding.peak_force_n = round(max((f for t, f in forces if t >= split), default=0.0), 2)
+    after = [force for t, force in forces if t >= split]
+    finding.peak_force_n = round(max(after), 2) if after else None
     exam = collected.exam
     done = exam is not None and exam.phase == ExamState.PHASE_DONE
     finding.ended = result.failure or (COMPLETE if done else str(exam.message if exam is not None else "never began"))
@@ -274,8 +275,7 @@ def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
     said = [finding.sign, finding.ended, *watch.signs]
     words = " ".join(re.sub(r"^(supervisor|driver|planning): ", "", sentence) for sentence in said)  # not who said it
     producer = contract().topics[finding.where].producer if finding.where in contract().topics else finding.where
-    readers = contract().topics[finding.where].readers if finding.where in contract().topics else {}
-    finding.named = any(name in words for name in (finding.where, producer, *readers))
+    finding.named = any(re.search(rf"(?<![\w/]){name}(?!\w)", words) for name in (finding.where, producer))
 
 
 def _reaction(collected: Any, ended: str) -> str:

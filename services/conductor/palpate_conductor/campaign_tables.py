@@ -34,7 +34,7 @@ def table(findings: Sequence[Finding]) -> Table:
 def markdown(findings: Sequence[Finding]) -> str:
     """For the documentation: a summary, and every case folded away."""
     good = sum(f.good for f in findings)
-    largest = max((f.peak_force_n for f in findings), default=0.0)
+    largest = max((f.peak_force_n or 0.0 for f in findings), default=0.0)
     lines = [f"{good} of {len(findings)} as they should be; the largest force was {largest:.1f} N.", ""]
     lines += _markdown_table(SUMMARY, _summary(findings))
     lines += ["", "<details><summary>Every case</summary>", ""]
@@ -67,7 +67,7 @@ def _summary(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
                 str(sum(f.good for f in cases)),
                 str(len(after)),
                 f"{median(after):.0f}, {max(after):.0f}" if after else "",
-                f"{max(f.peak_force_n for f in cases):.1f}",
+                f"{max(f.peak_force_n or 0.0 for f in cases):.1f}",
                 ", ".join(f"{outcome} {count}" for outcome, count in sorted(outcomes.items(), key=lambda item: -item[1])),
             )
         )
@@ -76,7 +76,8 @@ def _summary(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
 
 def _row(finding: Finding) -> tuple[str, ...]:
     after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
-    force = f"{finding.peak_force_before_n:.1f}, {finding.peak_force_n:.1f} N"
+    after = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
+    force = f"{finding.peak_force_before_n:.1f}, {after}"
     return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
 
 

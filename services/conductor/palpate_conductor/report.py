@@ -125,7 +125,7 @@ class Report(_Row):
     samples: int
     skipped_targets: int
     max_force_N: float | None
-    """Greatest true normal force of the run."""
+    """Greatest true contact force of the run, every step of the tissue counted; without a truth, the measured normal force."""
     mean_force_N: float | None
     """Mean measured normal force in steady contact."""
     depth_rms_error_m: float | None
@@ -158,7 +158,7 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
     if truth is not None and final is not None:
         scores = ScoresRow.model_validate(vars(scoring.score(centroids_of(final), found, truth)))
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
-    forces = [m.normal_force for m in c.indentation] or [s.normal_force for s in c.exam_states if s.in_contact]
+    forces = [m.peak_force for m in c.indentation] or [s.normal_force for s in c.exam_states if s.in_contact]
     return Report(
         scenario=scenario.name,
         seed=scenario.seed,

@@ -265,7 +265,7 @@ def run_composed(
         now = perf_counter()
         if now - told > 0.1:
             told = now
-            tell(Progress(run.t, run.t / NS / (now - start), collector.collected))
+            tell(Progress(run.t, run.t / NS / (now - start), collector.collected, tuple(run.trouble)))
         return collector.collected.end_tick
 
     lost: dict[str, int] = {}
@@ -276,7 +276,7 @@ def run_composed(
         interrupted = True
         failure, last = f"interrupted at tick {run.t / NS:.3f} s", run.t
     except ServiceFailed as error:
-        failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.__cause__}"
+        failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.why}"
         lost = {error.role: error.t}
         last = error.t
     wall = perf_counter() - start
@@ -295,6 +295,6 @@ def run_composed(
         blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
         counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
         failure=failure or _given_up(collector.collected),
-        lost=lost,
+        lost={**run.lost, **lost},
         interrupted=interrupted,
     )

@@ -127,6 +127,7 @@ def indentation(depth_error: float) -> list[Any]:
             depth=0.01 + depth_error if k >= 10 else 0.001,
             normal_force=7.0 if k == 50 else 2.4,
             tangential_force=0.5,
+            peak_force=7.2 if k == 50 else 2.5,
             contacts=20,
             surface_point=_Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
             stiffness=6.8e5,

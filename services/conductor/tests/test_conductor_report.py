@@ -45,7 +45,7 @@ def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
     assert written["findings"][0]["centroid_m"][:2] == pytest.approx(FOUND)
     assert written["truth"]["lesions"][0]["quadrant"] == "RLQ"
     assert written["real_time_factor"] == pytest.approx(4.0)
-    assert written["max_force_N"] == pytest.approx(7.0)
+    assert written["max_force_N"] == pytest.approx(7.2)
     assert written["mean_force_N"] == pytest.approx(2.5)
     assert (written["scores"]["matched"], written["scores"]["missed"], written["scores"]["false_positives"]) == (1, 0, 0)
     assert written["scores"]["localisation_error_m"] == pytest.approx(0.004, abs=1e-3)

@@ -48,10 +48,10 @@ STICTION_SPEED = 0.02
 """Joint speed at which half of the Coulomb friction is compensated [rad/s]; keeps the compensation smooth."""
 LEAST_DAMPING = 0.1
 """Part of the designed damping that is commanded even where friction alone would do: friction is known badly."""
-DEAD_TIME_S = 2e-3
+DEAD_TICKS = 2
 """From measuring to acting: a tick of transport, one of holding the torque, half of velocity's age, rounded up."""
-SPRING_RATE = 150.0
-"""Fastest undamped frequency of a spring [rad/s], 0.3 over the dead time: past it sampled damping adds energy."""
+SPRING_ANGLE = 0.3
+"""Fastest undamped frequency of a spring, times the dead time [rad]: past it sampled damping adds energy."""
 REGULARISATION = 1e-3
 """Added to a matrix of the task [1/kg, 1/(kg m^2)] where it has lost rank."""
 DESIGN_TICKS = 10
@@ -61,11 +61,13 @@ DESIGN_TICKS = 10
 class ImpedanceController:
     """The control law with its safety net. One instance an arm: it remembers the torque before, for the rate limit."""
 
-    def __init__(self, model: ArmModel, limit_zone: float = 0.05) -> None:
-        """A controller on `model`, with joint-limit repulsion in the last `limit_zone` [rad]."""
+    def __init__(self, model: ArmModel, limit_zone: float = 0.05, period_s: float = 1e-3) -> None:
+        """A controller on `model`, called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad]."""
         self.model = model
         self._repulsion = LimitRepulsion(model.position_lower, model.position_upper, model.torque_limit, limit_zone)
-        self._shaper = TorqueShaper(model.torque_limit)
+        self._shaper = TorqueShaper(model.torque_limit, period_s)
+        self._dead_time = DEAD_TICKS * period_s
+        self._spring_rate = SPRING_ANGLE / self._dead_time
         self._clip = np.array([POSITION_CLIP_M] * 3 + [ROTATION_CLIP_RAD] * 3)
         self._J, self._JW, self._slow_inertia = np.zeros((6, DOF)), np.zeros((6, DOF)), np.zeros((6, 6))  # in D's axes
         self._designed_for: Array | None = None
@@ -116,7 +118,7 @@ class ImpedanceController:
         squared, V = np.linalg.eigh((L_inverse * stiffness).dot(L_inverse.T))
         P, P_inverse = L.dot(V), V.T.dot(L_inverse)
         friction = (P_inverse**2).dot(self.model.viscous_friction)
-        squared = np.minimum(np.maximum(squared, 0.0), np.maximum(SPRING_RATE**2, friction / (4 * DEAD_TIME_S)))
+        squared = np.minimum(np.maximum(squared, 0.0), np.maximum(self._spring_rate**2, friction / (4 * self._dead_time)))
         damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(squared)
         self._joint_stiffness = (P * squared).dot(P.T)
         self._joint_damping = (P * np.maximum(damping - friction, LEAST_DAMPING * damping)).dot(P.T)
@@ -169,7 +171,8 @@ class ImpedanceController:
         friction = (self._slow_inertia.diagonal() - inertia) / SLOW_S
         # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
         mass = np.minimum(inertia, 4 / mobility.diagonal())
-        self._stiffness = np.minimum(reference.stiffness, np.maximum(SPRING_RATE**2 * mass, friction / (4 * DEAD_TIME_S)))
+        bound = np.maximum(self._spring_rate**2 * mass, friction / (4 * self._dead_time))
+        self._stiffness = np.minimum(reference.stiffness, bound)
         damping = 2 * reference.damping_ratio * np.sqrt(self._stiffness * mass)
         self._damping = np.maximum(damping - friction, LEAST_DAMPING * damping)
         free = joint_mobility.diagonal()

@@ -33,10 +33,10 @@ class LimitRepulsion:
 class TorqueShaper:
     """Saturates torques at the joints' limits, gravity counted in, and bounds their change from tick to tick."""
 
-    def __init__(self, torque_limit: Array, rate: float = TORQUE_RATE_NM) -> None:
-        """Torque limits [N m], shape (7,); `rate` [N m] a tick."""
+    def __init__(self, torque_limit: Array, period_s: float = 1e-3) -> None:
+        """Torque limits [N m], shape (7,), at one torque every `period_s`."""
         self._limit = torque_limit
-        self._rate = rate
+        self._rate = TORQUE_RATE_NM * period_s / 1e-3
         self._last = np.zeros_like(torque_limit)
 
     def reset(self) -> None:

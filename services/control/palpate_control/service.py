@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
+from palpate_bus import codec
 from palpate_bus.codec import Message
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import JointTorqueCommand
+from palpate_bus.messages import ImpedanceSetpoint, JointTorqueCommand, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_bus.stamps import NS, duration_message, header, nanoseconds
 from palpate_models.lbr import HOME, JOINT_NAMES, urdf
 from palpate_models.load import exam_input
 from palpate_models.scenario import Limits, Robot, Scenario
@@ -21,6 +22,8 @@ from palpate_control.model import DOF, ArmModel
 from palpate_control.reference import Extrapolator, Mode, Setpoint, rotation_from_quaternion
 
 _NAMES = list(JOINT_NAMES)
+AHEAD = 500 * MS
+"""A set-point whose stamp is further in the future is refused: it would keep all later ones waiting."""
 
 
 class ControlService(Service):
@@ -38,9 +41,9 @@ class ControlService(Service):
 
     def __init__(self, robot: Robot, limits: Limits) -> None:
         self.model = ArmModel(urdf(robot))
-        self._controller = ImpedanceController(self.model, limits.joint_margin_rad)
-        self._reference = Extrapolator()
         topics = contract().topics
+        self._controller = ImpedanceController(self.model, limits.joint_margin_rad, contract().roles[self.role].period / NS)
+        self._reference = Extrapolator()
         self._setpoint_expiry = (topics["planning/setpoint"].expiry_ms or 0) * MS
         self._joint_states_age = (topics["joint_states"].max_age_ms or 0) * MS
         self._validity = (topics["control/joint_torque"].expiry_ms or 0) * MS
@@ -63,15 +66,26 @@ class ControlService(Service):
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Compiles the law in both modes now: at 1 kHz there is no time for it."""
-        rest = np.zeros(DOF)
+        """Compiles the law in both modes now, on set-points as they come from the bus: at 1 kHz there is no time for it."""
+        kind, rest, still = "palpation_msgs/msg/ImpedanceSetpoint", np.zeros(DOF), Vector3(0.0, 0.0, 0.0)
+        pose = Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
         for mode in Mode:
             guide = Extrapolator()
             for stamp in (0, MS):
-                still, gains = np.zeros(6), np.ones(6)
-                guide.accept(
-                    Setpoint(mode, stamp, np.eye(3), np.zeros(3), still, still, gains, gains, rest, rest, np.ones(DOF)), stamp
+                message = ImpedanceSetpoint(
+                    header(stamp, "world"),
+                    int(mode),
+                    pose,
+                    Twist(still, still),
+                    Wrench(still, still),
+                    np.ones(6),
+                    np.ones(6),
+                    rest,
+                    rest,
+                    np.ones(DOF),
+                    self._valid,
                 )
+                guide.accept(setpoint_from(codec.decode(codec.encode(message, kind), kind)), stamp)
                 self._controller.torque(np.array(HOME), rest, guide.at(stamp))
         self._controller.reset()
 
@@ -116,17 +130,25 @@ class ControlService(Service):
         try:
             setpoint = setpoint_from(message)
         except ValueError as error:
-            self._facts["setpoints_rejected"] += 1
-            self._refused = f"planning/setpoint refused: {error}"
-            self._problem = f"at {t} ns: {self._refused}"
+            self._refuse(t, str(error))
             return
+        if setpoint.stamp > t + AHEAD:
+            self._refuse(t, f"stamped {(setpoint.stamp - t) / MS:.0f} ms ahead, limit {AHEAD / MS:.0f} ms")
+            return
+        while self._coming and self._coming[-1].stamp >= setpoint.stamp:
+            self._coming.pop()  # planning's clock was set back: its newest word counts
         self._refused = self._ceased = ""
         self._facts["setpoints"] += 1
         if self._reference.current is None and not self._coming:
             self._reference.accept(setpoint, t)
         else:
             self._coming.append(setpoint)
-        self._expires = setpoint.stamp + min(nanoseconds(message.valid_for), self._setpoint_expiry)
+        self._expires = min(setpoint.stamp, t) + min(nanoseconds(message.valid_for), self._setpoint_expiry)
+
+    def _refuse(self, t: int, why: str) -> None:
+        self._facts["setpoints_rejected"] += 1
+        self._refused = f"planning/setpoint refused: {why}"
+        self._problem = f"at {t} ns: {self._refused}"
 
     def _stand(self, t: int, problem: str) -> Outbox:
         """The last torque for as long as it is valid, then as `_cease`."""
@@ -157,7 +179,10 @@ class ControlService(Service):
 
 
 def setpoint_from(message: Message) -> Setpoint:
-    """The arrays of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field that is not usable."""
+    """The arrays of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field that is not usable.
+
+    They are copies: views of the message's bytes would be of another type to compiled code.
+    """
     p, o = message.pose.position, message.pose.orientation
     v, w = message.twist.linear, message.twist.angular
     f, m = message.wrench.force, message.wrench.torque
@@ -170,11 +195,11 @@ def setpoint_from(message: Message) -> Setpoint:
         p_WD=np.array([p.x, p.y, p.z]),
         V_WD=np.array([v.x, v.y, v.z, w.x, w.y, w.z]),
         F_W=np.array([f.x, f.y, f.z, m.x, m.y, m.z]),
-        stiffness=np.asarray(message.stiffness, dtype=np.float64),
-        damping_ratio=np.asarray(message.damping_ratio, dtype=np.float64),
-        q=np.asarray(message.joint_position, dtype=np.float64),
-        qd=np.asarray(message.joint_velocity, dtype=np.float64),
-        joint_stiffness=np.asarray(message.joint_stiffness, dtype=np.float64),
+        stiffness=np.array(message.stiffness, dtype=np.float64),
+        damping_ratio=np.array(message.damping_ratio, dtype=np.float64),
+        q=np.array(message.joint_position, dtype=np.float64),
+        qd=np.array(message.joint_velocity, dtype=np.float64),
+        joint_stiffness=np.array(message.joint_stiffness, dtype=np.float64),
     )
 
 

@@ -11,6 +11,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_control import extrapolation, kernel
 from palpate_control.service import ControlService, create
 from palpate_models.lbr import HOME, JOINT_NAMES
 from palpate_models.scenario import Scenario
@@ -224,3 +225,36 @@ def test_late_states_wind_no_spring_up() -> None:
 def test_an_arm_that_lags_by_more_than_a_setpoints_spacing_is_followed_in_its_own_time() -> None:
     """A plant on a busy machine falls behind tick by tick, here to 100 ms: nothing of that is an error of the arm."""
     assert peak_on_the_way(0, lagging=True) < peak_on_the_way(0) + 1.0
+
+
+def test_nothing_is_compiled_in_mid_run(rig: Rig) -> None:
+    """Arrays as they come from the bus are of the types that the warm-up has compiled for."""
+    functions = [f for module in (kernel, extrapolation) for f in vars(module).values() if hasattr(f, "signatures")]
+    assert functions
+    before = [len(f.signatures) for f in functions]
+    for k in range(4):
+        mode = ImpedanceSetpoint.MODE_CARTESIAN if k >= 2 else ImpedanceSetpoint.MODE_JOINT
+        rig.send(setpoint(rig.t - 10 * MS, mode=mode))
+        rig.tick(10)
+    assert rig.service.finish()["setpoints"] == 4
+    assert [len(f.signatures) for f in functions] == before
+
+
+def test_a_setpoint_of_the_far_future_is_refused_and_holds_up_no_other(rig: Rig) -> None:
+    rig.send(setpoint(0))
+    before = rig.tick(20).torque[0]
+    rig.send(setpoint(rig.t + 3_600_000 * MS))
+    rig.tick()
+    assert "ms ahead, limit 500 ms" in rig.service.finish()["problem"]
+    rig.send(setpoint(rig.t, joint_position=np.array(HOME) - 0.1))
+    command = rig.tick(40)
+    assert valid_for(command) == EXPIRY
+    assert np.sign(command.torque[0]) == -np.sign(before)
+
+
+def test_a_setpoint_after_planning_s_clock_was_set_back_counts(rig: Rig) -> None:
+    rig.send(setpoint(0))
+    before = rig.tick(20).torque[0]
+    rig.send(setpoint(rig.t + 400 * MS))
+    rig.send(setpoint(rig.t, joint_position=np.array(HOME) - 0.1))
+    assert np.sign(rig.tick(40).torque[0]) == -np.sign(before)

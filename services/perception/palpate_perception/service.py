@@ -133,7 +133,7 @@ def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
     elif burst.waiting and inbox.latest("tf_static") is None:
         why = "frames came, but no tf_static with the camera's pose"
     elif burst.waiting:
-        why = f"frames came, but no camera_info or no pose of {burst.waiting[0].header.frame_id!r} in world"
+        why = f"frames came, but no camera/depth/camera_info or no pose of {burst.waiting[0].header.frame_id!r} in world"
     else:
         why = f"no frame on camera/depth/image_raw within {PATIENCE_NS / NS:.0f} s of the expected end of the burst"
     empty = Cloud(np.empty((0, 3)), np.empty(0), np.empty((0, 2), np.intp))

@@ -121,10 +121,12 @@ class Watch:
     def _speed(self, tool: Tool) -> list[Breach]:
         free = self._limits.speed_mps * SPEED_MARGIN
         if tool.speed > free:
-            return [Breach(Level.EMERGENCY, Cause.SPEED, f"tool moves at {tool.speed:.2f} m/s, limit {free:.2f} m/s")]
+            words = f"robot/status: tool moves at {tool.speed:.2f} m/s, limit {free:.2f} m/s"
+            return [Breach(Level.EMERGENCY, Cause.SPEED, words)]
         contact = self._limits.contact_speed_mps
         if tool.force > CONTACT_N and tool.speed > contact:
-            words = f"tool moves at {tool.speed:.2f} m/s with {tool.force:.1f} N on it, limit in contact {contact:.2f} m/s"
+            words = f"robot/status: tool moves at {tool.speed:.2f} m/s with {tool.force:.1f} N on it"
+            words += f", limit in contact {contact:.2f} m/s"
             return [Breach(Level.EMERGENCY, Cause.SPEED, words)]
         return []
 

@@ -60,7 +60,7 @@ class TissueService(Service):
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
         self._p_WA = self._X_WA[:3, 3].copy()
         self._triangles = self._model.triangles.astype(np.uint32).ravel()
-        self._peak_n = 0.0
+        self._peak_n = self._recent_peak_n = 0.0
         self._contact_steps = 0
         self._onsets = 0
         self._touching = False
@@ -116,6 +116,7 @@ class TissueService(Service):
             outbox["sim/surface"] = self._surface_message(t)
         if t % self._truth_period == 0:
             outbox["truth/indentation"] = self._truth(t, tool, force_W)
+            self._peak_n, self._recent_peak_n = max(self._peak_n, self._recent_peak_n), 0.0
         if outbox:
             yield outbox
 
@@ -123,7 +124,7 @@ class TissueService(Service):
         """Facts about the body and the contact."""
         return {
             **self._facts,
-            "peak_force_n": round(self._peak_n, 4),
+            "peak_force_n": round(max(self._peak_n, self._recent_peak_n), 4),
             "contact_steps": self._contact_steps,
             "contact_onsets": self._onsets,
         }
@@ -133,7 +134,7 @@ class TissueService(Service):
         if touching:
             self._contact_steps += 1
             self._onsets += not self._touching
-            self._peak_n = max(self._peak_n, float(np.dot(force_W, force_W)) ** 0.5)
+            self._recent_peak_n = max(self._recent_peak_n, float(np.dot(force_W, force_W)) ** 0.5)
         self._touching = touching
 
     def _surface_message(self, t: int) -> Message:
@@ -144,7 +145,7 @@ class TissueService(Service):
 
     def _truth(self, t: int, tool: Message | None, force_W: Array) -> Message:
         if tool is None:
-            return _IndentationTruth(header(t, "world"), _OUT_OF_REACH_M, 0.0, 0.0, 0, _Point(0.0, 0.0, 0.0), 0.0)
+            return _IndentationTruth(header(t, "world"), _OUT_OF_REACH_M, 0.0, 0.0, 0.0, 0, _Point(0.0, 0.0, 0.0), 0.0)
         position = tool.pose.position
         p_A = self._R_AW @ (np.array((position.x, position.y, position.z)) - self._p_WA)
         under = self._surface.nearest(p_A, self._tissue.excursion(t / NS))
@@ -157,6 +158,7 @@ class TissueService(Service):
             float(tool.radius) - under.height,
             max(normal_force, 0.0),
             tangential,
+            self._recent_peak_n,
             len(self._tissue.contacts),
             _Point(*point_W.tolist()),
             under.stiffness,
