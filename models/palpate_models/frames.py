@@ -44,6 +44,8 @@ def look_at(position: Array, target: Array) -> Array:
     z = target - position
     z = z / np.linalg.norm(z)
     x = np.cross(z, (0.0, 0.0, 1.0))
+    if np.linalg.norm(x) < 1e-9:  # straight up or down: world's y is up in the picture
+        x = np.cross(z, (0.0, 1.0, 0.0))
     x = x / np.linalg.norm(x)
     X = np.eye(4)
     X[:3, :3] = np.column_stack((x, np.cross(z, x), z))

@@ -8,12 +8,17 @@ x to the patient's left, y to the head, z outward.
 from __future__ import annotations
 
 from enum import StrEnum
+from math import dist
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Length = Annotated[float, Field(gt=0, le=1)]
+"""[m], of something about a patient: millimetres are refused."""
+Force = Annotated[float, Field(gt=0, le=100)]
+"""[N]."""
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
@@ -34,10 +39,10 @@ class Lesion(_Section):
 
     centre_m: Vec2
     """Centre, x to the patient's left and y to the head, from the umbilicus."""
-    radii_m: tuple[Positive, Positive] = (0.03, 0.03)
+    radii_m: tuple[Length, Length] = (0.03, 0.03)
     """Half axes of the half-contrast outline."""
-    contrast: Annotated[float, Field(gt=0, le=20)] = 4.0
-    """Stiffness at its centre over the stiffness without it."""
+    contrast: Annotated[float, Field(gt=1, le=20)] = 4.0
+    """Stiffness at its centre over the stiffness without it. What is looked for, and scored, is stiffer than its surroundings."""
     edge_m: Positive = 0.008
     """Width of the smooth edge."""
     depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
@@ -104,7 +109,7 @@ class Phantom(_Section):
     kind: Literal["parametric", "mesh"] = "parametric"
     mesh: str | None = None
     """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
-    size_m: tuple[Positive, Positive, Positive] = (0.36, 0.46, 0.20)
+    size_m: tuple[Length, Length, Length] = (0.36, 0.46, 0.20)
     """Width, length and height of the parametric abdomen."""
     edge_m: Annotated[float, Field(ge=0.0025, le=0.02)] = 0.005
     """Longest mesh edge in the examined region."""
@@ -146,7 +151,7 @@ class Exam(_Section):
     """Distance of scan lines, and of points on a line."""
     speed_mps: Annotated[float, Field(ge=0.005, le=0.1)] = 0.03
     """Tangential speed in contact."""
-    region_m: tuple[Positive, Positive] = (0.20, 0.20)
+    region_m: tuple[Length, Length] = (0.20, 0.20)
     """Width (x) and height (y) of the examined region about `centre_m`."""
     centre_m: Vec2 = (0.0, 0.0)
     """Centre of the region in the abdomen frame."""
@@ -204,23 +209,27 @@ class Camera(_Section):
     def _recording(self) -> Camera:
         if (self.implementation == "replay") != (self.recording is not None):
             raise ValueError("camera.implementation: replay needs camera.recording: FILE, and camera.recording needs it")
+        if dist(self.position_m, self.look_at_m) < 0.1:
+            raise ValueError(
+                f"camera.position_m {self.position_m} and look_at_m {self.look_at_m}: want at least 0.1 m between them"
+            )
         return self
 
 
 class Limits(_Section):
     """Operating limits that we set (no claim of compliance with ISO/TS 15066)."""
 
-    force_working_n: Positive = 15.0
+    force_working_n: Force = 15.0
     """At this force depth yields."""
-    force_soft_stop_n: Positive = 25.0
+    force_soft_stop_n: Force = 25.0
     """The exam retreats along the normal."""
-    force_emergency_n: Positive = 40.0
+    force_emergency_n: Force = 40.0
     """The driver holds safely."""
-    depth_m: Positive = 0.020
-    joint_margin_rad: NonNegative = 0.05
-    speed_mps: Positive = 0.5
+    depth_m: Annotated[float, Field(gt=0, le=0.05)] = 0.020
+    joint_margin_rad: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    speed_mps: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Of the tool in free motion."""
-    contact_speed_mps: Positive = 0.25
+    contact_speed_mps: Annotated[float, Field(gt=0, le=0.5)] = 0.25
     """Of the tool while it presses: at this the supervisor stops."""
     workspace_min_m: Vec3 = (-0.7, -0.6, -0.1)
     """Least x, y, z of the tool in the abdomen frame ..."""
@@ -235,6 +244,11 @@ class Limits(_Section):
     def _order(self) -> Limits:
         if not self.force_working_n < self.force_soft_stop_n < self.force_emergency_n:
             raise ValueError("need force_working_n < force_soft_stop_n < force_emergency_n")
+        for axis, low, high in zip("xyz", self.workspace_min_m, self.workspace_max_m, strict=True):
+            if not -3 <= low < high <= 3:
+                raise ValueError(
+                    f"workspace_min_m and workspace_max_m: {axis} from {low:g} to {high:g} m; want -3 <= min < max <= 3"
+                )
         return self
 
 

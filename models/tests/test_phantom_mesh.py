@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from palpate_models.frames import look_at
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.phantom.mesh import orient, refine
 from palpate_models.phantom.parametric import parametric_surface
-from palpate_models.scenario import Phantom
+from palpate_models.scenario import Lesion, Limits, Phantom
 
 
 def dome(subdivisions=4):
@@ -166,3 +167,51 @@ def test_a_mesh_too_fine_is_refused(tmp_path):
     write(tmp_path / "fine.ply", vertices, faces)
     with pytest.raises(MeshError, match="decimate"):
         build_phantom(Phantom(kind="mesh", mesh=str(tmp_path / "fine.ply"), edge_m=0.0025), 0)
+
+
+def test_a_hole_before_the_camera_does_not_turn_the_body_inside_out(tmp_path):
+    vertices, faces = dome(3)
+    middle = vertices[faces].mean(axis=1)
+    hole = np.argsort(np.linalg.norm(middle - (0.05, 0.05, -0.01), axis=1))[:6]
+    model = build_phantom(write(tmp_path / "hole.ply", vertices, np.delete(faces, hole, axis=0)), 0)
+    assert model.normals[np.argmin(np.linalg.norm(model.vertices, axis=1)), 2] > 0.99
+
+
+def test_two_holes_are_refused(tmp_path):
+    vertices, faces = dome(3)
+    middle = vertices[faces].mean(axis=1)
+    holes = [np.argmin(np.linalg.norm(middle - at, axis=1)) for at in ((0.08, 0.08, -0.02), (-0.08, -0.08, -0.02))]
+    with pytest.raises(MeshError, match="it has 2 borders"):
+        build_phantom(write(tmp_path / "holes.ply", vertices, np.delete(faces, holes, axis=0)), 0)
+
+
+def test_a_shallow_patch_can_move(tmp_path):
+    vertices, faces = dome(4)
+    patch = vertices * (1, 1, 0.05)
+    model = build_phantom(write(tmp_path / "patch.ply", patch, faces[vertices[faces][:, :, 2].min(axis=1) > -0.08]), 0)
+    assert (~model.fixed).mean() > 0.8
+
+
+def test_a_lesion_beside_the_body_is_refused():
+    with pytest.raises(MeshError, match=r"phantom.lesions\[0\]: centre_m \(-55.0, 10.0\).*want metres"):
+        build_phantom(Phantom(lesions=(Lesion(centre_m=(-55.0, 10.0)),)), 0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"speed_mps": 500.0}, "speed_mps"),
+        ({"depth_m": 20.0}, "depth_m"),
+        ({"force_emergency_n": 40000.0}, "force_emergency_n"),
+        ({"workspace_min_m": (0.8, 0.0, 0.0)}, "want -3 <= min < max <= 3"),
+    ],
+)
+def test_limits_that_would_protect_nobody_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words):
+        Limits(**settings)
+
+
+def test_a_camera_may_look_straight_down():
+    X = look_at(np.array((0.56, 0.0, 1.9)), np.array((0.56, 0.0, 0.9)))
+    np.testing.assert_allclose(X[:3, :3].T @ X[:3, :3], np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(X[:3, 2], (0, 0, -1))

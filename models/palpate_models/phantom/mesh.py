@@ -85,9 +85,9 @@ def check(vertices: Array, triangles: IntArray) -> None:
     """Raises MeshError unless the mesh is a manifold of sound triangles, in metres, through the origin of A."""
     size = float(np.ptp(vertices, axis=0).max())
     if size > LARGEST_M:
-        raise MeshError(
-            f"it is {size:.4g} m large, more than {LARGEST_M} m: is it in millimetres? Scale it by 0.001 (want metres)"
-        )
+        units = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+        likely = [f"{name}? Scale it by {factor:g}" for name, factor in units.items() if 0.15 < size * factor < LARGEST_M]
+        raise MeshError(f"it is {size:.4g} m large, more than {LARGEST_M} m: is it in {(likely or ['metres?'])[0]} (want metres)")
     if size < SMALLEST_M:
         raise MeshError(f"it is {size:.4g} m large, less than {SMALLEST_M} m: want metres")
     corners = vertices[triangles]
@@ -104,11 +104,20 @@ def check(vertices: Array, triangles: IntArray) -> None:
         raise MeshError(f"non-manifold: {len(crowded)} edges with more than two triangles, the first at {where}")
     joined = sparse.coo_array((np.ones(len(unique)), (unique[:, 0], unique[:, 1])), shape=(len(vertices),) * 2)
     pieces, _ = connected_components(joined, directed=False)
+    border = unique[count == 1]
+    rim = sparse.coo_array((np.ones(len(border)), border.T), shape=(len(vertices),) * 2)
+    rims, _ = connected_components(rim, directed=False)
+    rims -= len(vertices) - len(np.unique(border))
+    if rims > 1:
+        raise MeshError(
+            f"it has {rims} borders, the first at {_place(vertices[border[0]])}: fill its holes; one border is allowed"
+        )
     if pieces > 1:
         raise MeshError(f"it is in {pieces} separate pieces: keep the one surface that is to be palpated")
     _check_fans(vertices, triangles)
-    nearest = vertices[np.argmin(np.linalg.norm(vertices, axis=1))]
-    reach = max(_NEAR_UMBILICUS_M, float(longest.max()))
+    at = np.argmin(np.linalg.norm(vertices, axis=1))
+    nearest = vertices[at]
+    reach = max(_NEAR_UMBILICUS_M, float(longest[(triangles == at).any(axis=1)].max()))
     if np.linalg.norm(nearest) > reach:
         raise MeshError(
             f"the umbilicus must be at the origin (abdomen frame: x to the patient's left, y to the head, z outward), "
@@ -117,7 +126,7 @@ def check(vertices: Array, triangles: IntArray) -> None:
 
 
 def orient(vertices: Array, triangles: IntArray) -> IntArray:
-    """The triangles, counter-clockwise seen from outside: of positive volume when closed, else facing +z on the whole.
+    """The triangles, counter-clockwise seen from outside: of positive volume when closed, else facing +z about the umbilicus.
 
     Raises MeshError if the surface is not orientable.
     """
@@ -139,7 +148,10 @@ def orient(vertices: Array, triangles: IntArray) -> IntArray:
     out = np.where(turned[:, None], triangles[:, ::-1], triangles)
     cross = _cross(vertices, out)
     closed = len(twin) * 2 == len(half)
-    outward = float((cross * vertices[out].mean(axis=1)).sum()) if closed else float(cross[:, 2].sum())
+    middle = vertices[out].mean(axis=1)
+    away = np.linalg.norm(middle, axis=1)
+    near = away <= away.min() + _NEAR_UMBILICUS_M
+    outward = float((cross * middle).sum()) if closed else float(cross[near, 2].sum())
     return np.ascontiguousarray(out if outward > 0 else out[:, ::-1], dtype=np.int32)
 
 

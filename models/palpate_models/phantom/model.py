@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate_models.phantom.field import background_factor, lesion_field
-from palpate_models.phantom.mesh import boundary_vertices, load_mesh, vertex_normals
+from palpate_models.phantom.mesh import MeshError, boundary_vertices, load_mesh, vertex_normals
 from palpate_models.phantom.parametric import parametric_surface
 from palpate_models.scenario import Phantom
 
@@ -56,14 +56,17 @@ def quadrant(x: float, y: float) -> str:
 def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
     """The phantom of a scenario. The same seed gives the same background, whatever the mesh or its resolution.
 
-    Raises MeshError if a user's mesh cannot be used.
+    Raises MeshError if a user's mesh or a lesion cannot be used.
     """
     if phantom.mesh is not None:
         surface = load_mesh(Path(phantom.mesh), phantom.edge_m)
         vertices, triangles = surface.vertices, surface.triangles
         normals = vertex_normals(vertices, triangles)
         fixed = boundary_vertices(len(vertices), triangles)
-        fixed |= vertices[:, 2] < vertices[:, 2].min() + _POSTERIOR_M
+        if not fixed.any():  # closed: its back lies on the table
+            fixed |= vertices[:, 2] < vertices[:, 2].min() + _POSTERIOR_M
+        if fixed.all():
+            raise MeshError(f"phantom.mesh = {phantom.mesh}: all of its vertices are on its border or its back, none can move")
     else:
         shape = parametric_surface(phantom.size_m, phantom.edge_m)
         vertices, triangles, normals, fixed = shape.vertices, shape.triangles, shape.normals, shape.fixed
@@ -73,6 +76,12 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
     half_length = float(np.ptp(vertices[:, 1])) / 2
     background = phantom.stiffness.k_w_n_per_m3 * background_factor(vertices, phantom.background, half_length, seed)
     contrast, lesion = lesion_field(vertices[:, :2], phantom.lesions, front=normals[:, 2] > 0)
+    for index in sorted(set(range(len(phantom.lesions))) - set(lesion.tolist())):
+        centre, radii = phantom.lesions[index].centre_m, phantom.lesions[index].radii_m
+        raise MeshError(
+            f"phantom.lesions[{index}]: centre_m {centre}, radii_m {radii}: no point of the abdomen's front belongs to it "
+            "(want metres from the umbilicus; a stiffer lesion may cover it)"
+        )
     return PhantomModel(
         vertices=vertices,
         triangles=triangles,
