@@ -282,8 +282,8 @@ class DashboardService(Service):
             return
         background = message.background if message.background > 0 else float(np.median(mean[scanned]))
         ratio = mean / background
-        half = (np.asarray(message.stiffness_upper) - np.asarray(message.stiffness_lower)) / 2.0
-        spread = half / np.maximum(mean, 1e-9)
+        lower, upper = np.asarray(message.stiffness_lower), np.asarray(message.stiffness_upper)
+        spread = np.sqrt(upper / np.maximum(lower, 1e-9)) - 1  # the band is a factor up and down
         self._map.update(t, vertices, arrays.triples(message.triangles), ratio, spread, scanned)
         self._scene.stiffness(t, apply(self._X_WA, vertices.astype(np.float64)).astype(np.float32), ratio, scanned)
 

@@ -87,7 +87,7 @@ class RosCameraService(Service):
 
     def __init__(self, port: CameraPort, frame: str = FRAME, world: str = "world", wait_s: float = POSE_WAIT_S) -> None:
         """Waits for the camera's pose. Raises CameraError naming the frames that are known when it does not come."""
-        self._port = port
+        self._port, self._frame = port, frame
         self._X_WC = _await_pose(port, frame, world, wait_s)
         self._wanted = 0
         self._facts = {"bursts": 0, "frames": 0, "frames_rejected": 0}
@@ -110,7 +110,7 @@ class RosCameraService(Service):
         if not self._wanted or not images or info is None:
             return {}
         try:
-            _agree(images[-1], info)
+            _agree(images[-1], info, self._frame)
             image = _image(t, images[-1])
             intrinsics = _intrinsics(t, info)
         except CameraError as error:
@@ -145,8 +145,12 @@ def _await_pose(port: CameraPort, frame: str, world: str, wait_s: float) -> Arra
         sleep(0.05)
 
 
-def _agree(image: Any, info: Any) -> None:
-    """The intrinsics must be those of the image: a driver that scales one of them shifts everything that is seen."""
+def _agree(image: Any, info: Any, frame: str) -> None:
+    """The intrinsics must be those of the image, and the pose that of its frame: else everything that is seen is shifted."""
+    for what, message in (("depth image", image), ("camera_info", info)):
+        named = message.header.frame_id.lstrip("/")
+        if named != frame:
+            raise CameraError(f"{what} is in frame {named!r}, the pose is that of {frame!r}: set PALPATE_CAMERA_FRAME={named}")
     if (image.width, image.height) != (info.width, info.height):
         raise CameraError(f"depth image is {image.width} x {image.height}, camera_info says {info.width} x {info.height}")
 

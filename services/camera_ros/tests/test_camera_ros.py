@@ -27,6 +27,7 @@ from palpate_bus.zenoh_config import BusOptions
 from palpate_camera_ros.convert import CameraError, depth_metres
 from palpate_camera_ros.service import CameraPort, RosCameraService, ZenohCamera
 
+FRAME = "camera_depth_optical_frame"
 METRES = np.array([[1.0, np.nan, 0.731], [0.5, 2.25, 1.125]], dtype=np.float32)
 
 
@@ -36,14 +37,14 @@ def ros_image(encoding: str = "16UC1", big_endian: bool = False) -> Any:
     pixels = millimetres if encoding == "16UC1" else METRES.astype(f"{order}f4")
     padded = np.zeros((2, 3 * pixels.itemsize + 5), np.uint8)  # drivers may pad their rows
     padded[:, : 3 * pixels.itemsize] = pixels.view(np.uint8).reshape(2, -1)
-    return Image(header(5, "d435"), 2, 3, encoding, int(big_endian), padded.shape[1], padded.ravel())
+    return Image(header(5, FRAME), 2, 3, encoding, int(big_endian), padded.shape[1], padded.ravel())
 
 
 def ros_info(d: float = 0.0) -> Any:
     K = np.array([600.0, 0, 1.0, 0, 610.0, 0.5, 0, 0, 1])
     P = np.hstack((K.reshape(3, 3), np.zeros((3, 1)))).ravel()
     roi = RegionOfInterest(0, 0, 0, 0, False)
-    return CameraInfo(header(5, "d435"), 2, 3, "plumb_bob", np.full(5, d), K, np.eye(3).ravel(), P, 0, 0, roi)
+    return CameraInfo(header(5, FRAME), 2, 3, "plumb_bob", np.full(5, d), K, np.eye(3).ravel(), P, 0, 0, roi)
 
 
 def link(parent: str, child: str, x: float, z_turn: float = 0.0) -> Any:
@@ -51,7 +52,7 @@ def link(parent: str, child: str, x: float, z_turn: float = 0.0) -> Any:
     return TransformStamped(header(0, parent), child, Transform(Vector3(x, 0.0, 0.0), rotation))
 
 
-TREE = [link("world", "stand", 1.0, np.pi / 2), link("stand", "camera_depth_optical_frame", 0.5)]
+TREE = [link("world", "stand", 1.0, np.pi / 2), link("stand", FRAME, 0.5)]
 
 
 class Port(CameraPort):
@@ -143,6 +144,19 @@ def test_an_image_that_camera_info_is_not_of_is_refused_and_said_so() -> None:
     facts = service.finish()
     assert (facts["frames"], facts["frames_rejected"]) == (0, 1)
     assert facts["problem"] == "depth image is 3 x 2, camera_info says 6 x 4"
+
+
+def test_an_image_of_another_frame_than_the_pose_is_refused_and_said_so() -> None:
+    """Depth that is aligned to colour is in the colour camera's frame."""
+    port = Port()
+    service = RosCameraService(port)
+    inbox = asked(1)
+    service.step(0, inbox)
+    image = ros_image()
+    image.header.frame_id = "camera_color_optical_frame"
+    port.waiting = [image]
+    assert service.step(100_000_000, inbox) == {}
+    assert "set PALPATE_CAMERA_FRAME=camera_color_optical_frame" in service.finish()["problem"]
 
 
 def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:

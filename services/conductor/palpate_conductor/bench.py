@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate_conductor.case_display import CaseDisplay
+from palpate_conductor.files import write_text
 from palpate_conductor.platforms import fingerprint
 from palpate_conductor.run import OBSERVERS, RunResult, run_composed, run_distributed
 
@@ -28,7 +29,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
     return {
         "sim_time_s": result.sim_time_s,
         "wall_time_s": result.wall_time_s,
-        "real_time_factor": result.sim_time_s / result.wall_time_s,
+        "real_time_factor": result.sim_time_s / max(result.wall_time_s, 1e-9),
         "command_to_first_tick_s": result.start_time_s,
         "run_hash": result.run_hash,
         "failure": result.failure,
@@ -113,7 +114,7 @@ def bench(scenario: str, out: Path, console: Console, groups: Sequence[str] = GR
     """Measures, prints the tables and writes bench.json; shows on a terminal how far it is, unless `quiet`."""
 
     def save(figures: dict[str, Any]) -> None:
-        out.write_text(json.dumps(figures, indent=2), encoding="utf-8")
+        write_text(out, json.dumps(figures, indent=2))
 
     screen = Console(stderr=True)
     with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:

@@ -14,6 +14,7 @@ from rich.markup import escape
 from palpate_conductor.campaign import KINDS, Finding, as_json, cases, forks, run_case
 from palpate_conductor.campaign_tables import markdown, table
 from palpate_conductor.case_display import CaseDisplay
+from palpate_conductor.files import replace_part, write_text
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
@@ -57,13 +58,15 @@ def faults(
         for number, case in enumerate(todo, 1):
             finding = run_case(case, Path(folder), started_by)
             found = [f for f in found if (f.kind, f.where, f.mode) != (finding.kind, finding.where, finding.mode)] + [finding]
-            out.write_text(json.dumps(as_json(found), indent=1) + "\n", encoding="utf-8")
+            write_text(out, json.dumps(as_json(found), indent=1) + "\n")
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
             display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDE, Console().width)).print(table(found))
     if doc is not None:
-        before, _, rest = doc.read_text(encoding="utf-8").partition(BEGIN)
-        doc.write_text(f"{before}{BEGIN}{markdown(found)}{END}{rest.partition(END)[2]}", encoding="utf-8")
+        try:
+            replace_part(doc, BEGIN, END, markdown(found))
+        except (OSError, ValueError) as error:
+            raise typer.BadParameter(str(error), param_hint="--doc") from None
     if any(not finding.good for finding in found):
         raise typer.Exit(EXIT_FAILED)
 

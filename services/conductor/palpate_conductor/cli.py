@@ -27,6 +27,7 @@ from palpate_conductor.case_display import CaseDisplay
 from palpate_conductor.evaluate import DEFAULT_CASES
 from palpate_conductor.evaluate import evaluate as run_evaluation
 from palpate_conductor.evaluate import table as evaluation_table
+from palpate_conductor.files import write_text
 from palpate_conductor.implementations import NONE, chosen_services
 from palpate_conductor.join import Absent, JoinError
 from palpate_conductor.outcome import RunFailed
@@ -284,16 +285,15 @@ def evaluate(
 ) -> None:
     """Examine many abdomens and print how well what is there was found; write the reports."""
     console = Console(stderr=True)
-    try:
-        with CaseDisplay(console, quiet or as_json) as display:
-            reports = run_evaluation(names or DEFAULT_CASES, range(seeds), workers, display.tell)
-    except RuntimeError as error:
-        _fail(console, EXIT_FAILED, str(error))
-    out.write_text(json.dumps(reports), encoding="utf-8")
+    with CaseDisplay(console, quiet or as_json) as display:
+        reports = run_evaluation(names or DEFAULT_CASES, range(seeds), workers, display.tell)
+    write_text(out, json.dumps(reports))
     if as_json:
         print(json.dumps(reports))
-        return
-    Console(width=max(WIDE, Console().width)).print(evaluation_table(reports))
+    else:
+        Console(width=max(WIDE, Console().width)).print(evaluation_table(reports))
+    if any(report["failure"] for report in reports):
+        raise typer.Exit(EXIT_FAILED)
 
 
 @app.command()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 ELSEWHERE = "elsewhere"
@@ -43,14 +44,15 @@ class Case:
 
 
 def run_case(case: Case) -> dict[str, Any]:
-    """Its report; raises RuntimeError with the run's words when it did not complete."""
+    """Its report; of a run that did not complete its scenario, seed and `failure` alone."""
     with tempfile.TemporaryDirectory(prefix="palpate-evaluate-") as folder:
         options = ["--composed", "--no-record", "--quiet", "--seed", str(case.seed), "--out", folder]
         done = subprocess.run(
             [sys.executable, "-m", "palpate_conductor", "run", *case.words, *options], capture_output=True, text=True, check=False
         )
         if done.returncode:
-            raise RuntimeError(f"{case.name}, seed {case.seed}: status {done.returncode}\n{done.stderr}")
+            words = done.stderr.strip().splitlines() or [""]
+            return {"scenario": case.name, "seed": case.seed, "failure": f"status {done.returncode}: {words[-1]}"}
         report: dict[str, Any] = json.loads((Path(folder) / "report.json").read_text(encoding="utf-8"))
         return report
 
@@ -58,18 +60,16 @@ def run_case(case: Case) -> dict[str, Any]:
 def evaluate(
     names: Sequence[str], seeds: Sequence[int], workers: int, tell: Callable[[int, int, str], None] = lambda *_: None
 ) -> list[dict[str, Any]]:
-    """The reports of all cases, `workers` at a time. `tell` hears how many of how many are done, and which was the last."""
+    """The reports of all cases, `workers` at a time. `tell` hears how many of how many are done, and which was the last.
+
+    A case that did not complete has a report with `failure`, `scenario` and `seed` alone: none is left out of the count.
+    """
     cases = [Case(name, seed) for name in names for seed in seeds]
     tell(0, len(cases), "")
     with ThreadPoolExecutor(workers) as pool:
         running = {pool.submit(run_case, case): case for case in cases}
-        try:
-            for done, future in enumerate(as_completed(running), 1):
-                future.result()
-                tell(done, len(cases), f"{running[future].name}, seed {running[future].seed}")
-        except RuntimeError:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for done, future in enumerate(as_completed(running), 1):
+            tell(done, len(cases), f"{running[future].name}, seed {running[future].seed}")
         return [future.result() for future in running]
 
 
@@ -80,6 +80,9 @@ def table(reports: Sequence[dict[str, Any]]) -> Table:
         "depth RMS [mm]", "surface RMS [mm]", "skipped", "real time", box=None,
     )  # fmt: skip
     for report in reports:
+        if report["failure"]:
+            rows.add_row(report["scenario"], str(report["seed"]), f"[red]{escape(report['failure'])}[/]")
+            continue
         scores = report["scores"]
 
         def figure(value: float | None, scale: float = 1.0, form: str = ".2f") -> str:

@@ -32,6 +32,17 @@ _SMALL = 8.5
 _LOG_TICKS = [m * 10.0**e for e in range(4) for m in (1, 1.5, 2, 3, 4, 5, 7)]
 
 
+def half_band_percent(lower: Array, upper: Array) -> Array:
+    """Half width of the 90 % band [%], shape (n,): the band is a factor up and down, this is that factor less one."""
+    return np.asarray(100 * (np.sqrt(upper / np.maximum(lower, 1e-9)) - 1))
+
+
+def drawable(message: Any) -> bool:
+    """Whether a `palpation_msgs/StiffnessMap` has a scanned triangle."""
+    triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
+    return bool(np.asarray(message.scanned, dtype=bool)[triangles].all(axis=1).any())
+
+
 class Drawing:
     """One map on its axes: triangulations of the scanned part, in millimetres."""
 
@@ -149,9 +160,9 @@ class Drawing:
 def draw_map(path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str) -> None:
     """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A) with the truth, where known, into a PNG file.
 
-    Nothing is drawn of a map on which nothing was scanned.
+    Nothing is drawn of a map that is not `drawable`.
     """
-    if not np.asarray(message.scanned).any():
+    if not drawable(message):
         return
     drawing = Drawing(message, findings, truth)
     figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
@@ -178,7 +189,7 @@ def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -
     solid.set_box_aspect((1, 1, 0.72), zoom=1.14)
     panel_title(solid, "b", "Normal force in 3-D", "height and colour are force")
     spread = figure.add_subplot(grid[0, 2])
-    half = 100 * (np.sqrt(drawing.map.upper / drawing.map.lower) - 1)
+    half = half_band_percent(drawing.map.lower, drawing.map.upper)
     image = drawing.plane(spread, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
     drawing.outlines(spread, truth=False)
     panel_title(spread, "c", "Uncertainty of the stiffness", "half width of the 90 % band")

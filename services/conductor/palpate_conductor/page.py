@@ -109,9 +109,18 @@ def verdict(report: Report) -> str:
     """The result in a sentence."""
     if report.failure:
         return f"The examination did not complete: {report.failure}."
+    if not report.assessed:
+        return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
+    if not report.findings and report.skipped_targets:
+        return f"No area was found that is stiffer than healthy variation explains{_unreached(report)}."
     if not report.findings:
         return "No area was found that is stiffer than healthy variation explains."
     return " ".join(_in_words(finding) for finding in report.findings)
+
+
+def _unreached(report: Report) -> str:
+    n = report.skipped_targets
+    return f"; {n} target{'s were' if n > 1 else ' was'} skipped, and nothing is known of what lies there" if n else ""
 
 
 def _in_words(f: FindingRow) -> str:

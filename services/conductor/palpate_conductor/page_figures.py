@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,6 +23,8 @@ from palpate_conductor.figures import (
     UNCERTAINTY_COLOURS,
     Drawing,
     colour_bar,
+    drawable,
+    half_band_percent,
     panel_title,
 )
 
@@ -74,7 +76,7 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     None when there is no map.
     """
     message = evidence.stiffness_map
-    if message is None or not np.asarray(message.scanned).any():
+    if message is None or not drawable(message):
         return None
     drawing = Drawing(message, evidence.findings, None)
     scanned = drawing.map.scanned
@@ -91,7 +93,7 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     drawing.outlines(middle, truth=False, labels=True)
     panel_title(middle, "b", "Stiffness", "times the background; findings outlined")
     colour_bar(figure, image, middle, "times background")
-    half = half_band_percent(message)
+    half = half_band_percent(drawing.map.lower, drawing.map.upper)
     image = drawing.plane(right, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
     drawing.outlines(right, truth=False)
     panel_title(right, "c", "How sure", "half width of the 90 % band of the stiffness")
@@ -102,12 +104,6 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
 def _ratio_norm(drawing: Drawing) -> LogNorm:
     ratio = (drawing.map.stiffness / drawing.background)[drawing.map.scanned]
     return LogNorm(float(np.quantile(ratio, 0.002)), max(2.0, float(np.quantile(ratio, 0.998))))
-
-
-def half_band_percent(message: Any) -> Array:
-    """Half width of the 90 % band [%], shape (n,): the band is a factor up and down, this is that factor less one."""
-    upper, lower = (np.asarray(getattr(message, f"stiffness_{name}"), dtype=np.float64) for name in ("upper", "lower"))
-    return np.asarray(100 * (np.sqrt(upper / np.maximum(lower, 1e-9)) - 1))
 
 
 def record(evidence: Evidence, limit_n: float) -> bytes | None:
@@ -159,7 +155,7 @@ def force_depth(evidence: Evidence) -> bytes | None:
 def truth(evidence: Evidence) -> bytes | None:
     """True stiffness with the findings' outlines, and the error of the depth; None when either is not known."""
     message = evidence.stiffness_map
-    if evidence.phantom is None or message is None or not np.asarray(message.scanned).any():
+    if evidence.phantom is None or message is None or not drawable(message):
         return None
     drawing = Drawing(message, evidence.findings, truth_of(evidence.phantom))
     if drawing.true is None:

@@ -12,8 +12,7 @@ from matplotlib.colors import LogNorm, Normalize, to_hex
 from numpy.typing import NDArray
 
 from palpate_conductor.evidence import map_of
-from palpate_conductor.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS
-from palpate_conductor.page_figures import half_band_percent
+from palpate_conductor.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS, half_band_percent
 
 Array = NDArray[np.float64]
 MAX_VERTICES = 65_535
@@ -45,7 +44,7 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     force = np.asarray(message.force, dtype=np.float64)
     ratio = mapped.stiffness / float(message.background)
     known = mapped.scanned
-    half = half_band_percent(message)
+    half = half_band_percent(mapped.lower, mapped.upper)
     low, high = float(np.quantile(ratio[known], 0.01)), max(2.0, float(np.quantile(ratio[known], 0.99)))
     relief = np.column_stack((shape[:, :2], np.where(known, force, 0.0) * (0.7 * radius / max(force[known].max(), 1e-9))))
     relief[:, 2] -= relief[known, 2].mean()

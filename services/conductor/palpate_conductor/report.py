@@ -26,6 +26,7 @@ from palpate_conductor.evidence import (
     truth_of,
 )
 from palpate_conductor.figures import draw_map
+from palpate_conductor.files import write_text
 from palpate_conductor.platforms import fingerprint
 from palpate_conductor.run import RunResult
 
@@ -179,7 +180,7 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
         depth_rms_error_m=depth.true_against_setpoint_m,
         depth=depth,
         surface_rms_error_m=_surface(scenario, c.surface, truth),
-        assessed=final is not None,
+        assessed=final is not None and found is not None,
         findings=[_finding(f) for f in ([] if final is None else final.findings)],
         truth=None if truth is None else TruthRow(lesions=[_lesion(lesion) for lesion in lesions]),
         scores=scores,
@@ -193,7 +194,7 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report
     c = result.collected
     report = assemble(scenario, result)
     samples = samples_of(c.samples)
-    (folder / "report.json").write_text(report.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     write_samples(folder / "samples.csv", samples)
     archive.write_evidence(folder / archive.FILE, c)
     if c.stiffness_map is not None:

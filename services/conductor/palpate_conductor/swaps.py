@@ -10,6 +10,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,14 @@ def read_report(folder: Path) -> dict[str, Any]:
     return report
 
 
+def complete(folder: Path) -> dict[str, Any] | None:
+    """The report of a run that is complete in `folder`, None where there is none."""
+    with suppress(OSError, ValueError):
+        report = read_report(folder)
+        return report if report["failure"] is None else None
+    return None
+
+
 def measure(
     scenario: str,
     settings: Sequence[str],
@@ -94,14 +103,14 @@ def measure(
 ) -> dict[str, dict[str, Any]]:
     """The reports of the reference, which is recorded, and of every swap, one run at a time, each in a folder of its name.
 
-    With `keep` a run that is already in its folder is not made again. Raises RuntimeError when a run did not complete.
+    With `keep` a run that is already complete in its folder is not made again. Raises RuntimeError when a run did not complete.
     """
     reports = {}
     reference = Swap(REFERENCE, (), "")
     for swap in (reference, *swaps):
         where = folder / swap.name
-        if keep and (where / "report.json").is_file():
-            reports[swap.name] = read_report(where)
+        if keep and (kept := complete(where)) is not None:
+            reports[swap.name] = kept
             continue
         tell(swap.name)
         recorded = str((folder / REFERENCE).resolve())

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from palpate_conductor.files import replace_part
 from palpate_conductor.processes import ProcessListError, compose_file
 from palpate_conductor.swaps import measure, read_swaps, table
 
@@ -40,5 +41,7 @@ def swaps(
     text = table(chosen, reports)
     typer.echo(text)
     if doc is not None:
-        before, _, rest = doc.read_text(encoding="utf-8").partition(BEGIN)
-        doc.write_text(f"{before}{BEGIN}{text}{END}{rest.partition(END)[2]}", encoding="utf-8")
+        try:
+            replace_part(doc, BEGIN, END, text)
+        except (OSError, ValueError) as error:
+            raise typer.BadParameter(str(error), param_hint="--doc") from None

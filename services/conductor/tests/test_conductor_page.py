@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from conductor_messages import collected, findings, result
 from palpate_conductor import archive
-from palpate_conductor.page import write_page
-from palpate_conductor.report import write_results
+from palpate_conductor.page import verdict, write_page
+from palpate_conductor.report import assemble, write_results
 from palpate_conductor.run import write_scenario_files
 from palpate_models.load import load_scenario
 
@@ -80,6 +80,17 @@ def test_a_run_that_failed_says_so_first(tmp_path: Path) -> None:
     assert "did not complete: tissue lost at tick 12.345 s" in page
     assert "surface-data" not in page
     assert "12.35 s" in page  # among the safety events
+
+
+def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> None:
+    scenario = load_scenario("rlq_guarding")
+    whole = assemble(scenario, result(collected(), failure=None)).model_copy(update={"findings": [], "skipped_targets": 0})
+    assert verdict(whole) == "No area was found that is stiffer than healthy variation explains."
+    blind = verdict(whole.model_copy(update={"skipped_targets": 3}))
+    assert blind.endswith("; 3 targets were skipped, and nothing is known of what lies there.")
+    none = assemble(scenario, result(collected(map_too=False), failure=None))
+    assert not none.assessed
+    assert verdict(none).startswith(f"Not assessed: {none.samples} samples are too few for a map")
 
 
 def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:

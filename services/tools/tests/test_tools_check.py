@@ -22,8 +22,8 @@ from palpate_tools.suites import SUITES, check
 
 SCENARIO = load_scenario("rlq_guarding")
 POINTS = {point.name: point for group in ("palpate.services", "palpate.implementations") for point in entry_points(group=group)}
-HARDWARE = {"robot.lbr"}
-"""Runs by the wall clock only: `palpate check` takes it live."""
+HARDWARE = {"robot.lbr", "camera.ros", "camera.replay"}
+"""By the wall clock only: `palpate check` takes them live; and the replay, whose own tests check it on a recorded plane."""
 QUICK = {"assessment", "camera", "control", "perception", "planning", "robot", "tissue", "tissue.fmu"}
 IMPLEMENTATIONS = sorted(name for name in POINTS if name.partition(".")[0] in SUITES and name not in HARDWARE)
 
