@@ -131,9 +131,9 @@ def _recording(source: Path, console: Console) -> Path:
         target = Path(tempfile.mkdtemp(prefix="palpate-dashboard-")) / FILE
         drawn = DashboardService(load_scenario(str(exam)), target, Live(), paced=False)
         with _drawing(console) as status:
-            replay.replay(source, drawn, _teller(status))
+            replay.replay((source,), drawn, _teller(status))
         return target
-    if replay.recording_of(source) is not None:
+    if replay.recording_of(source):
         with _drawing(console) as status:
             return replay.main(source, _teller(status))
     raise NothingToShow(f"{source}: neither a .rrd nor a .mcap file, nor the folder of a run that was recorded")

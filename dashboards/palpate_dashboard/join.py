@@ -20,7 +20,7 @@ from palpate_bus.operator_keys import OperatorKeys
 from palpate_bus.runs import Run, live
 from palpate_bus.zenoh_config import session
 
-from palpate_dashboard.replay import catch_up, recording_of
+from palpate_dashboard.replay import draw, messages, recording_of
 from palpate_dashboard.service import DashboardService
 
 CHECK_S = 1.0
@@ -37,9 +37,9 @@ def follow(run: Run, service: DashboardService, say: Say, keys: OperatorKeys) ->
         decode = codec.decoder("palpation_msgs/msg/RunControl")
         observed = ObservedService(service, member)  # listens from now on, while the past is drawn
         recording = recording_of(Path(run.out))
-        if recording is not None:
-            say(f"drawing what happened so far, from {recording}")
-            until = catch_up(recording, service)
+        if recording:
+            say(f"drawing what happened so far, from {recording[0].parent}")
+            until = draw(messages(recording), service)
             say(f"joined at {max(until, 0) / 1e9:.1f} s of simulated time")
         checked = monotonic()
         end = ""

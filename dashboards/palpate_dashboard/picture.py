@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from palpate_models.load import load_scenario
 from PIL import Image
 
-from palpate_dashboard.replay import draw, messages
+from palpate_dashboard.replay import draw, messages, recording_of
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live, address
 
@@ -70,9 +70,11 @@ def look(page: Page) -> Pixels:
 def take(folder: Path, target: Path, at_s: float, port: int, width: int, height: int, tell: Callable[[str], None]) -> None:
     """Writes the dashboard at `at_s` [s] of the run in `folder` to the PNG file `target`.
 
-    Raises NoPicture, or OSError when the run was not recorded.
+    Raises NoPicture, also when the run was not recorded, and OSError.
     """
-    recording, exam = folder / "recording_mcap" / "recording_mcap_0.mcap", folder / "exam.yaml"
+    recording, exam = recording_of(folder), folder / "exam.yaml"
+    if not recording:
+        raise NoPicture(f"{folder}: no recording there; give the folder of a run that was recorded")
     service = DashboardService(load_scenario(str(exam)), None, Live(serve_port=port), paced=False)
     try:
         tell(f"drawing {folder} up to {at_s:g} s")

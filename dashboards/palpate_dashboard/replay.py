@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from heapq import heappop, heappush
 from itertools import groupby
 from pathlib import Path
 
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -66,47 +65,44 @@ class RecordedInbox:
         return False
 
 
-def messages(path: Path) -> Iterator[tuple[int, str, bytes]]:
-    """Time [ns], topic and payload of what the dashboard observes, in order of time. Raises OSError, McapError."""
-    topics = [f"/{topic.name}" for topic, _ in contract().inputs("dashboard")]
-    with path.open("rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages(topics=topics):
-            yield message.log_time, channel.topic.removeprefix("/"), message.data
+def recording_of(folder: Path) -> tuple[Path, ...]:
+    """The MCAP files of the run in `folder`, in order; empty when there are none. A long recording has several."""
+    files = (folder / "recording_mcap").glob("recording_mcap_*.mcap")
+    return tuple(sorted(files, key=lambda path: int(path.stem.rpartition("_")[2])))
 
 
-def recording_of(folder: Path) -> Path | None:
-    """The MCAP file of the run in `folder`, None when there is none."""
-    path = folder / "recording_mcap" / "recording_mcap_0.mcap"
-    return path if path.is_file() else None
+def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
+    """Time [ns], topic and payload of what the dashboard observes, in order of time: all that is complete in the files.
 
-
-def messages_so_far(path: Path) -> Iterator[tuple[int, str, bytes]]:
-    """The same of a file that is still written, or was cut off: all that is complete in it.
-
-    Chunks of the services come as they were sent, so the order of time is restored within `DISORDER`.
+    The last one may still be written, or be cut off. Chunks of the services come as they were sent, so the order of time is
+    restored within `DISORDER`. Raises OSError.
     """
     topics = {f"/{topic.name}" for topic, _ in contract().inputs("dashboard")}
-    names: dict[int, str] = {}
     waiting: list[tuple[int, int, str, bytes]] = []
-    count = 0
-    with path.open("rb") as stream:
-        records = StreamReader(stream).records
-        while True:
-            try:
-                record = next(records)
-            except (StopIteration, *_BROKEN):
-                break
-            if isinstance(record, Channel) and record.topic in topics:
-                names[record.id] = record.topic.removeprefix("/")
-            elif isinstance(record, McapMessage) and record.channel_id in names:
-                count += 1
-                heappush(waiting, (record.log_time, count, names[record.channel_id], record.data))
-                while waiting[0][0] < record.log_time - DISORDER:
-                    time, _, topic, payload = heappop(waiting)
-                    yield time, topic, payload
+    for count, (name, record) in enumerate(_records(files, topics)):
+        heappush(waiting, (record.log_time, count, name, record.data))
+        while waiting[0][0] < record.log_time - DISORDER:
+            time, _, topic, payload = heappop(waiting)
+            yield time, topic, payload
     while waiting:
         time, _, topic, payload = heappop(waiting)
         yield time, topic, payload
+
+
+def _records(files: Sequence[Path], topics: Set[str]) -> Iterator[tuple[str, McapMessage]]:
+    for path in files:
+        names: dict[int, str] = {}
+        with path.open("rb") as stream:
+            records = StreamReader(stream).records
+            while True:
+                try:
+                    record = next(records)
+                except (StopIteration, *_BROKEN):
+                    break
+                if isinstance(record, Channel) and record.topic in topics:
+                    names[record.id] = record.topic.removeprefix("/")
+                elif isinstance(record, McapMessage) and record.channel_id in names:
+                    yield names[record.channel_id], record
 
 
 def draw(source: Iterable[tuple[int, str, bytes]], service: DashboardService, tell: Callable[[int], None] | None = None) -> int:
@@ -127,28 +123,19 @@ def draw(source: Iterable[tuple[int, str, bytes]], service: DashboardService, te
     return last
 
 
-def catch_up(recording: Path, service: DashboardService) -> int:
-    """Draws what a recording that is still written holds so far; returns the time [ns] reached."""
-    return draw(messages_so_far(recording), service)
-
-
-def replay(recording: Path, service: DashboardService, tell: Callable[[int], None] | None = None) -> None:
-    """Steps `service` through the messages of an MCAP file and finishes it. Raises OSError."""
-    try:
-        draw(messages(recording), service, tell)
-    except McapError:  # without an index: cut off, or still written
-        draw(messages_so_far(recording), service, tell)
+def replay(files: Sequence[Path], service: DashboardService, tell: Callable[[int], None] | None = None) -> None:
+    """Steps `service` through the messages of a recording and finishes it. Raises OSError."""
+    draw(messages(files), service, tell)
     service.finish()
 
 
 def main(folder: Path, tell: Callable[[int], None] | None = None) -> Path:
     """Draws the run in `folder` again; returns the file. Raises FileNotFoundError naming what is missing."""
-    recording = folder / "recording_mcap" / "recording_mcap_0.mcap"
-    scenario = folder / "exam.yaml"
-    for needed in (recording, scenario):
-        if not needed.is_file():
-            raise FileNotFoundError(f"{needed}: not there; give the folder of a run that was recorded")
-    replay(recording, DashboardService(load_scenario(str(scenario)), folder / FILE, Live(), paced=False), tell)
+    files, scenario = recording_of(folder), folder / "exam.yaml"
+    if not files or not scenario.is_file():
+        needed = scenario if files else folder / "recording_mcap"
+        raise FileNotFoundError(f"{needed}: not there; give the folder of a run that was recorded")
+    replay(files, DashboardService(load_scenario(str(scenario)), folder / FILE, Live(), paced=False), tell)
     return folder / FILE
 
 

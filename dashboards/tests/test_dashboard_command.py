@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -57,7 +58,7 @@ def test_a_recording_that_is_still_written_is_drawn_as_far_as_it_goes(tmp_path: 
     whole = path.read_bytes()
     path.write_bytes(whole[: 2 * len(whole) // 3])
     service = DashboardService(Scenario(name="late"), tmp_path / FILE, Live())
-    reached = replay.catch_up(path, service)
+    reached = replay.draw(replay.messages((path,)), service)
     service.finish()
     assert 0.5e9 < reached < 2.9e9
     assert (tmp_path / FILE).stat().st_size > 10_000
@@ -65,9 +66,17 @@ def test_a_recording_that_is_still_written_is_drawn_as_far_as_it_goes(tmp_path: 
 
 def test_messages_come_in_order_of_time(tmp_path: Path) -> None:
     path = record(tmp_path, 1.0)
-    times = [time for time, _, _ in replay.messages_so_far(path)]
+    times = [time for time, _, _ in replay.messages((path,))]
     assert times == sorted(times)
-    assert [item[:2] for item in replay.messages_so_far(path)] == [item[:2] for item in replay.messages(path)]
+
+
+def test_a_recording_in_several_files_is_read_whole(tmp_path: Path) -> None:
+    path = record(tmp_path, 1.0)
+    shutil.copy(path, path.with_name("recording_mcap_1.mcap"))
+    shutil.copy(path, path.with_name("recording_mcap_10.mcap"))
+    files = replay.recording_of(tmp_path)
+    assert [file.name for file in files] == [f"recording_mcap_{n}.mcap" for n in (0, 1, 10)]
+    assert len(list(replay.messages(files))) == 3 * len(list(replay.messages(files[:1])))
 
 
 def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) -> None:

@@ -83,9 +83,15 @@ def workers(scenario: Scenario) -> tuple[str, ...]:
     return tuple(role for role in WORKERS if role != "tissue" or scenario.tissue.implementation != NONE)
 
 
+RESULTS = ("report.json", "report.html", "map.png", "samples.csv", "evidence.npz", "bus.json", "recording.rrd")
+"""What the end of a run leaves in its folder, and the viewer's drawing; the recorder sees to its own."""
+
+
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
     """Makes the results folder and the scenario files; returns the file that each role may see."""
     (out / "logs").mkdir(parents=True, exist_ok=True)
+    for name in RESULTS:  # of an earlier run in the same folder: nobody is to take them for this one's
+        (out / name).unlink(missing_ok=True)
     full, exam = out / "scenario.yaml", out / "exam.yaml"
     full.write_text(dump_scenario(scenario), encoding="utf-8")
     exam.write_text(dump_scenario(redacted(scenario)), encoding="utf-8")

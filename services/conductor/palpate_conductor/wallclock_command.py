@@ -49,7 +49,7 @@ def latencies(reports: Mapping[int, dict[str, Any]]) -> str:
     A way is a message's age when its reader takes it up: transport, and waiting for the reader's next tick.
     """
     text = _row("control rate", *(f"{what}: p50, p99, largest [ms]" for what, _, _ in LEGS), "mean step of control [ms]",
-                "state to command acted on: p50, p99, largest at most [ms]")  # fmt: skip
+                "together: sum of p50, of p99, of largest [ms]")  # fmt: skip
     text += _row(*["---"] * 5)
     for rate, report in reports.items():
         ways = [[report["services"][role]["age_ms"][topic][part] for part in PARTS] for _, role, topic in LEGS]

@@ -103,7 +103,7 @@ def write(
     tell("figure 6: phases")
     chosen = chosen_moments(evidence[0])
     recording = recording_of(folder)
-    if recording is None:
+    if not recording:
         raise RunError(f"{folder}: it has no recording")
     rest, *seen = moments(recording, [min(0.2, chosen[0][1]), *(time for _, time, _ in chosen)])
     shown = [(words, moment, close) for (words, _, close), moment in zip(chosen, seen, strict=True)]

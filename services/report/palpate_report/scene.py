@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from palpate_dashboard import arrays, palette, patient
 from palpate_dashboard.geometry import Carry, VertexNormals, creased
-from palpate_dashboard.replay import RecordedInbox, messages_so_far
+from palpate_dashboard.replay import RecordedInbox, messages
 from palpate_models import table
 from palpate_models.frames import apply, inverse
 from palpate_models.lbr_visual import visual_meshes
@@ -34,8 +34,8 @@ class Moment:
     stiffness_map: Any | None
 
 
-def moments(recording: Path, times_s: Sequence[float]) -> list[Moment]:
-    """The scene at each of `times_s`, in their order, from an MCAP recording. Raises OSError, ValueError if it ends before."""
+def moments(recording: Sequence[Path], times_s: Sequence[float]) -> list[Moment]:
+    """The scene at each of `times_s`, in their order, from a recording's files. Raises OSError, ValueError if it ends before."""
     inbox = RecordedInbox()
     wanted = sorted(set(times_s))
     found: dict[float, Moment] = {}
@@ -44,7 +44,7 @@ def moments(recording: Path, times_s: Sequence[float]) -> list[Moment]:
         poses, surface, known = (inbox.latest(topic) for topic in SEEN)
         found[time] = Moment(time, poses, surface, known)
 
-    for stamp, topic, payload in messages_so_far(recording):
+    for stamp, topic, payload in messages(recording):
         while wanted and stamp / 1e9 > wanted[0]:
             take(wanted.pop(0))
         if topic in SEEN:
