@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import tempfile
 from collections.abc import Callable
 from importlib import metadata, resources
 from pathlib import Path
@@ -17,6 +18,17 @@ MOST_BYTES = 2_000_000_000
 """Beyond this, what was not used for longest is removed."""
 
 
+_CODE = {
+    "palpate_tissue_elastic": ("compliance.py", "contact.py", "equivalent.py", "kernel.py", "modulus.py", "solid.py"),
+    "palpate_models.phantom": ("field.py",),
+    "palpate_tissue": ("friction.py",),
+}
+"""Modules on which results depend: a change of one makes them anew."""
+_PARTIAL = ".part"
+_STALE_S = 3600.0
+"""A partial file that is so much older than the newest result was left by a process that was killed [s]."""
+
+
 def folder() -> Path:
     """Where results are kept: `palpate/elastic` in XDG_CACHE_HOME or ~/.cache."""
     root = os.environ.get("XDG_CACHE_HOME") or (Path.home() / ".cache")
@@ -26,9 +38,9 @@ def folder() -> Path:
 def content_key(kind: str, *parts: object) -> str:
     """A name for a result: a hash of its kind, of what it depends on (arrays by their bytes), and of the code that makes it."""
     key = hashlib.sha256(f"{kind} numpy {metadata.version('numpy')} scipy {metadata.version('scipy')}".encode())
-    for file in sorted(resources.files("palpate_tissue_elastic").iterdir(), key=lambda item: item.name):
-        if file.name in {"kernel.py", "solid.py", "modulus.py", "compliance.py", "equivalent.py", "contact.py"}:
-            key.update(file.read_bytes())
+    for package, names in _CODE.items():
+        for name in names:
+            key.update(resources.files(package).joinpath(name).read_bytes())
     for part in parts:
         if isinstance(part, np.ndarray):
             key.update(f"{part.dtype}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
@@ -51,17 +63,25 @@ def remembered(key: str, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
     value = compute()
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(f".{os.getpid()}")
-        with partial.open("wb") as file:
-            np.save(file, value)
-        partial.replace(path)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.stem, suffix=_PARTIAL, delete=False) as file:
+            partial = Path(file.name)
+            try:
+                np.save(file, value)
+                file.close()
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
         _forget_oldest(path.parent)
     return value
 
 
 def _forget_oldest(where: Path) -> None:
+    kept = sorted(where.glob("*.npy"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for partial in where.glob(f"*{_PARTIAL}"):
+        if kept and kept[0].stat().st_mtime - partial.stat().st_mtime > _STALE_S:
+            partial.unlink(missing_ok=True)
     room = MOST_BYTES
-    for path in sorted(where.glob("*.npy"), key=lambda path: path.stat().st_mtime, reverse=True):
+    for path in kept:
         room -= path.stat().st_size
         if room < 0:
             path.unlink(missing_ok=True)

@@ -83,7 +83,6 @@ class ElasticTissue:
         """u and y_k of the free vertices as they were `_behind` steps ago."""
         self._behind = 0
         self._near: Near | None = None
-        self._deepest = 0.0
         self.disturbed = False
         """Whether anything has ever moved."""
         self.touching = False
