@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from pathlib import Path
 
 from palpate_bus.contract import MS
 
 WORKER = 15
 """Niceness of a thread that computes for seconds: a planner must not keep the 1 kHz loop from a core."""
+BACKGROUND = 10
+"""Niceness of observers."""
 _BY_PERIOD = ((100 * MS, 10), (10 * MS, 5))
 
 
@@ -24,10 +27,14 @@ def by_period(period: int) -> int:
     return next((niceness for least, niceness in _BY_PERIOD if period >= least), 0)
 
 
-def when_idle() -> None:
-    """Runs only when the cores would idle: for observers.
+def in_the_background() -> None:
+    """Puts all threads of this process behind others: for observers, once they have started.
 
-    With the usual policy one that has just been woken may keep a core for milliseconds, of which a tick has less than one.
+    As batch work they take no core from who is running when they wake, which with the usual policy costs a tick milliseconds; and
+    with a tenth of the weight they still go on where others load the machine. SCHED_IDLE would not: a viewer did not even start.
     """
-    with suppress(OSError, AttributeError):  # SCHED_IDLE is Linux's
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    with suppress(OSError, AttributeError):  # Linux
+        for thread in (int(path.name) for path in Path("/proc/self/task").iterdir()):
+            with suppress(OSError):
+                os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
+                os.setpriority(os.PRIO_PROCESS, thread, BACKGROUND)

@@ -25,7 +25,7 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.distributed import LockstepNode, RunAborted
 from palpate_bus.member import Member
 from palpate_bus.observer import ObserverNode
-from palpate_bus.priority import when_idle
+from palpate_bus.priority import in_the_background
 from palpate_bus.recording import RawRecorder, RecorderNode
 from palpate_bus.service import Service
 from palpate_bus.wallclock import WallClockNode
@@ -75,13 +75,14 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
     try:
         rules = contract()
         domain = domain_from_env()
-        if rules.roles[role].observer:
-            when_idle()
         service = create(load(_scenario()))
         session = open_session()
         member = Member(session, role, rules, domain)
+        node = node_type(service, rules)(service, member)
         gc.freeze()  # a full collection of all that was loaded would stop the service for some 50 ms in mid-run
-        node_type(service, rules)(service, member).run()
+        if rules.roles[role].observer:
+            in_the_background()
+        node.run()
         member.leave()
     except RunAborted as aborted:
         logging.getLogger(role).warning("run ended early: %s", aborted)
