@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import TypeVar
 
 import numpy as np
@@ -53,12 +52,8 @@ PALPATING = frozenset({Phase.INDENT, Phase.SCAN, Phase.RETRACT})
 class Exam:
     """Runs one examination. `step` each planning period; `status` says where it stands."""
 
-    def __init__(self, known: ExamInput, *, lockstep: bool = True, worker: Executor | None = None) -> None:
-        """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes.
-
-        `worker` does it, one piece at a time.
-        """
-        self._worker = worker or ThreadPoolExecutor(max_workers=1)
+    def __init__(self, known: ExamInput, *, lockstep: bool = True) -> None:
+        """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes."""
         self._known = known
         self._lockstep = lockstep
         self._kinematics = Kinematics(known.robot, known.limits)
@@ -249,7 +244,7 @@ class Exam:
         return False
 
     def _think(self, t: int, budget: int, work: Callable[[], T]) -> Thought[T]:
-        return Thought(self._worker, t, budget, work, lockstep=self._lockstep)
+        return Thought(t, budget, work, lockstep=self._lockstep)
 
     # --- phases -------------------------------------------------------------------------------------------------------
 

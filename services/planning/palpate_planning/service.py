@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_bus import priority
 from palpate_bus.codec import Message
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.priority import WORKER, give_way
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import duration_message, header
 from palpate_models.load import exam_input
@@ -24,6 +24,7 @@ from palpate_planning.messages import path_message, setpoint_message, state_mess
 from palpate_planning.prepare import Seen
 from palpate_planning.status import Observation, Phase, Unseen
 from palpate_planning.surface import Surface
+from palpate_planning.thinking import WORKER
 
 Array = NDArray[np.float64]
 
@@ -46,8 +47,8 @@ class PlanningService(Service):
         """`lockstep` as in `Exam`."""
         self._known = known
         self._X_WA = np.array(known.X_WA)
-        worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning", initializer=give_way, initargs=(WORKER,))
-        self._exam = Exam(known, lockstep=lockstep, worker=worker)
+        _let_the_worker_give_way()
+        self._exam = Exam(known, lockstep=lockstep)
         self._reading: Reading | None = None
         self._surface: Message | None = None
         self._valid = duration_message(VALID_FOR)
@@ -166,6 +167,11 @@ def _end(inbox: Inbox) -> str:
         if request.request == OperatorRequest.END:
             return f"ended by the operator: {request.reason}"
     return ""
+
+
+@cache
+def _let_the_worker_give_way() -> None:
+    WORKER.submit(priority.give_way, priority.WORKER)
 
 
 def create(scenario: Scenario) -> PlanningService:

@@ -9,22 +9,23 @@ nothing waits: the result is taken up when it is there, but not before its time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
+WORKER = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
+"""The one worker of the process: CasADi and OMPL are not safe in two threads at once, and a thought that is not wanted any more
+goes on to its end."""
+
 
 class Thought(Generic[T]):
-    """One piece of work: started at `t` [ns], its result taken at `t + budget`. `work` must share no state with the steps.
+    """One piece of work: started at `t` [ns], its result taken at `t + budget`. `work` must share no state with the steps."""
 
-    `worker` does one piece at a time: one that is not wanted any more goes on to its end, and the next must not start beside it.
-    """
-
-    def __init__(self, worker: Executor, t: int, budget: int, work: Callable[[], T], *, lockstep: bool = True) -> None:
+    def __init__(self, t: int, budget: int, work: Callable[[], T], *, lockstep: bool = True) -> None:
         self._due = t + budget
         self._lockstep = lockstep
-        self._future: Future[T] = worker.submit(work)
+        self._future: Future[T] = WORKER.submit(work)
 
     def due(self, t: int) -> bool:
         """Whether its time has come."""

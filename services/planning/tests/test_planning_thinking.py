@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
 import pytest
 from palpate_planning.thinking import Thought
 
-WORKER = ThreadPoolExecutor(max_workers=1)
-
 
 def test_in_lockstep_the_result_is_due_at_its_time_whether_it_is_there_or_not() -> None:
     go = Event()
-    thought = Thought(WORKER, 1000, 50, lambda: go.wait(10) and 7)
+    thought = Thought(1000, 50, lambda: go.wait(10) and 7)
     assert not thought.due(1049)
     assert thought.due(1050)
     go.set()
@@ -22,7 +19,7 @@ def test_in_lockstep_the_result_is_due_at_its_time_whether_it_is_there_or_not() 
 
 def test_on_a_wall_clock_an_unfinished_thought_is_not_due() -> None:
     go = Event()
-    thought = Thought(WORKER, 1000, 50, lambda: go.wait(10) and 7, lockstep=False)
+    thought = Thought(1000, 50, lambda: go.wait(10) and 7, lockstep=False)
     assert not thought.due(5000)
     go.set()
     assert thought.result() == 7
@@ -35,4 +32,4 @@ def test_what_the_work_raises_is_raised_again() -> None:
         raise KeyError("why")
 
     with pytest.raises(KeyError, match="why"):
-        Thought(WORKER, 0, 0, fail).result()
+        Thought(0, 0, fail).result()
