@@ -22,6 +22,7 @@ from palpate_bus.stamps import NS, nanoseconds
 from palpate_bus.zenoh_config import close_session, open_session
 from palpate_models.load import load_scenario
 
+from palpate_conductor.evidence import peak_force
 from palpate_conductor.forks import Forks
 from palpate_conductor.outcome import Patience, RunFailed
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
@@ -262,7 +263,7 @@ def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
             finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
             finding.sign = watch.signs[0] if watch.signs else str(result.failure)
     split = (finding.injected_s or 0.0) * NS
-    forces = [(nanoseconds(m.header.stamp), float(m.peak_force)) for m in collected.indentation]
+    forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in collected.indentation]
     finding.peak_force_before_n = round(max((f for t, f in forces if t < split), default=0.0), 2)
     after = [force for t, force in forces if t >= split]
     finding.peak_force_n = round(max(after), 2) if after else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import hypot
 from typing import Any
 
 import numpy as np
@@ -110,6 +111,11 @@ def samples_of(messages: list[Any]) -> Samples:
         time_in_contact=column([m.time_in_contact for m in messages]),
         force_limited=np.array([m.force_limited for m in messages], dtype=bool),
     )
+
+
+def peak_force(message: Any) -> float:
+    """Greatest contact force [N] since the `palpation_msgs/IndentationTruth` before, at least that of its own moment."""
+    return max(float(message.peak_force), hypot(message.normal_force, message.tangential_force))
 
 
 def centroids_of(findings: Any | None) -> Array:

@@ -20,6 +20,7 @@ from palpate_conductor.evidence import (
     Samples,
     centroids_of,
     map_of,
+    peak_force,
     points,
     samples_of,
     steady_contact,
@@ -159,7 +160,7 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
     if truth is not None and final is not None:
         scores = ScoresRow.model_validate(vars(scoring.score(centroids_of(final), found, truth)))
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
-    forces = [m.peak_force for m in c.indentation] or [s.normal_force for s in c.exam_states if s.in_contact]
+    forces = [peak_force(m) for m in c.indentation] or [s.normal_force for s in c.exam_states if s.in_contact]
     return Report(
         scenario=scenario.name,
         seed=scenario.seed,
