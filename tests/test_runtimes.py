@@ -103,6 +103,9 @@ def test_composed_an_observer_or_a_tap_that_fails_ends_no_run() -> None:
         def step(self, t: int, inbox: Inbox) -> Outbox:
             raise ValueError("nothing to draw on")
 
+        def finish(self) -> Mapping[str, Any]:
+            raise ValueError("nothing was drawn")
+
     def full(topic: Topic, payload: bytes, t: int, sequence: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -112,6 +115,7 @@ def test_composed_an_observer_or_a_tap_that_fails_ends_no_run() -> None:
     assert run.run_hash() == composed_hash()
     assert set(run.lost) == {"dashboard", "recorder"}
     assert any("nothing to draw on" in words for words in run.trouble)
+    assert set(run.finish()) == {*toy_services.TOYS, "conductor"}
 
 
 def test_composed_and_distributed_give_the_same_run_hash() -> None:

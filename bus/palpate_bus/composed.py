@@ -6,6 +6,7 @@ Every message is encoded once, since the run hash covers its bytes, and decoded 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from typing import Any
 
 from palpate_bus.contract import MS, Contract, Topic, contract
@@ -117,8 +118,12 @@ class Composed:
         return self.t - MS
 
     def finish(self) -> dict[str, Mapping[str, Any]]:
-        """Finishes every service; returns what each reports."""
-        return {role: stepper.service.finish() for role, stepper in self.steppers.items()}
+        """Finishes every service; returns what each reports. One that has failed need not."""
+        facts = {}
+        for role, stepper in self.steppers.items():
+            with suppress(Exception) if role in self.lost else nullcontext():
+                facts[role] = stepper.service.finish()
+        return facts
 
     def run_hash(self) -> str:
         """The run hash."""

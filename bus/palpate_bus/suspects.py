@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 
 from palpate_bus.checker import Checker
 from palpate_bus.codec import CodecError, Message
@@ -11,14 +12,17 @@ from palpate_bus.lockstep import InputBuffer, Received
 
 def failure(error: BaseException, buffers: Iterable[InputBuffer]) -> str:
     """An error in words, with each input that does not keep to its row of the contract and who sends it."""
-    return "; ".join((f"{type(error).__name__}: {error}", *suspects(buffers)))
+    words = [f"{type(error).__name__}: {error}"]
+    with suppress(Exception):  # whatever is wrong with an input must not hide the error
+        words += suspects(buffers)
+    return "; ".join(words)
 
 
 def suspects(buffers: Iterable[InputBuffer]) -> list[str]:
     """A sentence for each topic whose newest messages cannot be decoded or have values that the contract does not allow."""
     found = []
     for buffer in buffers:
-        for received in (*buffer.new, *([buffer.latest] if buffer.latest is not None else [])):
+        for received in buffer.new or ([buffer.latest] if buffer.latest is not None else []):
             wrong = _wrong(buffer, received)
             if wrong:
                 found.append(f"{buffer.topic.name} from {buffer.topic.producer} {wrong}")

@@ -18,6 +18,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import RobotStatus
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models import lbr, table
+from palpate_models.band import half_width
 from palpate_models.frames import apply, inverse
 from palpate_models.lbr_visual import visual_meshes
 from palpate_models.load import exam_input
@@ -282,8 +283,7 @@ class DashboardService(Service):
             return
         background = message.background if message.background > 0 else float(np.median(mean[scanned]))
         ratio = mean / background
-        lower, upper = np.asarray(message.stiffness_lower), np.asarray(message.stiffness_upper)
-        spread = np.sqrt(upper / np.maximum(lower, 1e-9)) - 1  # the band is a factor up and down
+        spread = half_width(message.stiffness_lower, message.stiffness_upper)
         self._map.update(t, vertices, arrays.triples(message.triangles), ratio, spread, scanned)
         self._scene.stiffness(t, apply(self._X_WA, vertices.astype(np.float64)).astype(np.float32), ratio, scanned)
 

@@ -1,4 +1,4 @@
-"""The FMU's variables: one table, from which modelDescription.xml, the C code's table come.
+"""The FMU's variables: one table, from which modelDescription.xml and the C code's table come.
 
 A value reference stands for a whole array in FMI 3.0. FMI 2.0 has scalars only: there, element k of a variable has its
 value reference plus k, and is named `name[1]` or `name[1,2]`.

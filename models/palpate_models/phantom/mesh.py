@@ -86,8 +86,10 @@ def check(vertices: Array, triangles: IntArray) -> None:
     size = float(np.ptp(vertices, axis=0).max())
     if size > LARGEST_M:
         units = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
-        likely = [f"{name}? Scale it by {factor:g}" for name, factor in units.items() if 0.15 < size * factor < LARGEST_M]
-        raise MeshError(f"it is {size:.4g} m large, more than {LARGEST_M} m: is it in {(likely or ['metres?'])[0]} (want metres)")
+        likely = [
+            f": is it in {name}? Scale it by {factor:g}" for name, factor in units.items() if 0.15 < size * factor < LARGEST_M
+        ]
+        raise MeshError(f"it is {size:.4g} m large, more than {LARGEST_M} m{''.join(likely[:1])} (want metres)")
     if size < SMALLEST_M:
         raise MeshError(f"it is {size:.4g} m large, less than {SMALLEST_M} m: want metres")
     corners = vertices[triangles]

@@ -5,6 +5,8 @@ Columns over time are arrays in SI units. The final map, findings and phantom ar
 
 from __future__ import annotations
 
+import json
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -127,6 +129,14 @@ def write_evidence(path: Path, c: Collected) -> None:
 
 _FLOATS: Final = {"depth": "depth", "setpoint": "depth_setpoint", "force": "normal_force"}
 _FLAGS: Final = ("in_contact", "steady", "force_limited")
+
+
+def completed(folder: Path) -> dict[str, Any] | None:
+    """report.json of a completed run with its evidence; None where there is none."""
+    with suppress(OSError, ValueError):
+        report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        return report if report["failure"] is None and (folder / FILE).is_file() else None
+    return None
 
 
 def read_evidence(folder: Path) -> Evidence:

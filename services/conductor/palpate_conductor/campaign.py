@@ -224,7 +224,7 @@ def run_case(case: Case, folder: Path, forks: Forks | None = None) -> Finding:
             for role in WORKERS:
                 local.start(processes[role])
             watch = _Watch(case, local, target, finding)
-            result = conduct(session, WORKERS, watch.tell, lambda: _died(local), None, case.wallclock, PATIENCE)
+            result = conduct(session, WORKERS, watch.tell, local.ended, None, case.wallclock, PATIENCE)
             if result.interrupted:
                 raise KeyboardInterrupt
             _conclude(finding, watch, result)
@@ -246,10 +246,6 @@ def _fault(case: Case) -> Mapping[str, str]:
         return {"PALPATE_FAULT": "clock:jump"}
     lasting = case.kind in LASTING or (case.wallclock and case.kind == "drop")
     return {"PALPATE_FAULT": f"{case.where}:{case.kind}", "PALPATE_FAULT_COUNT": "0" if lasting else "1"}
-
-
-def _died(local: LocalProcesses) -> Mapping[str, str]:
-    return {role: f"killed by signal {-code}" if code < 0 else f"left with status {code}" for role, code in local.ended().items()}
 
 
 def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:

@@ -14,12 +14,12 @@ from rich.markup import escape
 from palpate_conductor.campaign import KINDS, Finding, as_json, cases, forks, run_case
 from palpate_conductor.campaign_tables import markdown, table
 from palpate_conductor.case_display import CaseDisplay
-from palpate_conductor.files import replace_part, write_text
+from palpate_conductor.files import write_text
+from palpate_conductor.marked import doc_option, write_part
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
 WIDE = 200
-BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 
 Listed = Annotated[list[str] | None, typer.Option("--only", help="Keep these roles and topics; may be repeated.")]
 
@@ -31,7 +31,7 @@ def faults(
     out: Annotated[Path, typer.Option(help="File for the findings; those already there are kept, and not run again.")] = Path(
         "faults.json"
     ),
-    doc: Annotated[Path | None, typer.Option(help="A Markdown file whose marked table is replaced.")] = None,
+    doc: Annotated[Path | None, doc_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
 ) -> None:
@@ -63,10 +63,7 @@ def faults(
             display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDE, Console().width)).print(table(found))
     if doc is not None:
-        try:
-            replace_part(doc, BEGIN, END, markdown(found))
-        except (OSError, ValueError) as error:
-            raise typer.BadParameter(str(error), param_hint="--doc") from None
+        write_part(doc, "faults", markdown(found))
     if any(not finding.good for finding in found):
         raise typer.Exit(EXIT_FAILED)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from contextlib import nullcontext
 from datetime import datetime
 from functools import partial
@@ -16,6 +17,7 @@ from palpate_bus.keys import KeysError
 from palpate_bus.router import DEFAULT_ENDPOINT, serve
 from palpate_bus.zenoh_config import BusConfigError, close_session, open_session
 from palpate_models.load import ScenarioError, exam_input, load_scenario, scenario_names
+from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.scenario import Scenario
 from rich.console import Console
 from rich.markup import escape
@@ -83,6 +85,15 @@ RUN_EXAMPLES = """
 """
 
 
+def _usable(name: str, settings: Sequence[str], seed: int | None) -> Scenario:
+    """A scenario whose services are installed and whose phantom can be made. Raises ScenarioError or MeshError."""
+    scenario = load_scenario(name, settings, seed)
+    chosen_services(scenario)
+    if scenario.tissue.implementation != NONE:
+        build_phantom(scenario.phantom, scenario.seed)
+    return scenario
+
+
 @app.command(epilog=RUN_EXAMPLES)
 def run(
     scenario: Annotated[
@@ -123,11 +134,10 @@ def run(
     console = Console(stderr=True)
     quiet = quiet or as_json
     try:
-        chosen = load_scenario(scenario, settings or (), seed)
-        chosen_services(chosen)
+        chosen = _usable(scenario, settings or (), seed)
         own = own_services(services or ())
         absent = Absent(tuple(without or ()), wait, partial(console.print, highlight=False, soft_wrap=True))
-    except (ScenarioError, OwnServiceError, JoinError) as error:
+    except (ScenarioError, MeshError, OwnServiceError, JoinError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     if composed and (realtime or wallclock):
         _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")

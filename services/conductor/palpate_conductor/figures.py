@@ -18,6 +18,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
+from palpate_models.band import half_width
 
 from palpate_conductor.evidence import Samples, map_of
 from palpate_conductor.scoring import Map, TrueSurface, Truth
@@ -30,11 +31,6 @@ FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS = "viridis", "inferno", "c
 _FINDING, _TRUE = "#18e0d0", "#ffffff"
 _SMALL = 8.5
 _LOG_TICKS = [m * 10.0**e for e in range(4) for m in (1, 1.5, 2, 3, 4, 5, 7)]
-
-
-def half_band_percent(lower: Array, upper: Array) -> Array:
-    """Half width of the 90 % band [%], shape (n,): the band is a factor up and down, this is that factor less one."""
-    return np.asarray(100 * (np.sqrt(upper / np.maximum(lower, 1e-9)) - 1))
 
 
 def drawable(message: Any) -> bool:
@@ -189,7 +185,7 @@ def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -
     solid.set_box_aspect((1, 1, 0.72), zoom=1.14)
     panel_title(solid, "b", "Normal force in 3-D", "height and colour are force")
     spread = figure.add_subplot(grid[0, 2])
-    half = half_band_percent(drawing.map.lower, drawing.map.upper)
+    half = 100 * half_width(drawing.map.lower, drawing.map.upper)
     image = drawing.plane(spread, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
     drawing.outlines(spread, truth=False)
     panel_title(spread, "c", "Uncertainty of the stiffness", "half width of the 90 % band")

@@ -111,10 +111,8 @@ def verdict(report: Report) -> str:
         return f"The examination did not complete: {report.failure}."
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
-    if not report.findings and report.skipped_targets:
-        return f"No area was found that is stiffer than healthy variation explains{_unreached(report)}."
     if not report.findings:
-        return "No area was found that is stiffer than healthy variation explains."
+        return f"No area was found that is stiffer than healthy variation explains{_unreached(report)}."
     return " ".join(_in_words(finding) for finding in report.findings)
 
 

@@ -12,6 +12,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from palpate_bus.messages import ExamState
+from palpate_models.band import half_width
 
 from palpate_conductor.archive import Evidence
 from palpate_conductor.evidence import truth_of
@@ -24,7 +25,6 @@ from palpate_conductor.figures import (
     Drawing,
     colour_bar,
     drawable,
-    half_band_percent,
     panel_title,
 )
 
@@ -93,7 +93,7 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     drawing.outlines(middle, truth=False, labels=True)
     panel_title(middle, "b", "Stiffness", "times the background; findings outlined")
     colour_bar(figure, image, middle, "times background")
-    half = half_band_percent(drawing.map.lower, drawing.map.upper)
+    half = 100 * half_width(drawing.map.lower, drawing.map.upper)
     image = drawing.plane(right, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
     drawing.outlines(right, truth=False)
     panel_title(right, "c", "How sure", "half width of the 90 % band of the stiffness")

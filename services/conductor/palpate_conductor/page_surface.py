@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm, Normalize, to_hex
 from numpy.typing import NDArray
+from palpate_models.band import half_width
 
 from palpate_conductor.evidence import map_of
-from palpate_conductor.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS, half_band_percent
+from palpate_conductor.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS
 
 Array = NDArray[np.float64]
 MAX_VERTICES = 65_535
@@ -44,7 +45,7 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     force = np.asarray(message.force, dtype=np.float64)
     ratio = mapped.stiffness / float(message.background)
     known = mapped.scanned
-    half = half_band_percent(mapped.lower, mapped.upper)
+    half = 100 * half_width(mapped.lower, mapped.upper)
     low, high = float(np.quantile(ratio[known], 0.01)), max(2.0, float(np.quantile(ratio[known], 0.99)))
     relief = np.column_stack((shape[:, :2], np.where(known, force, 0.0) * (0.7 * radius / max(force[known].max(), 1e-9))))
     relief[:, 2] -= relief[known, 2].mean()

@@ -102,6 +102,15 @@ def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceP
     return ServiceProcess(role, tuple(command), {**before, **{k: str(v) for k, v in environment.items()}})
 
 
+def how(code: int, log: Path) -> str:
+    """How a process ended, in words: its signal, or its exit status `code` and the last line of its log."""
+    if code < 0:
+        return f"killed by signal {-code}"
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    said = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+    return f"left with status {code}: {said}"
+
+
 class LocalProcesses:
     """Service processes on this machine, each with its log file; unix sockets in a folder of their own carry the bus."""
 
@@ -176,9 +185,10 @@ class LocalProcesses:
             process_group=0,  # Ctrl-C is the conductor's to hear: it ends the run, and the recorder closes its files
         )
 
-    def ended(self) -> dict[str, int]:
-        """Exit status of every process that has ended, by role; negative is a signal's number."""
-        return {role: code for role, child in self.running.items() if (code := child.poll()) is not None}
+    def ended(self) -> dict[str, str]:
+        """How each process that has ended did so, by role: by a signal, or with a status and the last line of its log."""
+        gone = {role: code for role, child in self.running.items() if (code := child.poll()) is not None}
+        return {role: how(code, self._out / "logs" / f"{role}.log") for role, code in gone.items()}
 
     def stop(self, patience_s: float = 5.0) -> None:
         """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets."""

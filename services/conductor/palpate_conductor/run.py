@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -146,12 +147,9 @@ def run_distributed(
             patience = replace(patience or Patience(), absent=absent.roles, join=absent.wait_s)
             absent.call(out, {role: (processes[role].command, local.environment(processes[role])) for role in absent.roles})
 
-        def died() -> Mapping[str, str]:
-            return {role: _how(code) for role, code in local.ended().items()}
-
         try:
             tree = FrameTree(exam_input(scenario))
-            result = conduct(session, roles, tell, died, realtime, wallclock, patience, begin, tree, handover_s)
+            result = conduct(session, roles, tell, local.ended, realtime, wallclock, patience, begin, tree, handover_s)
             if absent is not None and result.failure is not None:
                 result.failure = absent.explain(result.failure)
             return result
@@ -220,10 +218,6 @@ def _given_up(collected: Collected) -> str | None:
     return str(exam.message) if exam is not None and exam.phase == ExamState.PHASE_ABORTED else None
 
 
-def _how(code: int) -> str:
-    return f"killed by signal {-code}" if code < 0 else f"left with status {code}"
-
-
 def load_services(scenario: Scenario, roles: tuple[str, ...], own: Mapping[str, Path] | None = None) -> list[Service]:
     """The services of `roles` in this process, from the files of `own` and the entry points `palpate.services`.
 
@@ -289,7 +283,8 @@ def run_composed(
     facts = run.finish()
     for recorder in recorders:
         if isinstance(recorder, Service):
-            facts[recorder.role] = recorder.finish()
+            with suppress(Exception) if recorder.role in run.lost else nullcontext():
+                facts[recorder.role] = recorder.finish()
     return RunResult(
         runtime="composed",
         collected=collector.collected,

@@ -10,13 +10,13 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from palpate_conductor.archive import completed
 from palpate_conductor.processes import ProcessListError
 
 REFERENCE = "reference"
@@ -85,14 +85,6 @@ def read_report(folder: Path) -> dict[str, Any]:
     return report
 
 
-def complete(folder: Path) -> dict[str, Any] | None:
-    """The report of a run that is complete in `folder`, None where there is none."""
-    with suppress(OSError, ValueError):
-        report = read_report(folder)
-        return report if report["failure"] is None else None
-    return None
-
-
 def measure(
     scenario: str,
     settings: Sequence[str],
@@ -109,7 +101,7 @@ def measure(
     reference = Swap(REFERENCE, (), "")
     for swap in (reference, *swaps):
         where = folder / swap.name
-        if keep and (kept := complete(where)) is not None:
+        if keep and (kept := completed(where)) is not None:
             reports[swap.name] = kept
             continue
         tell(swap.name)

@@ -9,11 +9,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate_conductor.files import replace_part
+from palpate_conductor.marked import doc_option, write_part
 from palpate_conductor.processes import ProcessListError, compose_file
 from palpate_conductor.swaps import measure, read_swaps, table
-
-BEGIN, END = "<!-- palpate swaps: begin -->\n", "<!-- palpate swaps: end -->\n"
 
 
 def swaps(
@@ -24,7 +22,7 @@ def swaps(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the runs.")] = Path("out/swaps"),
     keep: Annotated[bool, typer.Option("--keep", help="Do not run again what is in the folder.")] = False,
-    doc: Annotated[Path | None, typer.Option(help="A Markdown file whose marked table is replaced.")] = None,
+    doc: Annotated[Path | None, doc_option("swaps")] = None,
 ) -> None:
     """Measure what each swap of `swap/` changes in the findings; print the table. A minute or two a swap."""
     console = Console(stderr=True)
@@ -41,7 +39,4 @@ def swaps(
     text = table(chosen, reports)
     typer.echo(text)
     if doc is not None:
-        try:
-            replace_part(doc, BEGIN, END, text)
-        except (OSError, ValueError) as error:
-            raise typer.BadParameter(str(error), param_hint="--doc") from None
+        write_part(doc, "swaps", text)

@@ -14,14 +14,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate_conductor.files import replace_part
+from palpate_conductor.marked import doc_option, write_part
 from palpate_conductor.swaps import read_report
 
 FAST = ("robot", "tissue", "control")
 LEGS = (("state to controller", "control", "joint_states"), ("command to robot", "robot", "control/joint_torque"))
 """Ways of a message: what it is, who looks at it, topic."""
 PARTS = ("p50", "p99", "max")
-BEGIN, END = "<!-- palpate wallclock: begin -->\n", "<!-- palpate wallclock: end -->\n"
 
 
 def _run(scenario: str, settings: list[str], folder: Path, rate: int, *options: str) -> dict[str, Any]:
@@ -104,7 +103,7 @@ def wallclock(
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the runs; by default they are thrown away.")] = None,
-    doc: Annotated[Path | None, typer.Option(help="A Markdown file whose marked tables are replaced.")] = None,
+    doc: Annotated[Path | None, doc_option("wallclock")] = None,
 ) -> None:
     """Measure an examination in real time: age of states and commands, late ticks, and its findings beside lockstep's."""
     console = Console(stderr=True)
@@ -131,7 +130,4 @@ def wallclock(
     text += "\n".join((latencies(real), ticks(real), comparison(found)))
     typer.echo(text)
     if doc is not None:
-        try:
-            replace_part(doc, BEGIN, END, text)
-        except (OSError, ValueError) as error:
-            raise typer.BadParameter(str(error), param_hint="--doc") from None
+        write_part(doc, "wallclock", text)

@@ -5,9 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from palpate_conductor.files import replace_part, write_text
+import typer
+from palpate_conductor.commands import app_for
+from palpate_conductor.files import write_text
+from palpate_conductor.marked import write_part
+from typer.testing import CliRunner
 
-BEGIN, END = "<!-- begin -->\n", "<!-- end -->\n"
+BEGIN, END = "<!-- palpate swaps: begin -->\n", "<!-- palpate swaps: end -->\n"
 
 
 def test_a_file_is_replaced_and_nothing_is_left_beside_it(tmp_path: Path) -> None:
@@ -30,7 +34,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
 def test_only_what_is_between_the_marks_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "doc.md"
     path.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    replace_part(path, BEGIN, END, "new\n")
+    write_part(path, "swaps", "new\n")
     assert path.read_text() == f"before\n{BEGIN}new\n{END}after\n"
 
 
@@ -38,6 +42,16 @@ def test_only_what_is_between_the_marks_is_replaced(tmp_path: Path) -> None:
 def test_a_document_without_both_marks_is_refused_and_kept(tmp_path: Path, text: str) -> None:
     path = tmp_path / "doc.md"
     path.write_text(text)
-    with pytest.raises(ValueError, match="has no part to replace"):
-        replace_part(path, BEGIN, END, "new\n")
+    with pytest.raises(typer.BadParameter, match="has no part to replace"):
+        write_part(path, "swaps", "new\n")
     assert path.read_text() == text
+
+
+def test_a_document_is_looked_at_before_anything_is_measured(tmp_path: Path) -> None:
+    path = tmp_path / "doc.md"
+    path.write_text("no marks\n")
+    for command in ("faults", "swaps", "wallclock"):
+        done = CliRunner().invoke(app_for(command), [command, "--doc", str(path)])
+        assert done.exit_code == 2
+        words = " ".join(done.output.replace("│", " ").split())  # without the box
+        assert "wants the lines" in words

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from palpate_conductor.cli import EXIT_BAD_INPUT, app
 from palpate_conductor.implementations import chosen_processes
-from palpate_conductor.processes import ProcessListError, compose_file, override_files, read_processes
+from palpate_conductor.processes import ProcessListError, compose_file, how, override_files, read_processes
 from palpate_conductor.run import OBSERVERS, WORKERS, workers
 from palpate_conductor.swaps import read_swaps
 from palpate_models.load import load_scenario
@@ -105,3 +105,27 @@ def test_a_swap_without_settings_is_named(tmp_path: Path) -> None:
     (tmp_path / "robot-x.yml").write_text("x-swap: words\nservices: {robot: {command: [a]}}")
     with pytest.raises(ProcessListError, match=r"robot-x\.yml.*PALPATE_SETTINGS"):
         read_swaps(tmp_path)
+
+
+def test_how_a_process_ended_is_said_in_its_own_words(tmp_path: Path) -> None:
+    log = tmp_path / "tissue.log"
+    log.write_text("Traceback (most recent call last):\n  File ...\nMeshError: two holes\n\n")
+    assert how(3, log) == "left with status 3: MeshError: two holes"
+    assert how(-9, log) == "killed by signal 9"
+    log.write_text("")
+    assert how(1, log) == "left with status 1: it said nothing"
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["phantom.lesions=[{centre_m: [-55, 10]}]"], "phantom.lesions[0]"),
+        (["phantom.kind=mesh", "phantom.mesh=/nowhere.stl"], "phantom.mesh = /nowhere.stl: no such file"),
+    ],
+)
+def test_a_phantom_that_cannot_be_made_is_named_before_anything_starts(settings: list[str], words: str, tmp_path: Path) -> None:
+    options = [word for setting in settings for word in ("--set", setting)]
+    called = CliRunner().invoke(app, ["run", *options, "--out", str(tmp_path / "out")])
+    assert called.exit_code == EXIT_BAD_INPUT
+    assert words in called.output
+    assert not (tmp_path / "out").exists()

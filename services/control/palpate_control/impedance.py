@@ -74,14 +74,12 @@ class ImpedanceController:
         self._design_age = 0
         self._stiffness = self._damping = np.zeros(6)
         self._posture_damping = np.zeros(DOF)
-        self._joint_designed_for: Array | None = None
-        self._joint_design_age = 0
         self._joint_stiffness = self._joint_damping = np.zeros((DOF, DOF))
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
         self._shaper.reset()
-        self._designed_for = self._joint_designed_for = None
+        self._designed_for = None
 
     def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
         """Torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s].
@@ -102,14 +100,21 @@ class ImpedanceController:
     def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
         model = self.model
         model.update_gravity(q)
-        if reference.joint_stiffness is not self._joint_designed_for or self._joint_design_age >= DESIGN_TICKS:
+        if self._outdated(reference.joint_stiffness):
             self._design_joint(q, reference.joint_stiffness)
-        self._joint_design_age += 1
         error = np.minimum(np.maximum(reference.q - q, -JOINT_CLIP_RAD), JOINT_CLIP_RAD)
         torque: Array = (
             self._joint_stiffness.dot(error) + self._joint_damping.dot(reference.qd - qd) + self._friction(reference.qd)
         )
         return torque + model.inverse_dynamics(q, qd, reference.qdd)
+
+    def _outdated(self, stiffness: Array) -> bool:
+        """Whether gains are to be designed now for the stiffness that is asked for, of the mode that is on."""
+        if stiffness is self._designed_for and self._design_age < DESIGN_TICKS:
+            self._design_age += 1
+            return False
+        self._designed_for, self._design_age = stiffness, 1
+        return True
 
     def _design_joint(self, q: Array, stiffness: Array) -> None:
         """Gains of mode JOINT at a posture, mode by mode bounded as in `_design`."""
@@ -122,16 +127,14 @@ class ImpedanceController:
         damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(squared)
         self._joint_stiffness = (P * squared).dot(P.T)
         self._joint_damping = (P * np.maximum(damping - friction, LEAST_DAMPING * damping)).dot(P.T)
-        self._joint_designed_for, self._joint_design_age = stiffness, 0
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
         model = self.model
         model.update(q, qd)
         R_WD = np.ascontiguousarray(reference.R_WD)
         kernel.task_space(R_WD, model.J_W, model.slow_mobility, REGULARISATION, self._J, self._JW, self._slow_inertia)
-        if reference.stiffness is not self._designed_for or self._design_age >= DESIGN_TICKS:
+        if self._outdated(reference.stiffness):
             self._design(reference)
-        self._design_age += 1
         torque = np.empty(DOF)
         kernel.cartesian_torque(
             q,
@@ -177,7 +180,6 @@ class ImpedanceController:
         self._damping = np.maximum(damping - friction, LEAST_DAMPING * damping)
         free = joint_mobility.diagonal()
         self._posture_damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(reference.joint_stiffness / free)
-        self._designed_for, self._design_age = reference.stiffness, 0
 
 
 def _inverse(matrix: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,6 @@ from palpate_planning.timing import JointTrajectory, Pace
 from palpate_planning.weight import ToolWeight
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -237,14 +235,11 @@ class Exam:
             if float(np.abs(self._follower.q - goal).max()) < AT_HOME_RAD:
                 return True
             start, seen = self._follower.q.copy(), self._seen
-            self._motion = self._think(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen))
+            self._motion = Thought(now.t, MOTION_BUDGET, lambda: self._planner.motion(start, goal, seen), lockstep=self._lockstep)
         elif self._motion.due(now.t):
             self._follower.start(self._motion.result())
             self._motion = None
         return False
-
-    def _think(self, t: int, budget: int, work: Callable[[], T]) -> Thought[T]:
-        return Thought(t, budget, work, lockstep=self._lockstep)
 
     # --- phases -------------------------------------------------------------------------------------------------------
 
@@ -293,7 +288,7 @@ class Exam:
         if self._thought is None:
             seen, start = self._seen, self._follower.q.copy()
             assert seen is not None
-            self._thought = self._think(now.t, PLAN_BUDGET, lambda: self._planner.examination(seen, start))
+            self._thought = Thought(now.t, PLAN_BUDGET, lambda: self._planner.examination(seen, start), lockstep=self._lockstep)
         elif self._thought.due(now.t):
             try:
                 plan = self._thought.result()

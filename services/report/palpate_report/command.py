@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
-from palpate_conductor.archive import EvidenceError
+from palpate_conductor.archive import EvidenceError, completed
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from palpate_report import reproduction
-from palpate_report.runs import CASES, GRAPH, POINTS, SNAKE, RunError, finished, perform, record_graph
+from palpate_report.runs import CASES, GRAPH, POINTS, SNAKE, RunError, perform, record_graph
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 3
@@ -77,7 +77,7 @@ def reproduce(
     try:
         with steps.bar if not quiet else nullcontext():
             for case in cases:
-                if again or not finished(out / case.name):
+                if again or completed(out / case.name) is None:
                     steps.tell(f"examining: {case.pattern}, {case.mode}")
                     perform(case, out / case.name, chosen)
             if again or not (out / "bus" / GRAPH).is_file():

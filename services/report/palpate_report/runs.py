@@ -6,15 +6,15 @@ import json
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
-from typing import Any, Final
+from typing import Final
 
 from palpate_bus.liveliness import GraphWatch, Kind
 from palpate_bus.runs import Run, live
 from palpate_bus.zenoh_config import session
+from palpate_conductor.archive import completed
 
 GRAPH: Final = "graph.json"
 LISTEN_S: Final = 3.0
@@ -48,14 +48,6 @@ class RunError(RuntimeError):
     """An examination that did not complete. Names its folder and what it said."""
 
 
-def finished(folder: Path) -> bool:
-    """Whether the folder holds a completed run."""
-    with suppress(OSError, ValueError):
-        report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        return report["failure"] is None and (folder / "evidence.npz").is_file()
-    return False
-
-
 def perform(case: Case, folder: Path, settings: tuple[str, ...]) -> None:
     """Examines in one process into `folder`; the paper's case is recorded. Raises RunError."""
     words = ["--composed", "--quiet"] + ([] if case == SNAKE else ["--no-record"])
@@ -66,7 +58,7 @@ def perform(case: Case, folder: Path, settings: tuple[str, ...]) -> None:
         process.wait()
     finally:
         _stop(process)
-    if process.returncode or not finished(folder):
+    if process.returncode or completed(folder) is None:
         raise RunError(f"{case.name} left with status {process.returncode}: {_said(folder)} ({folder})")
 
 

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from palpate_conductor.archive import Evidence
+from palpate_conductor.archive import Evidence, completed
 from palpate_report import figures
 from palpate_report.render import BACKGROUND, Body, View, picture
 from palpate_report.reproduction import chosen_moments
-from palpate_report.runs import finished
 from PIL import Image
 
 
@@ -74,12 +73,12 @@ def test_the_moments_are_of_their_phases() -> None:
 
 
 def test_a_run_that_failed_is_not_finished(tmp_path: Path) -> None:
-    assert not finished(tmp_path)
+    assert completed(tmp_path) is None
     (tmp_path / "evidence.npz").touch()
     (tmp_path / "report.json").write_text('{"failure": "robot lost"}', encoding="utf-8")
-    assert not finished(tmp_path)
+    assert completed(tmp_path) is None
     (tmp_path / "report.json").write_text('{"failure": null}', encoding="utf-8")
-    assert finished(tmp_path)
+    assert completed(tmp_path) is not None
 
 
 @pytest.mark.slow

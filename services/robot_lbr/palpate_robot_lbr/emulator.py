@@ -244,7 +244,7 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGINT, stop)
     node = RosNode("lbr_emulator", given.domain, BusOptions(listen=(given.listen,)))
     log.info("an LBR at %s, FRI every %d ms", given.listen, options.period_ms)
-    gc.freeze()  # a controller cabinet does not pause for some 50 ms
+    gc.freeze()  # a controller cabinet takes no tenth of a second to collect garbage
     try:
         serve(emulator, Graph(node, options), options, running)
     finally:

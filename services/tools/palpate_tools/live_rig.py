@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Callable
 from time import monotonic, sleep, time_ns
 from typing import Any
 
@@ -48,10 +47,7 @@ class LiveRig(Rig):
         self.graph = GraphWatch(session, domain)
         self._tokens: dict[str, NodeTokens] = {}
         self._publishers: dict[str, Publisher] = {}
-        self._encoders: dict[str, Callable[[Message], bytes]] = {}
-        """Made now: in the middle of a check an implementation would miss commands meanwhile, and rightly hold."""
         for topic, _ in self.rules.inputs(role):
-            self._encoders[topic.name] = codec.encoder(topic.type)
             tokens = self._tokens.setdefault(topic.producer, NodeTokens(session, topic.producer, domain))
             qos = self.rules.qos[topic.qos]
             self._publishers[topic.name] = Publisher(session, topic_key(topic, domain), qos, tokens.publisher(topic, qos))
@@ -221,7 +217,7 @@ class LiveRig(Rig):
 
     def send(self, topic: str, message: Message) -> None:
         """Publishes a message as its rightful producer."""
-        self._next(topic, self._encoders[topic](message))
+        self._next(topic, codec.encode(message, self.rules.topics[topic].type))
 
     def lose(self, role: str) -> None:
         """Says that a role is lost, as a conductor does."""
