@@ -10,7 +10,7 @@ from contextlib import nullcontext, suppress
 from typing import Any
 
 from palpate_bus.contract import MS, Contract, Topic, contract
-from palpate_bus.lockstep import InputBuffer, Received, Sent, Stepper, run_hash
+from palpate_bus.lockstep import InputBuffer, OutputPort, Received, Sent, Stepper, run_hash
 from palpate_bus.service import Service
 from palpate_bus.suspects import failure
 
@@ -50,9 +50,10 @@ class Composed:
         observers = [role for role in order if self.contract.roles[role].observer]
         self.steppers = {role: Stepper(by_role[role], self.contract) for role in (*workers, *observers)}
         self._taps = tuple(taps)
-        self._readers: dict[str, tuple[InputBuffer, ...]] = {
-            name: tuple(stepper.buffers[name] for stepper in self.steppers.values() if name in stepper.buffers)
-            for name in self.contract.topics
+        self._readers: dict[OutputPort, tuple[InputBuffer, ...]] = {
+            port: tuple(stepper.buffers[name] for stepper in self.steppers.values() if name in stepper.buffers)
+            for sender in self.steppers.values()
+            for name, port in sender.ports.items()
         }
         self._schedule = tuple((stepper, stepper.role.period) for stepper in self.steppers.values())
         self._started = False
@@ -64,9 +65,10 @@ class Composed:
 
     def _send(self, sent: Sequence[Sent], t: int) -> None:
         for port, payload, sequence in sent:
-            received = Received(payload, t, sequence)
-            for buffer in self._readers[port.topic.name]:
-                buffer.deliver(received)
+            if readers := self._readers[port]:
+                received = Received(payload, t, sequence)
+                for buffer in readers:
+                    buffer.deliver(received)
             for tap in self._taps:
                 try:
                     tap(port.topic, payload, t, sequence)

@@ -12,7 +12,6 @@ import struct
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
-from typing import NamedTuple
 
 from palpate_bus import codec
 from palpate_bus.blame import Blame
@@ -21,6 +20,8 @@ from palpate_bus.contract import Contract, Edge, Topic
 from palpate_bus.service import Outbox, Service
 
 _CHAIN = struct.Struct("<qqq")
+_SMALL = 4096
+"""A payload up to this size [bytes] is cheaper copied behind its head than hashed in a call of its own."""
 NEVER = -1
 """The tick of something that has not happened."""
 
@@ -44,12 +45,13 @@ class Received:
 class InputBuffer:
     """What a service holds of one topic, and how far the producer has advanced.
 
-    `advanced` is the producer's tick [ns] up to which the topic is known completely; `new` are the messages of the current step.
+    `advanced` is the producer's tick [ns] up to which the topic is known completely; `new` are the messages of the current step,
+    `pending` those of later ones.
     """
 
     __slots__ = (
-        "_advances", "_blocks", "_last_sequence", "_latched", "_pending", "_unstamped",
-        "advanced", "decode", "delay", "edge", "grid", "latest", "lost", "new", "period", "topic",
+        "_advances", "_blocks", "_last_sequence", "_latched", "_unstamped",
+        "advanced", "decode", "delay", "edge", "grid", "latest", "lost", "new", "pending", "period", "topic",
     )  # fmt: skip
 
     def __init__(self, topic: Topic, edge: Edge, producer_period: int) -> None:
@@ -64,7 +66,7 @@ class InputBuffer:
         self.new: list[Received] = []
         self.lost = False
         self._blocks, self._latched = edge.blocking, edge is Edge.LATCHED
-        self._pending: deque[Received] = deque()
+        self.pending: deque[Received] = deque()
         self._unstamped: deque[Received] = deque()
         self._advances: deque[tuple[int, int]] = deque()
         self._last_sequence = 0
@@ -89,10 +91,10 @@ class InputBuffer:
         self._last_sequence = sequence
         if self.topic.periodic:
             stamp = (sequence - 1) * self.period
-            self._pending.append(Received(payload, stamp, sequence))
+            self.pending.append(Received(payload, stamp, sequence))
             self.advanced = stamp
         elif self.topic.latched:
-            self._pending.append(Received(payload, 0, sequence))
+            self.pending.append(Received(payload, 0, sequence))
         else:
             self._unstamped.append(Received(payload, NEVER, sequence))
             self._settle()
@@ -108,7 +110,7 @@ class InputBuffer:
             while self._unstamped and self._unstamped[0].sequence <= sequence:
                 received = self._unstamped.popleft()
                 received.stamp = tick
-                self._pending.append(received)
+                self.pending.append(received)
             self.advanced = tick
 
     @property
@@ -119,17 +121,17 @@ class InputBuffer:
     @property
     def holds_any(self) -> bool:
         """Whether any message has come."""
-        return bool(self._pending) or self.latest is not None
+        return bool(self.pending) or self.latest is not None
 
     def deliver(self, received: Received) -> None:
         """Takes a message whose stamp is known (composed run, observers)."""
-        self._pending.append(received)
+        self.pending.append(received)
         self.advanced = received.stamp
 
     def take(self, t: int) -> None:
         """Moves what the reader may see at `t` into `new` and `latest`."""
         limit = t - self.delay
-        pending = self._pending
+        pending = self.pending
         if not pending or pending[0].stamp > limit:
             if self.new:
                 self.new = []
@@ -165,7 +167,7 @@ class TickInbox:
     def new(self, topic: str) -> list[Message]:
         """The messages since the step before, oldest first."""
         buffer = self._buffers[topic]
-        return [self._message(buffer, received) for received in buffer.new]
+        return [self._message(buffer, received) for received in buffer.new] if buffer.new else []
 
     def raw(self, topic: str) -> Sequence[Received]:
         """The messages since the step before, undecoded."""
@@ -195,28 +197,30 @@ class OutputPort:
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
 
-    def pack(self, message: Message) -> bytes:
+    def pack(self, message: Message) -> Sent:
         """Encodes and numbers a message."""
         self.sequence += 1
-        return self.encode(message)
+        return self, self.encode(message), self.sequence
 
     def chain(self, payload: bytes, stamp: int, sequence: int) -> None:
         """Takes a sent message into the digest."""
-        if self._digest is not None:
-            self._digest.update(_CHAIN.pack(stamp, sequence, len(payload)))
-            self._digest.update(payload)
+        digest = self._digest
+        if digest is None:
+            return
+        size = len(payload)
+        if size <= _SMALL:
+            digest.update(_CHAIN.pack(stamp, sequence, size) + payload)
+        else:
+            digest.update(_CHAIN.pack(stamp, sequence, size))
+            digest.update(payload)
 
     def digest(self) -> str | None:
         """Hexadecimal digest, None for a topic that is not hashed."""
         return None if self._digest is None else self._digest.hexdigest()
 
 
-class Sent(NamedTuple):
-    """A message on its way out."""
-
-    port: OutputPort
-    payload: bytes
-    sequence: int
+Sent = tuple[OutputPort, bytes, int]
+"""A message on its way out: port, payload, sequence."""
 
 
 class Stepper:
@@ -244,9 +248,9 @@ class Stepper:
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
-            payload = port.pack(message)
-            port.chain(payload, 0, port.sequence)
-            sent.append(Sent(port, payload, port.sequence))
+            packed = port.pack(message)
+            port.chain(packed[1], 0, packed[2])
+            sent.append(packed)
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
             raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
@@ -261,8 +265,7 @@ class Stepper:
 
         Raises LockstepError when the service leaves out a periodic message or sends one off its tick.
         """
-        for buffer in self._all:
-            buffer.take(t)
+        self._take(t)
         blame = self.blame
         begin, decoded = perf_counter_ns(), blame.decode
         for outbox in self.service.parts(t, self.inbox):
@@ -278,24 +281,31 @@ class Stepper:
             stepped = perf_counter_ns()
             blame.encode += stepped - begin
             begin = stepped
-        for port in self._periodic if self._strict else ():
-            if not t % port.period and port.sequence != t // port.period + 1:
-                raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
-        blame.steps += 1
+        self._close(t)
+
+    def _take(self, t: int) -> None:
+        for buffer in self._all:
+            if buffer.pending or buffer.new:
+                buffer.take(t)
+
+    def _close(self, t: int) -> None:
+        """Ends a step: holds the service to its periods."""
+        if self._strict:
+            for port in self._periodic:
+                if not t % port.period and port.sequence != t // port.period + 1:
+                    raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+        self.blame.steps += 1
 
     def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
-        sent = []
+        sent: list[Sent] = []
         for name, message in outbox.items():
-            port = self._port(name)
+            port = self.ports.get(name) or self._port(name)
             if port.event:
-                for item in message if isinstance(message, list) else (message,):
-                    payload = port.pack(item)
-                    sent.append(Sent(port, payload, port.sequence))
+                sent += map(port.pack, message) if isinstance(message, list) else (port.pack(message),)
             elif t % port.period:
                 raise LockstepError(f"{self.role.name} sent {name} at {t} ns, which is no tick of its period {port.period} ns")
             else:
-                payload = port.pack(message)
-                sent.append(Sent(port, payload, port.sequence))
+                sent.append(port.pack(message))
         return sent
 
     def _port(self, name: str) -> OutputPort:

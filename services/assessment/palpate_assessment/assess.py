@@ -86,8 +86,8 @@ def assess(
         found = find(posterior.mean - background, grid, scanned, posterior, observations, healthy)
     rest = scanned & ~np.any([f.nodes for f in found], axis=0) if found else scanned
     felt = felt_modulus(posterior.mean, grid, contact)
-    kept = np.array([1.0 - s.lost / float(contact.force(np.array(s.depth))) for s in good])
-    unit = float(contact.force(np.array(contact.common_depth))) * float(np.median(kept))
+    kept = 1.0 - np.array([s.lost for s in good]) / contact.force(np.array([s.depth for s in good]))
+    unit = contact.flat_force(contact.common_depth) * float(np.median(kept))
     return Assessment(
         grid=grid,
         force=felt * unit,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.polyline import Polyline
 from palpate_models.scenario import Stiffness
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
@@ -108,7 +109,9 @@ class ReferenceContact:
         self._force = np.array([static_contact(float(d), sphere, length).force for d in self._depths])
         wider = np.array([static_contact(float(d), 1.02 * sphere, length).force for d in self._depths])
         self._radius_exponent = np.log(wider / self._force) / np.log(1.02)
-        self._exponent = np.gradient(np.log(self._force), np.log(self._depths))
+        self._log_depths, self._log_force = np.log(self._depths), np.log(self._force)
+        self._log_line = Polyline(self._log_depths, self._log_force)
+        self._exponent = np.gradient(self._log_force, self._log_depths)
         self._footprints: dict[tuple[int, float], Array] = {}
         self._overlap = self._overlap_table()
 
@@ -118,9 +121,14 @@ class ReferenceContact:
         To first order a convex surface acts as a smaller sphere, 1 / R_eff = 1 / R + curvature.
         """
         d = np.clip(depth, self._depths[0], self._depths[-1])
-        flat = np.exp(np.interp(np.log(d), np.log(self._depths), np.log(self._force)))
+        flat = np.exp(np.interp(np.log(d), self._log_depths, self._log_force))
         exponent = np.interp(d, self._depths, self._radius_exponent)
         return np.asarray(flat * np.maximum(1.0 + self.sphere * np.asarray(curvature), 0.5) ** -exponent)
+
+    def flat_force(self, depth: float) -> float:
+        """`force` at one depth [m] on a flat surface."""
+        d = min(max(depth, float(self._depths[0])), float(self._depths[-1]))
+        return float(np.exp(self._log_line.at(float(np.log(d)))))
 
     def exponent(self, depth: Array) -> Array:
         """Local exponent d log F / d log depth [1]."""

@@ -57,10 +57,9 @@ class MapGrid:
         def z(dx: float, dy: float) -> Array:
             return _terms(x + dx, y + dy) @ self.shape
 
-        middle = z(0, 0)
-        zx, zy = (z(step, 0) - z(-step, 0)) / (2 * step), (z(0, step) - z(0, -step)) / (2 * step)
-        zxx = (z(step, 0) - 2 * middle + z(-step, 0)) / step**2
-        zyy = (z(0, step) - 2 * middle + z(0, -step)) / step**2
+        middle, left, right, below, above = z(0, 0), z(-step, 0), z(step, 0), z(0, -step), z(0, step)
+        zx, zy = (right - left) / (2 * step), (above - below) / (2 * step)
+        zxx, zyy = (right - 2 * middle + left) / step**2, (above - 2 * middle + below) / step**2
         zxy = (z(step, step) - z(step, -step) - z(-step, step) + z(-step, -step)) / (4 * step**2)
         top = (1 + zy**2) * zxx - 2 * zx * zy * zxy + (1 + zx**2) * zyy
         return np.asarray(-top / (2 * (1 + zx**2 + zy**2) ** 1.5))

@@ -146,7 +146,7 @@ def spread_under(footprint: Array, z: Array) -> Array:
 
 def footprints(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact) -> Array:
     """Weight of each node in each sample, shape (m, n), rows sum to 1: distances along the surface are taken in space."""
-    centre = np.array([s.position + contact.advance(s.velocity) for s in samples])
+    centre = np.array([s.position for s in samples]) + contact.advance(np.array([s.velocity for s in samples]))
     depth = np.array([s.depth for s in samples])
     distance = cdist(centre, grid.nodes)
     rows = np.zeros_like(distance)

@@ -35,8 +35,7 @@ class PathMemory:
 
     def add(self, time: float, dt: float, position: Array, depth: float) -> None:
         """Notes that the indenter was at `position` [m], shape (3,), at `depth` [m], for `dt` seconds up to `time` [s]."""
-        x, y, z = position
-        self._open.append((time - 0.5 * dt, dt, max(depth, 0.0), float(x), float(y), float(z)))
+        self._open.append((time - 0.5 * dt, dt, max(depth, 0.0), *position.tolist()))
         if len(self._open) >= _SLICE:
             self._close()
 
@@ -54,11 +53,12 @@ class PathMemory:
             return
         block = np.array(self._open)
         self._open.clear()
-        depth = float(block[:, 2].mean())
+        total = block.sum(axis=0)
+        time, _, depth, x, y, z = (total / len(block)).tolist()
         if depth <= 0.0:
             return
         if self._count == len(self._slices):
             self._slices = np.concatenate([self._slices, np.zeros_like(self._slices)])
-        impulse = float(self._contact.force(np.array(depth))) * float(block[:, 1].sum())
-        self._slices[self._count] = (block[:, 0].mean(), impulse, *block[:, 3:].mean(axis=0))
+        impulse = self._contact.flat_force(depth) * float(total[1])
+        self._slices[self._count] = (time, impulse, x, y, z)
         self._count += 1

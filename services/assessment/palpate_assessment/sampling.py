@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,8 +92,8 @@ class Sampler:
         if state.in_contact and state.counts:
             self._block.append(state)
             first = self._block[0]
-            far = float(np.linalg.norm(state.position - first.position)) >= self._travel
-            if far or state.time - first.time >= LONGEST:
+            way = state.position - first.position
+            if sqrt(way.dot(way)) >= self._travel or state.time - first.time >= LONGEST:
                 sample = self._average()
         else:
             sample = self._average()

@@ -50,6 +50,7 @@ class AssessmentService(Service):
     def __init__(self, exam: ExamInput) -> None:
         self._exam = exam.exam
         self._X_AW = inverse(np.array(exam.X_WA))
+        self._R_AW, self._p_AW = self._X_AW[:3, :3], self._X_AW[:3, 3]
         self._contact = ReferenceContact(exam.robot.indenter_radius_m, exam.exam.depth_m)
         self._reach = float(np.clip(0.8 * exam.exam.spacing_m, 0.006, 0.020))
         self._sampler = Sampler(self._contact)
@@ -107,8 +108,8 @@ class AssessmentService(Service):
         p, n = message.surface_point, message.surface_normal
         return State(
             time=nanoseconds(message.header.stamp) / NS,
-            position=apply(self._X_AW, np.array([[p.x, p.y, p.z]]))[0],
-            normal=self._X_AW[:3, :3] @ np.array([n.x, n.y, n.z]),
+            position=self._R_AW @ np.array((p.x, p.y, p.z)) + self._p_AW,
+            normal=self._R_AW @ np.array((n.x, n.y, n.z)),
             depth=float(message.depth),
             force=float(message.normal_force),
             in_contact=bool(message.in_contact),

@@ -99,8 +99,8 @@ class Conductor:
         """Passes an operator's request on to robot, supervisor and planning; see `palpation_msgs/OperatorRequest`."""
         port = self._observed.stepper.ports["operator/request"]
         t = max(self._observed.now, 0)
-        payload = port.pack(OperatorRequest(header(t), request, reason))
-        self._observed.publishers["operator/request"].put(payload, port.sequence)
+        _, payload, sequence = port.pack(OperatorRequest(header(t), request, reason))
+        self._observed.publishers["operator/request"].put(payload, sequence)
 
     def abort(self, reason: str) -> None:
         """Tells every service to stop at once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
@@ -270,6 +271,7 @@ def run_composed(
 
     lost: dict[str, int] = {}
     interrupted = False
+    gc.freeze()  # full collections in mid-run need not go through all that was loaded
     try:
         last = run.run(end, SIM_LIMIT)
     except KeyboardInterrupt:
@@ -279,6 +281,8 @@ def run_composed(
         failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.why}"
         lost = {error.role: error.t}
         last = error.t
+    finally:
+        gc.unfreeze()
     wall = perf_counter() - start
     facts = run.finish()
     for recorder in recorders:

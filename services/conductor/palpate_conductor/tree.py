@@ -8,26 +8,38 @@ from typing import Any
 import numpy as np
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
 from palpate_bus.stamps import header
+from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.lbr_kinematics import link_transforms
+from palpate_models.rotations import quaternion, rotation
 from palpate_models.scenario import ExamInput
-from scipy.spatial.transform import Rotation
+
+_AXES = np.array(lbr.JOINT_AXIS)
+_FIRST_JOINT = 1
+"""Where the joints stand among the frames: behind the base, whose frame stands still as those behind them do."""
 
 
 class FrameTree:
     """Makes messages of `tf`: world, lbr_link_0 to 7, lbr_link_ee, ft_sensor, indenter; and world, abdomen."""
 
     def __init__(self, exam: ExamInput) -> None:
-        self._robot = exam.robot
-        self._abdomen = ("world", "abdomen", np.array(exam.X_WA))
+        frames = [*link_transforms(np.zeros(7), exam.robot), ("world", "abdomen", np.array(exam.X_WA))]
+        self._names = [(parent, child) for parent, child, _ in frames]
+        self._transforms = [_transform(X) for _, _, X in frames]
 
     def message(self, t: int, q: Iterable[float]) -> Any:
         """The tree at joint positions `q` [rad], shape (7,), stamped `t` [ns]."""
-        parts = [*link_transforms(np.asarray(q, np.float64), self._robot), self._abdomen]
-        turns = Rotation.from_matrix([X[:3, :3] for _, _, X in parts]).as_quat(canonical=True).tolist()
-        return TFMessage([_stamped(t, *part, turn) for part, turn in zip(parts, turns, strict=True)])
+        turns = np.array(q, np.float64)[:, None] * _AXES
+        transforms = self._transforms.copy()
+        for i, turn in enumerate(turns.tolist(), _FIRST_JOINT):
+            transforms[i] = Transform(transforms[i].translation, Quaternion(*quaternion(rotation(turn))))
+        return TFMessage(
+            [
+                TransformStamped(header(t, parent), child, transform)
+                for (parent, child), transform in zip(self._names, transforms, strict=True)
+            ]
+        )
 
 
-def _stamped(t: int, parent: str, child: str, X: Array, turn: list[float]) -> Any:
-    transform = Transform(Vector3(*X[:3, 3].tolist()), Quaternion(*turn))
-    return TransformStamped(header(t, parent), child, transform)
+def _transform(X: Array) -> Any:
+    return Transform(Vector3(*X[:3, 3].tolist()), Quaternion(*quaternion(X[:3, :3].tolist())))

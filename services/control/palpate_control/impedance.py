@@ -23,37 +23,21 @@ against each other, and then a few milliseconds from measuring to acting shake t
 
 from __future__ import annotations
 
-from math import isfinite
-
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate_control import kernel
+from palpate_control.kernel import JOINT_DAMPING_RATIO, LEAST_DAMPING
 from palpate_control.model import DOF, SLOW_S, ArmModel
-from palpate_control.reference import Mode, Reference
-from palpate_control.safety import LimitRepulsion, TorqueShaper
+from palpate_control.reference import Mode, Reference, Setpoint
+from palpate_control.safety import SafetyNet
 
 Array = NDArray[np.float64]
 
-POSITION_CLIP_M = 0.1
-"""Largest position error that stretches the spring, each axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use the like)."""
-ROTATION_CLIP_RAD = 0.5
-JOINT_CLIP_RAD = 0.25
-"""The same for a joint in mode JOINT."""
-NULL_TORQUE_NM = 5.0
-"""Cap of the null-space torque, each joint."""
-JOINT_DAMPING_RATIO = 0.7
-"""Of the joint spring in mode JOINT and of the null-space posture [1]."""
-STICTION_SPEED = 0.02
-"""Joint speed at which half of the Coulomb friction is compensated [rad/s]; keeps the compensation smooth."""
-LEAST_DAMPING = 0.1
-"""Part of the designed damping that is commanded even where friction alone would do: friction is known badly."""
 DEAD_TICKS = 2
 """From measuring to acting: a tick of transport, one of holding the torque, half of velocity's age, rounded up."""
 SPRING_ANGLE = 0.3
 """Fastest undamped frequency of a spring, times the dead time [rad]: past it sampled damping adds energy."""
-REGULARISATION = 1e-3
-"""Added to a matrix of the task [1/kg, 1/(kg m^2)] where it has lost rank."""
 DESIGN_TICKS = 10
 """Gains are designed for each set-point, and again after so many ticks: meanwhile the arm moves by milliradians."""
 
@@ -64,21 +48,21 @@ class ImpedanceController:
     def __init__(self, model: ArmModel, limit_zone: float = 0.05, period_s: float = 1e-3) -> None:
         """A controller on `model`, called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad]."""
         self.model = model
-        self._repulsion = LimitRepulsion(model.position_lower, model.position_upper, model.torque_limit, limit_zone)
-        self._shaper = TorqueShaper(model.torque_limit, period_s)
+        self._net = SafetyNet(model.position_lower, model.position_upper, model.torque_limit, limit_zone, period_s)
         self._dead_time = DEAD_TICKS * period_s
         self._spring_rate = SPRING_ANGLE / self._dead_time
-        self._clip = np.array([POSITION_CLIP_M] * 3 + [ROTATION_CLIP_RAD] * 3)
+        self._joints = np.stack((model.velocity_limit, model.viscous_friction, model.coulomb_friction))
+        self._q, self._qd, self._raw = np.zeros(DOF), np.zeros(DOF), np.zeros(DOF)
         self._J, self._JW, self._slow_inertia = np.zeros((6, DOF)), np.zeros((6, DOF)), np.zeros((6, 6))  # in D's axes
-        self._designed_for: Array | None = None
+        self._designed_for: Setpoint | None = None
         self._design_age = 0
-        self._stiffness = self._damping = np.zeros(6)
-        self._posture_damping = np.zeros(DOF)
+        self._gains = np.zeros(6 + 6 + DOF)
         self._joint_stiffness = self._joint_damping = np.zeros((DOF, DOF))
+        self._position_error, self._velocity_error = np.zeros(DOF), np.zeros(DOF)
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
-        self._shaper.reset()
+        self._net.reset()
         self._designed_for = None
 
     def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
@@ -86,34 +70,44 @@ class ImpedanceController:
 
         Raises ValueError if `q` or `qd` is not finite or not of shape (7,).
         """
-        if q.shape != (DOF,) or qd.shape != (DOF,) or not isfinite(q.dot(q) + qd.dot(qd)):
+        if not self._take(q, qd):
             raise ValueError(f"joint_states: position = {q}, velocity = {qd}: must be {DOF} finite values each")
-        raw = self._cartesian(q, qd, reference) if reference.mode is Mode.CARTESIAN else self._joint(q, qd, reference)
-        push = self._repulsion.torque(q)
-        return self._shaper.shape(raw if push is None else raw + push, self.model.gravity)
+        if reference.setpoint.mode is Mode.CARTESIAN:
+            self._cartesian(reference)
+        else:
+            self._joint(reference)
+        return self._net.torque(self._raw, self._q, self.model.gravity)
 
-    def _friction(self, qd: Array) -> Array:
-        """Torque that overcomes viscous and Coulomb friction at the desired velocity, shape (7,)."""
-        model = self.model
-        return (model.viscous_friction + model.coulomb_friction / (np.abs(qd) + STICTION_SPEED)) * qd
+    def _take(self, q: Array, qd: Array) -> bool:
+        """Copies a joint state; False where it is none."""
+        if q.shape != (DOF,) or qd.shape != (DOF,):
+            return False
+        self._q[:] = q
+        self._qd[:] = qd
+        return kernel.finite(self._q, self._qd)
 
-    def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
-        model = self.model
+    def _joint(self, reference: Reference) -> None:
+        model, q, qd = self.model, self._q, self._qd
         model.update_gravity(q)
-        if self._outdated(reference.joint_stiffness):
+        if self._outdated(reference.setpoint):
             self._design_joint(q, reference.joint_stiffness)
-        error = np.minimum(np.maximum(reference.q - q, -JOINT_CLIP_RAD), JOINT_CLIP_RAD)
-        torque: Array = (
-            self._joint_stiffness.dot(error) + self._joint_damping.dot(reference.qd - qd) + self._friction(reference.qd)
+        kernel.joint_errors(q, qd, reference.values, self._position_error, self._velocity_error)
+        kernel.joint_torque(
+            self._joint_stiffness.dot(self._position_error),
+            self._joint_damping.dot(self._velocity_error),
+            model.inverse_dynamics(q, qd, reference.qdd),
+            model.gravity,
+            reference.values,
+            self._joints,
+            self._raw,
         )
-        return torque + model.inverse_dynamics(q, qd, reference.qdd)
 
-    def _outdated(self, stiffness: Array) -> bool:
-        """Whether gains are to be designed now for the stiffness that is asked for, of the mode that is on."""
-        if stiffness is self._designed_for and self._design_age < DESIGN_TICKS:
+    def _outdated(self, setpoint: Setpoint) -> bool:
+        """Whether gains are to be designed now for the set-point."""
+        if setpoint is self._designed_for and self._design_age < DESIGN_TICKS:
             self._design_age += 1
             return False
-        self._designed_for, self._design_age = stiffness, 1
+        self._designed_for, self._design_age = setpoint, 1
         return True
 
     def _design_joint(self, q: Array, stiffness: Array) -> None:
@@ -128,63 +122,34 @@ class ImpedanceController:
         self._joint_stiffness = (P * squared).dot(P.T)
         self._joint_damping = (P * np.maximum(damping - friction, LEAST_DAMPING * damping)).dot(P.T)
 
-    def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
-        model = self.model
+    def _cartesian(self, reference: Reference) -> None:
+        model, q, qd, values = self.model, self._q, self._qd, reference.values
+        J, JW, slow_inertia = self._J, self._JW, self._slow_inertia
         model.update(q, qd)
-        R_WD = np.ascontiguousarray(reference.R_WD)
-        kernel.task_space(R_WD, model.J_W, model.slow_mobility, REGULARISATION, self._J, self._JW, self._slow_inertia)
-        if self._outdated(reference.stiffness):
+        kernel.task_space(values, model.J_W, model.slow_mobility, J, JW, slow_inertia)
+        if self._outdated(reference.setpoint):
             self._design(reference)
-        torque = np.empty(DOF)
         kernel.cartesian_torque(
             q,
             qd,
+            values,
             model.R_WI,
             model.p_WI,
-            self._J,
-            self._JW,
-            self._slow_inertia,
-            model.coriolis,
-            R_WD,
-            reference.p_WD,
-            reference.V_WD,
-            reference.F_W,
-            reference.q,
-            reference.qd,
-            reference.joint_stiffness,
-            self._stiffness,
-            self._damping,
-            self._posture_damping,
-            self._clip,
-            model.velocity_limit,
-            model.viscous_friction,
-            model.coulomb_friction,
-            STICTION_SPEED,
-            NULL_TORQUE_NM,
-            torque,
+            J,
+            JW,
+            slow_inertia,
+            model.bias,
+            model.gravity,
+            self._gains,
+            self._joints,
+            self._raw,
         )
-        return torque
 
     def _design(self, reference: Reference) -> None:
         """Gains for this set-point and posture: stiffness that sampling can bear and the damping that goes with it."""
-        J = self._J
         joint_mobility = self.model.mobility
-        mobility = J.dot(joint_mobility).dot(J.T)
-        inertia = _inverse(mobility).diagonal()
-        friction = (self._slow_inertia.diagonal() - inertia) / SLOW_S
-        # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
-        mass = np.minimum(inertia, 4 / mobility.diagonal())
-        bound = np.maximum(self._spring_rate**2 * mass, friction / (4 * self._dead_time))
-        self._stiffness = np.minimum(reference.stiffness, bound)
-        damping = 2 * reference.damping_ratio * np.sqrt(self._stiffness * mass)
-        self._damping = np.maximum(damping - friction, LEAST_DAMPING * damping)
-        free = joint_mobility.diagonal()
-        self._posture_damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(reference.joint_stiffness / free)
-
-
-def _inverse(matrix: Array) -> Array:
-    """Inverse of a symmetric positive definite matrix by Cholesky, shape (6, 6); regularised where the arm is singular."""
-    inverse = np.empty_like(matrix)
-    if not kernel.spd_inverse(matrix, inverse, 0.0):
-        kernel.spd_inverse(matrix, inverse, REGULARISATION)
-    return inverse
+        mobility = self._J.dot(joint_mobility).dot(self._J.T)
+        square_rate = self._spring_rate**2
+        kernel.design(
+            reference.values, mobility, joint_mobility, self._slow_inertia, SLOW_S, square_rate, self._dead_time, self._gains
+        )

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
-from math import exp
+from math import exp, sqrt
 from typing import Final
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from palpate_control.extrapolation import bridge, carry
+from palpate_control import layout
+from palpate_control.extrapolation import carry, change_over, follow, joint_acceleration
 
 Array = NDArray[np.float64]
 
@@ -55,24 +56,39 @@ class Setpoint:
     """Velocity of `q` [rad/s], shape (7,)."""
     joint_stiffness: Array
     """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
+    values: Array = field(init=False, repr=False, compare=False)
+    """All of them as in `layout`, shape (57,)."""
 
     def __post_init__(self) -> None:
-        everything = np.concatenate([getattr(self, name).ravel() for name in _ARRAYS])
+        everything = np.concatenate(
+            (
+                self.stiffness,
+                self.damping_ratio,
+                self.joint_stiffness,
+                self.p_WD,
+                self.V_WD,
+                self.F_W,
+                self.q,
+                self.qd,
+                self.R_WD.ravel(),
+            )
+        )
         if not ((everything >= _LOW) & (everything <= _HIGH)).all():  # so it is, too, where one is NaN
             raise ValueError(self._wrong())
-        a, b, c, d, e, f, g, h, i = everything[-9:].tolist()
+        object.__setattr__(self, "values", everything)
+        a, b, c, d, e, f, g, h, i = everything[layout.R_WD :].tolist()
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if abs(determinant - 1) > 1e-6:
             raise ValueError(f"set-point: R_WD has determinant {determinant}: must be a rotation")
 
     def _wrong(self) -> str:
         """The first field that is out of its range."""
-        for name, part, field, low, high in RANGES:
+        for name, part, said, low, high in RANGES:
             values = getattr(self, name)[part]
             if not np.isfinite(values).all():
-                return f"set-point: {field} = {values}: must be finite"
+                return f"set-point: {said} = {values}: must be finite"
             if not ((values >= low) & (values <= high)).all():
-                return f"set-point: {field} = {values}: must be within {low:g} and {high:g}"
+                return f"set-point: {said} = {values}: must be within {low:g} and {high:g}"
         return f"set-point: R_WD = {self.R_WD}: must be a rotation"
 
 
@@ -91,7 +107,6 @@ RANGES: Final = (
 )
 """What a set-point may ask for: attribute, part of it, the message's field, least and largest value; as in the contract, where it
 says."""
-_ARRAYS: Final = ("stiffness", "damping_ratio", "joint_stiffness", "p_WD", "V_WD", "F_W", "q", "qd", "R_WD")
 _SIZES: Final = (6, 6, 7, 3, 3, 3, 3, 3, 7, 7)
 _LOW: Final = np.repeat([row[3] for row in RANGES] + [-2.0], (*_SIZES, 9))
 _HIGH: Final = np.repeat([row[4] for row in RANGES] + [2.0], (*_SIZES, 9))
@@ -99,7 +114,7 @@ _HIGH: Final = np.repeat([row[4] for row in RANGES] + [2.0], (*_SIZES, 9))
 
 def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
     """Rotation matrix, shape (3, 3), of a unit quaternion. Raises ValueError if its norm is off by 1 % or more."""
-    norm = float(np.sqrt(x * x + y * y + z * z + w * w))
+    norm = sqrt(x * x + y * y + z * z + w * w)
     if not abs(norm - 1) < 0.01:
         raise ValueError(f"set-point: pose.orientation = ({x}, {y}, {z}, {w}) has norm {norm}: must be 1")
     rotation: Array = pin.Quaternion(w / norm, x / norm, y / norm, z / norm).toRotationMatrix()
@@ -108,36 +123,62 @@ def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
 
 @dataclass(slots=True)
 class Reference:
-    """What the law follows at one tick; fields as in `Setpoint`."""
+    """What the law follows at one tick; the properties are views of `values`, and as in `Setpoint`."""
 
-    mode: Mode
-    R_WD: Array
-    p_WD: Array
-    V_WD: Array
-    F_W: Array
-    stiffness: Array
-    damping_ratio: Array
-    joint: Array
-    """Joint position [rad], velocity and acceleration, shape (3, 7); the acceleration is zero in mode CARTESIAN."""
-    joint_stiffness: Array
+    setpoint: Setpoint
+    """The set-point that it comes from."""
+    values: Array
+    """That set-point's numbers carried on to the tick, and the joints' acceleration, as in `layout`, shape (64,)."""
+
+    @property
+    def mode(self) -> Mode:
+        """The set-point's."""
+        return self.setpoint.mode
+
+    @property
+    def R_WD(self) -> Array:
+        """Shape (3, 3)."""
+        return self.values[layout.R_WD : layout.SETPOINT].reshape(3, 3)
+
+    @property
+    def p_WD(self) -> Array:
+        """[m], shape (3,)."""
+        return self.values[layout.P_WD : layout.V_WD]
+
+    @property
+    def V_WD(self) -> Array:
+        """Linear [m/s] then angular [rad/s], shape (6,)."""
+        return self.values[layout.V_WD : layout.F_W]
+
+    @property
+    def F_W(self) -> Array:
+        """Force [N] then torque [N m], shape (6,)."""
+        return self.values[layout.F_W : layout.Q]
+
+    @property
+    def stiffness(self) -> Array:
+        """Translation [N/m], rotation [N m/rad], shape (6,)."""
+        return self.values[layout.STIFFNESS : layout.DAMPING_RATIO]
+
+    @property
+    def joint_stiffness(self) -> Array:
+        """[N m/rad], shape (7,)."""
+        return self.values[layout.JOINT_STIFFNESS : layout.P_WD]
 
     @property
     def q(self) -> Array:
         """Joint position [rad], shape (7,)."""
-        row: Array = self.joint[0]
-        return row
+        return self.values[layout.Q : layout.QD]
 
     @property
     def qd(self) -> Array:
         """Joint velocity [rad/s], shape (7,)."""
-        row: Array = self.joint[1]
-        return row
+        return self.values[layout.QD : layout.R_WD]
 
     @property
     def qdd(self) -> Array:
-        """Joint acceleration [rad/s^2], shape (7,)."""
-        row: Array = self.joint[2]
-        return row
+        """Joint acceleration [rad/s^2], shape (7,); zero in mode CARTESIAN."""
+        return self.values[layout.QDD :]
 
 
 class Extrapolator:
@@ -175,65 +216,46 @@ class Extrapolator:
             return
         before = self._raw(old, t)
         spacing = setpoint.stamp - old.stamp
-        joint = setpoint.mode is Mode.JOINT and 0 < spacing <= MAX_EXTRAPOLATION_NS
-        acceleration = (setpoint.qd - old.qd) / (spacing * 1e-9) if joint else np.zeros(7)
-        self._acceleration = np.clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)
+        acceleration = np.zeros(7)
+        if setpoint.mode is Mode.JOINT and 0 < spacing <= MAX_EXTRAPOLATION_NS:
+            joint_acceleration(old.values, setpoint.values, spacing * 1e-9, MAX_ACCELERATION, acceleration)
+        self._acceleration = acceleration
         self._current = setpoint
         after = self._raw(setpoint, t)
         self._standing = False
-        gap = self._gap
-        gap[:3] += before.p_WD - after.p_WD
-        gap[3:6] += pin.log3(before.R_WD @ after.R_WD.T)
-        gap[6:12] += before.V_WD - after.V_WD
-        gap[12:18] += before.F_W - after.F_W
-        gap[18:25] += before.q - after.q
-        gap[25:] += before.qd - after.qd
+        change_over(before.values, after.values, pin.log3(before.R_WD @ after.R_WD.T), self._gap)
+        if setpoint.mode is Mode.JOINT:
+            self._gap[:18] = 0.0  # a joint reference has no pose of its own
 
     def _raw(self, setpoint: Setpoint, t: int) -> Reference:
-        """The set-point extrapolated to `t` alone, in arrays of its own."""
-        age_ns = t - setpoint.stamp
-        standing = age_ns > MAX_EXTRAPOLATION_NS
-        age = min(max(age_ns, -MAX_EXTRAPOLATION_NS), MAX_EXTRAPOLATION_NS) * 1e-9
-        R, p, V, joint = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty((3, 7))
-        carry(
-            np.ascontiguousarray(setpoint.R_WD),
-            setpoint.p_WD,
-            setpoint.V_WD,
-            setpoint.q,
-            setpoint.qd,
-            self._acceleration,
-            age,
-            standing,
-            R,
-            p,
-            V,
-            joint,
-        )
-        return Reference(
-            setpoint.mode,
-            R,
-            p,
-            V,
-            setpoint.F_W.copy(),
-            setpoint.stiffness,
-            setpoint.damping_ratio,
-            joint,
-            setpoint.joint_stiffness,
-        )
+        """The set-point extrapolated to `t` alone."""
+        values = np.empty(layout.REFERENCE)
+        age = t - setpoint.stamp
+        carry(setpoint.values, self._acceleration, _bounded(age) * 1e-9, age > MAX_EXTRAPOLATION_NS, values)
+        return Reference(setpoint, values)
 
     def at(self, t: int) -> Reference:
         """The reference at time `t` [ns], which does not go back. Raises ValueError before the first set-point."""
         setpoint = self._current
         if setpoint is None:
             raise ValueError("no set-point yet")
-        reference = self._raw(setpoint, t)
-        if not self._standing and t - setpoint.stamp > MAX_EXTRAPOLATION_NS:
+        age = t - setpoint.stamp
+        standing = age > MAX_EXTRAPOLATION_NS
+        if standing and not self._standing:
             self._standing = True  # the sender has fallen silent: brake smoothly
-            self._gap[6:12] += setpoint.V_WD
+            if setpoint.mode is Mode.CARTESIAN:
+                self._gap[6:12] += setpoint.V_WD
             self._gap[25:] += setpoint.qd
-        fade = exp(-max(t - self._time, 0) * 1e-9 / SMOOTHING_S) if self._time else 1.0
+        elapsed = t - self._time
+        fade = exp(-elapsed * 1e-9 / SMOOTHING_S) if self._time and elapsed > 0 else 1.0
         self._time = t
-        if setpoint.mode is Mode.JOINT:
-            self._gap[:18] = 0.0  # a joint reference has no pose of its own
-        bridge(fade, self._gap, reference.R_WD, reference.p_WD, reference.V_WD, reference.F_W, reference.joint)
-        return reference
+        values = np.empty(layout.REFERENCE)
+        follow(setpoint.values, self._acceleration, _bounded(age) * 1e-9, standing, fade, self._gap, values)
+        return Reference(setpoint, values)
+
+
+def _bounded(age: int) -> int:
+    """An age [ns] within what is extrapolated."""
+    if age > MAX_EXTRAPOLATION_NS:
+        return MAX_EXTRAPOLATION_NS
+    return age if age > -MAX_EXTRAPOLATION_NS else -MAX_EXTRAPOLATION_NS

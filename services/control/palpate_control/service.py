@@ -17,6 +17,7 @@ from palpate_models.lbr import HOME, JOINT_NAMES, urdf
 from palpate_models.load import exam_input
 from palpate_models.scenario import Limits, Robot, Scenario
 
+from palpate_control import kernel
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import DOF, ArmModel
 from palpate_control.reference import Extrapolator, Mode, Setpoint, rotation_from_quaternion
@@ -87,13 +88,15 @@ class ControlService(Service):
                 )
                 guide.accept(setpoint_from(codec.decode(codec.encode(message, kind), kind)), stamp)
                 self._controller.torque(np.array(HOME), rest, guide.at(stamp))
+        kernel.widen(self._peak, rest)
         self._controller.reset()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One control tick."""
         joints = inbox.latest("joint_states")
         received = inbox.stamp("joint_states")
-        received = t if received is None else received
+        if received is None:
+            received = t
         measured = t if joints is None else min(nanoseconds(joints.header.stamp), received, t)
         # The law compares the reference with a measurement, so it takes that of the same moment. With the present one a late
         # state would look like an error that grows with the speed, and wind the spring up: 17 mrad after 20 ms at 0.86 rad/s.
@@ -114,10 +117,10 @@ class ControlService(Service):
             return self._reject_joints(t, f"joint_states: name = {joints.name}: must be {_NAMES}")
         try:
             reference = self._reference.at(followed)
-            torque = self._controller.torque(np.array(joints.position), np.array(joints.velocity), reference)
+            torque = self._controller.torque(joints.position, joints.velocity, reference)
         except ValueError as error:
             return self._reject_joints(t, str(error))
-        np.maximum(self._peak, np.abs(torque), out=self._peak)
+        kernel.widen(self._peak, torque)
         self._torque, self._until = torque, t + self._validity
         return self._command(t, torque, self._valid)
 
@@ -179,10 +182,7 @@ class ControlService(Service):
 
 
 def setpoint_from(message: Message) -> Setpoint:
-    """The arrays of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field that is not usable.
-
-    They are copies: views of the message's bytes would be of another type to compiled code.
-    """
+    """The arrays of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field that is not usable."""
     p, o = message.pose.position, message.pose.orientation
     v, w = message.twist.linear, message.twist.angular
     f, m = message.wrench.force, message.wrench.torque
@@ -195,11 +195,11 @@ def setpoint_from(message: Message) -> Setpoint:
         p_WD=np.array([p.x, p.y, p.z]),
         V_WD=np.array([v.x, v.y, v.z, w.x, w.y, w.z]),
         F_W=np.array([f.x, f.y, f.z, m.x, m.y, m.z]),
-        stiffness=np.array(message.stiffness, dtype=np.float64),
-        damping_ratio=np.array(message.damping_ratio, dtype=np.float64),
-        q=np.array(message.joint_position, dtype=np.float64),
-        qd=np.array(message.joint_velocity, dtype=np.float64),
-        joint_stiffness=np.array(message.joint_stiffness, dtype=np.float64),
+        stiffness=message.stiffness,
+        damping_ratio=message.damping_ratio,
+        q=message.joint_position,
+        qd=message.joint_velocity,
+        joint_stiffness=message.joint_stiffness,
     )
 
 

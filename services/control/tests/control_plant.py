@@ -88,6 +88,4 @@ def setpoint(arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: Mode = Mode.CA
 
 def reference(setpoint_: Setpoint) -> Reference:
     """A set-point as the law follows it, without extrapolation."""
-    names = ("mode", "R_WD", "p_WD", "V_WD", "F_W", "stiffness", "damping_ratio", "joint_stiffness")
-    values = {name: getattr(setpoint_, name) for name in names}
-    return Reference(**values, joint=np.stack((setpoint_.q, setpoint_.qd, np.zeros(7))))
+    return Reference(setpoint_, np.concatenate((setpoint_.values, np.zeros(7))))

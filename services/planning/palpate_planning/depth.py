@@ -15,8 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 EXPONENT = 1.45
 """Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
 FORCE_FRACTION = 0.9
@@ -44,6 +42,8 @@ RETURN_MPS = 0.02
 """Fastest d_r towards the surface and, after yielding, back into the tissue."""
 MODEL_DEPTH_M = 0.003
 """Shallower than this the power law says little."""
+RATE_MAX_MPS = 0.2
+"""Greatest rate of the commanded depth that is passed on for control to extrapolate by."""
 LIMITED_M = 0.0002
 """Yielding by more than this is reported."""
 
@@ -113,4 +113,4 @@ class DepthRegulator:
         self._command = command
         feed = FEED_FORWARD * min(max(self._force, 0.0), self.force_max)
         limited = self._yield + self._guard > LIMITED_M
-        return Regulation(command, float(np.clip(rate, -0.2, 0.2)), reference, feed, limited, expected)
+        return Regulation(command, min(max(rate, -RATE_MAX_MPS), RATE_MAX_MPS), reference, feed, limited, expected)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from palpate_models import lbr
 from palpate_models.scenario import ExamInput
 
+from palpate_planning import path
 from palpate_planning.follow import Follower
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.look import look_postures
@@ -54,6 +55,7 @@ class Exam:
         """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes."""
         self._known = known
         self._lockstep = lockstep
+        path.compile_ahead()
         self._kinematics = Kinematics(known.robot, known.limits)
         plane = Surface.plane(np.array(known.X_WA))
         self._sense = ContactSense(self._kinematics, ToolWeight.of(known.robot), plane, known.robot.indenter_radius_m)

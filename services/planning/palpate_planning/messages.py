@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from palpate_bus.codec import Message, message_type
 from palpate_bus.messages import ExamState, ImpedanceSetpoint
 from palpate_bus.stamps import header
+from palpate_models.rotations import quaternion
 
 from palpate_planning.measure import Contact
-from palpate_planning.poses import quaternion
 from palpate_planning.setpoint import DAMPING_RATIO, Setpoint
 from palpate_planning.status import ExamStatus
 
@@ -29,18 +29,18 @@ _Wrench: Any = message_type("geometry_msgs/msg/Wrench")
 
 def pose_message(X_WI: Array) -> Message:
     """`geometry_msgs/Pose` of a homogeneous matrix."""
-    return _Pose(_Point(*map(float, X_WI[:3, 3])), _Quaternion(*map(float, quaternion(X_WI[:3, :3]))))
+    return _Pose(_Point(*X_WI[:3, 3].tolist()), _Quaternion(*quaternion(X_WI[:3, :3].tolist())))
 
 
 def setpoint_message(t: int, setpoint: Setpoint, valid_for: Message) -> Message:
     """`palpation_msgs/ImpedanceSetpoint` that holds at `t` [ns]."""
-    V, F = (tuple(map(float, x)) for x in (setpoint.V_WI, setpoint.F_W))
+    V = setpoint.V_WI.tolist()
     return ImpedanceSetpoint(
         header=header(t, "world"),
         mode=int(setpoint.mode),
         pose=pose_message(setpoint.X_WI),
         twist=_Twist(_Vector3(*V[:3]), _Vector3(*V[3:])),
-        wrench=_Wrench(_Vector3(*F), _Vector3(0.0, 0.0, 0.0)),
+        wrench=_Wrench(_Vector3(*setpoint.F_W.tolist()), _Vector3(0.0, 0.0, 0.0)),
         stiffness=setpoint.stiffness,
         damping_ratio=DAMPING_RATIO,
         joint_position=setpoint.q,
@@ -52,8 +52,8 @@ def setpoint_message(t: int, setpoint: Setpoint, valid_for: Message) -> Message:
 
 def state_message(t: int, status: ExamStatus, contact: Contact | None) -> Message:
     """`palpation_msgs/ExamState`; without a contact (the robot has not been heard of) nothing is measured."""
-    p = (0.0, 0.0, 0.0) if contact is None else tuple(map(float, contact.p_W))
-    n = (0.0, 0.0, 1.0) if contact is None else tuple(map(float, contact.n_W))
+    p = (0.0, 0.0, 0.0) if contact is None else contact.p_W.tolist()
+    n = (0.0, 0.0, 1.0) if contact is None else contact.n_W.tolist()
     return ExamState(
         header=header(t, "world"),
         phase=int(status.phase),

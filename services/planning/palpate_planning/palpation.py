@@ -158,7 +158,7 @@ class Palpation:
     @property
     def _target(self) -> int:
         path = self._legs[self._k].path
-        i = int(np.searchsorted(path.visits, self._s.position + 1e-6, side="right")) - 1
+        i = int(path.visits.searchsorted(self._s.position + 1e-6, side="right")) - 1
         return int(path.targets[max(i, 0)])
 
     @property
@@ -364,7 +364,7 @@ class Palpation:
         rate, regulation = self._s.velocity, self._regulation
         arm = self._radius + self.offset - regulation.depth
         linear = (place.dp + place.dn * arm) * rate - place.n * regulation.rate
-        p_W = centre(place.p, place.n, self._radius + self.offset, regulation.depth)
+        p_W = place.p + place.n * arm
         if self._aside is not None:
             p_W, linear = p_W + self._aside.offset, linear + self._aside.velocity
         setpoint = Setpoint(

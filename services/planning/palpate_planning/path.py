@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 from palpate_models import lbr
+from palpate_models.compiled import compiled
 from palpate_models.scenario import Limits
-from scipy.interpolate import CubicSpline
 
+from palpate_planning.curve import Curve, polynomial_at
 from palpate_planning.poses import angular_velocity, frame, least_twist
 from palpate_planning.surface import Surface
 from palpate_planning.timing import SpeedLimit
@@ -23,6 +25,8 @@ TURN_RATE = 0.6
 """Largest rate at which the tool axis turns in contact [rad/s] [A]."""
 ACCELERATION = 0.2
 """Tangential acceleration in contact [m/s^2] [A]."""
+_STEP_M = 1e-4
+"""Over which the turn of the orientation is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,19 +60,16 @@ class SurfacePath:
         self.targets, self.visits = targets, s[visits]
         self.length = float(s[-1])
         if len(s) > 1:
-            self._spline = CubicSpline(s, np.hstack((p, n, R[:, :, 0], q)), bc_type="natural")
-            self._rate = self._spline.derivative()
+            self._curve = Curve(s, np.hstack((p, n, R[:, :, 0], q)))
 
     def at(self, s: float) -> Place:
         """The place at path length s, clipped to the path."""
         if self.length == 0.0:
             zero = np.zeros(3)
             return Place(self.p[0], self.n[0], self.R[0], zero, zero, zero, self.q[0], np.zeros(7))
-        s = min(max(s, 0.0), self.length)
-        y, dy = self._spline(s), self._rate(s)
-        R = _frame(y)
-        step = 1e-4
-        w = angular_velocity(R, _frame(y + step * dy), step)
+        curve = self._curve
+        y, dy, R, w = np.empty(16), np.empty(16), np.empty((3, 3)), np.empty(3)
+        _along(curve.knots, curve.cubics, curve.tangents, min(max(s, 0.0), self.length), y, dy, R, w)
         return Place(y[:3], -R[:, 2], R, dy[:3], dy[3:6], w, y[9:], dy[9:])
 
     def speed_limit(self, speed: float, limits: Limits) -> SpeedLimit:
@@ -90,10 +91,31 @@ class SurfacePath:
         return SpeedLimit(self.s, allowed, 0.7 * ACCELERATION)
 
 
-def _frame(y: Array) -> Array:
-    """Orientation from a spline's columns: z opposite to the normal, x near the interpolated x."""
+def compile_ahead() -> None:
+    """Compiles what a path needs where it is first looked at, which takes seconds: for whoever has a deadline then."""
+    ends, s, normals = np.arange(2), np.array((0.0, 1.0)), np.tile((0.0, 0.0, 1.0), (2, 1))
+    path = SurfacePath(s, np.eye(2, 3), normals, np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 7)), ends, ends)
+    path.at(0.5)
+
+
+@compiled
+def _along(knots: Array, cubics: Array, tangents: Array, s: float, y: Array, dy: Array, R: Array, w: Array) -> None:
+    """A curve of point, normal, x axis and posture at s: values and derivatives (16,), orientation (3, 3) and its turn (3,)."""
+    polynomial_at(knots, cubics, s, y)
+    polynomial_at(knots, tangents, s, dy)
+    _frame(y, R)
+    ahead = np.empty((3, 3))
+    _frame(y + _STEP_M * dy, ahead)
+    turn = angular_velocity(R, ahead, _STEP_M)
+    for i in range(3):
+        w[i] = turn[i]
+
+
+@compiled
+def _frame(y: Array, R: Array) -> None:
+    """Orientation from a curve's values: z opposite to the normal, x near the interpolated x."""
     n = y[3:6]
-    return frame(y[6:9], -n / np.sqrt(n @ n))
+    frame(y[6:9], -n / sqrt(n @ n), R)
 
 
 def lay(surface: Surface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:

@@ -7,11 +7,15 @@ point lies `depth` below the surface point p along the inward normal. Spin about
 from __future__ import annotations
 
 from math import atan2, sqrt
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.compiled import compiled
 
 Array = NDArray[np.float64]
+
+_IDENTITY: Final[Array] = np.eye(4)
 
 
 def centre(p_W: Array, n_W: Array, radius: float, depth: float | Array) -> Array:
@@ -36,45 +40,31 @@ def least_twist(z_W: Array, R_ref: Array) -> Array:
     return np.stack((x, np.cross(z, x), z), axis=-1)
 
 
-def frame(x_near: Array, z: Array) -> Array:
-    """The rotation, shape (3, 3), with unit z as its z axis and its x axis as near to x_near as it can be."""
+@compiled
+def frame(x_near: Array, z: Array, R: Array) -> None:
+    """R, shape (3, 3), becomes the rotation with unit z as its z axis and its x axis as near to x_near as it can be."""
     x = x_near - z * float(z @ x_near)
-    x = x / np.sqrt(x @ x)
-    R = np.empty((3, 3))
-    R[:, 0], R[:, 1], R[:, 2] = x, cross(z, x), z
-    return R
+    x /= sqrt(x @ x)
+    y = cross(z, x)
+    for i in range(3):
+        R[i, 0], R[i, 1], R[i, 2] = x[i], y[i], z[i]
 
 
+@compiled
 def cross(a: Array, b: Array) -> Array:
-    """Cross product of two 3-vectors; a tenth of numpy.cross's time."""
+    """Cross product of two 3-vectors."""
     return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
 
 
 def pose(R: Array, p: Array) -> Array:
     """Homogeneous matrix, shape (4, 4)."""
-    X = np.eye(4)
+    X = _IDENTITY.copy()
     X[:3, :3] = R
     X[:3, 3] = p
     return X
 
 
-def quaternion(R: Array) -> Array:
-    """Unit quaternion (x, y, z, w) with w >= 0 of a rotation matrix, shape (4,). Shepperd's method."""
-    trace = float(R[0, 0] + R[1, 1] + R[2, 2])
-    i = int(np.argmax((R[0, 0], R[1, 1], R[2, 2], trace)))
-    q = np.empty(4)
-    if i == 3:
-        q[:] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q[i] = 1.0 - trace + 2.0 * R[i, i]
-        q[j] = R[j, i] + R[i, j]
-        q[k] = R[k, i] + R[i, k]
-        q[3] = R[k, j] - R[j, k]
-    q /= np.linalg.norm(q)
-    return -q if q[3] < 0 else q
-
-
+@compiled
 def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
     """w_W [rad/s] that turns R0 into R1 in dt [s], shape (3,)."""
     D = R1 @ R0.T

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from functools import cache
+from math import isfinite
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,7 +35,7 @@ SUPERVISOR_AGE = 250 * MS
 """A supervisor that has said nothing for so long is gone: nothing is pressed that nobody watches."""
 NEEDED = ("robot", "assessment", "supervisor")
 """Roles whose loss ends the exam, whatever its phase."""
-NEEDED_TO_SEE = ("camera", "perception")
+NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
 """Roles whose loss ends it until the targets are there."""
 
 
@@ -58,7 +59,8 @@ class PlanningService(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One planning period: what is measured, what the exam makes of it, what is to be done."""
         self._read(inbox)
-        stop, soft = _stop(inbox)
+        requests = tuple(inbox.new("operator/request"))
+        stop, soft = _stop(inbox, requests)
         outcome = self._exam.step(
             Observation(
                 t=t,
@@ -67,7 +69,7 @@ class PlanningService(Service):
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
                 stop=stop,
                 soft=soft,
-                end=_end(inbox),
+                end=_end(requests),
                 lost=self._lost(t, inbox),
             )
         )
@@ -103,11 +105,11 @@ class PlanningService(Service):
         if status is None:
             return
         force, moment = status.wrench.force, status.wrench.torque
-        wrench = np.array((force.x, force.y, force.z, moment.x, moment.y, moment.z))
-        if not np.isfinite(np.concatenate((status.position, status.velocity, wrench))).all():
+        wrench = (force.x, force.y, force.z, moment.x, moment.y, moment.z)
+        if not all(map(isfinite, (*status.position.tolist(), *status.velocity.tolist(), *wrench))):
             self._unreadable += 1  # nothing to go by: the supervisor stops the arm, the last reading stands until then
             return
-        self._reading = Reading(np.array(status.position), wrench, np.array(status.velocity))
+        self._reading = Reading(np.array(status.position), np.array(wrench), np.array(status.velocity))
 
     def _perceived(self, inbox: Inbox) -> Seen | Unseen | None:
         """Perception's newest answer, if one came."""
@@ -139,16 +141,16 @@ class PlanningService(Service):
 
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
         seeing = self._exam.status.phase in (Phase.HOME, Phase.LOOK)
-        gone = tuple(role for role in NEEDED + (NEEDED_TO_SEE if seeing else ()) if inbox.lost(role))
+        gone = tuple([role for role in (NEEDED_TO_SEE if seeing else NEEDED) if inbox.lost(role)])
         heard = inbox.stamp("supervisor/state")
         if heard is not None and t - heard > SUPERVISOR_AGE:
             gone += (f"the supervisor, silent for {(t - heard) / MS:.0f} ms",)
         return gone
 
 
-def _stop(inbox: Inbox) -> tuple[str, bool]:
+def _stop(inbox: Inbox, requests: tuple[Message, ...]) -> tuple[str, bool]:
     """Why the arm must rest, empty when all is well; and whether planning is to retreat rather than the driver to hold."""
-    for request in inbox.new("operator/request"):
+    for request in requests:
         if request.request == OperatorRequest.STOP:
             return f"stopped by the operator: {request.reason}", False
     status = inbox.latest("robot/status")
@@ -161,9 +163,9 @@ def _stop(inbox: Inbox) -> tuple[str, bool]:
     return f"{'soft' if soft else 'emergency'} stop of the supervisor: {state.reason}", soft
 
 
-def _end(inbox: Inbox) -> str:
+def _end(requests: tuple[Message, ...]) -> str:
     """Why the exam is to end, if an operator has just said so."""
-    for request in inbox.new("operator/request"):
+    for request in requests:
         if request.request == OperatorRequest.END:
             return f"ended by the operator: {request.reason}"
     return ""

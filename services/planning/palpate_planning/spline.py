@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.compiled import compiled
 from scipy.ndimage import spline_filter
 
 Array = NDArray[np.float64]
@@ -20,28 +21,48 @@ class UniformField:
 
     def __init__(self, origin: tuple[float, float], step: tuple[float, float], values: Array) -> None:
         """`values` has shape (nx, ny, m); value [i, j] stands at origin + (i, j) * step."""
-        self._origin, self._step = origin, step
+        self.axes: Array = np.array([(origin[k], step[k], values.shape[k] - 1.0) for k in (0, 1)])
+        """Origin, step and last index of the grid along x and along y, shape (2, 3)."""
         coefficients = np.stack([spline_filter(values[..., k], order=3, mode="mirror") for k in range(values.shape[2])], axis=-1)
-        self._c = np.pad(coefficients, ((1, 2), (1, 2), (0, 0)), mode="reflect")  # as 'mirror' continues them
-        self._last = (values.shape[0] - 1.0, values.shape[1] - 1.0)
-
-    def one(self, x: float, y: float) -> Array:
-        """Values at one point, shape (m,). Outside the grid the nearest edge's hold."""
-        u = min(max((x - self._origin[0]) / self._step[0], 0.0), self._last[0])
-        v = min(max((y - self._origin[1]) / self._step[1], 0.0), self._last[1])
-        i, j = int(u), int(v)
-        u, v = u - i, v - j
-        wu = np.array((1.0, u, u * u, u * u * u)) @ _BASIS
-        wv = np.array((1.0, v, v * v, v * v * v)) @ _BASIS
-        return np.asarray(np.einsum("a,b,abm->m", wu, wv, self._c[i : i + 4, j : j + 4]))
+        self.coefficients: Array = np.pad(coefficients, ((1, 2), (1, 2), (0, 0)), mode="reflect")  # as 'mirror' continues them
+        """Of the B-splines, shape (nx + 3, ny + 3, m): those of cell [i, j] are [i : i + 4, j : j + 4]."""
 
     def many(self, xy: Array) -> Array:
         """Values at points of shape (n, 2): shape (n, m)."""
-        uv = np.clip((xy - self._origin) / self._step, 0.0, self._last)
+        origin, step, last = self.axes.T
+        uv = np.clip((xy - origin) / step, 0.0, last)
         ij = uv.astype(int)
         t = uv - ij
         powers = np.stack((np.ones_like(t), t, t * t, t * t * t), axis=-1)
         w = powers @ _BASIS  # (n, 2, 4)
         rows = ij[:, 0, None, None] + _OFFSETS[None, :, None]
         columns = ij[:, 1, None, None] + _OFFSETS[None, None, :]
-        return np.asarray(np.einsum("na,nb,nabm->nm", w[:, 0], w[:, 1], self._c[rows, columns]))
+        return np.asarray(np.einsum("na,nb,nabm->nm", w[:, 0], w[:, 1], self.coefficients[rows, columns]))
+
+
+@compiled
+def value_at(axes: Array, coefficients: Array, x: float, y: float) -> Array:
+    """Values at one point of the field with these `axes` and `coefficients`, shape (m,). Outside, the nearest edge's hold."""
+    u, v = _place(axes[0], x), _place(axes[1], y)
+    i, j = int(u), int(v)
+    wu, wv = _weights(u - i), _weights(v - j)
+    total = np.zeros(coefficients.shape[2])
+    for a in range(4):
+        for b in range(4):
+            weight = wu[a] * wv[b]
+            for k in range(total.size):
+                total[k] += weight * coefficients[i + a, j + b, k]
+    return total
+
+
+@compiled
+def _place(axis: Array, x: float) -> float:
+    """Where x is along an axis, in steps from its origin, on the grid. What is no number is at the origin: it makes an index."""
+    u = (x - axis[0]) / axis[1]
+    return min(u, axis[2]) if u > 0.0 else 0.0
+
+
+@compiled
+def _weights(t: float) -> Array:
+    """Of four neighbours at the part `t` of the way from the second to the third, shape (4,)."""
+    return np.array((1.0, t, t * t, t * t * t)) @ _BASIS

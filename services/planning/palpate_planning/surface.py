@@ -6,12 +6,15 @@ are smooth enough to regulate depth against: a mesh's facets would show as rippl
 
 from __future__ import annotations
 
+from math import isfinite, sqrt
+
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.compiled import compiled
 from palpate_models.frames import apply, inverse
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from palpate_planning.spline import UniformField
+from palpate_planning.spline import UniformField, value_at
 
 Array = NDArray[np.float64]
 
@@ -27,10 +30,13 @@ class Surface:
     def __init__(self, X_WA: Array, field: UniformField) -> None:
         """`field` holds height [m], slope along x and slope along y."""
         self.X_WA = X_WA
-        self.X_AW = inverse(X_WA)
+        X_AW = inverse(X_WA)
+        self._R_WA, self._p_WA = X_WA[:3, :3].copy(), X_WA[:3, 3].copy()
+        self._R_AW, self._p_AW = X_AW[:3, :3].copy(), X_AW[:3, 3].copy()
         self._field = field
         self.offset = 0.0
         """Shift of the whole surface along its outward normals [m], from the onset of force."""
+        self.nearest(self._p_WA)  # compiles it
 
     @staticmethod
     def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> Surface:
@@ -84,19 +90,49 @@ class Surface:
         Fixed point: slide the foot by the tangential part of what separates it from c. Converges at the rate of distance
         over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
         """
-        c_A = self.X_AW[:3, :3] @ c_W + self.X_AW[:3, 3]
-        x, y = float(c_A[0]), float(c_A[1])
-        for k in range(iterations):
-            h, slope_x, slope_y = self._field.one(x, y)
-            n_A = np.array((-slope_x, -slope_y, 1.0)) / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-            foot = np.array((x, y, h))
-            gap = c_A - foot
-            distance = float(gap @ n_A)
-            slide = gap - distance * n_A
-            size = max(abs(float(slide[0])), abs(float(slide[1])))
-            if size < 1e-6 or k == iterations - 1:
-                break
-            limit = min(1.0, 0.02 / size)
-            x, y = x + limit * float(slide[0]), y + limit * float(slide[1])
-        p_A = foot + self.offset * n_A
-        return self.X_WA[:3, :3] @ p_A + self.X_WA[:3, 3], self.X_WA[:3, :3] @ n_A, distance - self.offset
+        field, p_W, n_W = self._field, np.empty(3), np.empty(3)
+        c_W = np.ascontiguousarray(c_W)
+        distance = _nearest(
+            self._R_WA, self._p_WA, self._R_AW, self._p_AW, field.axes, field.coefficients, self.offset, c_W, iterations, p_W, n_W
+        )
+        if not isfinite(distance):
+            raise ValueError(f"perceived surface: distance {distance} of {c_W.tolist()} in world")
+        return p_W, n_W, distance
+
+
+@compiled
+def _nearest(
+    R_WA: Array,
+    p_WA: Array,
+    R_AW: Array,
+    p_AW: Array,
+    axes: Array,
+    coefficients: Array,
+    offset: float,
+    c_W: Array,
+    iterations: int,
+    p_W: Array,
+    n_W: Array,
+) -> float:
+    """The foot `p_W` [m] and the unit normal `n_W` there, shapes (3,), of a field of heights and slopes; signed distance [m]."""
+    c = R_AW @ c_W + p_AW
+    x, y = c[0], c[1]
+    foot, normal = np.empty(3), np.empty(3)
+    distance = 0.0
+    for k in range(iterations):
+        h, slope_x, slope_y = value_at(axes, coefficients, x, y)
+        foot[0], foot[1], foot[2] = x, y, h
+        length = sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+        normal[0], normal[1], normal[2] = -slope_x / length, -slope_y / length, 1.0 / length
+        gap = c - foot
+        distance = float(gap @ normal)
+        slide = gap - distance * normal
+        size = max(abs(slide[0]), abs(slide[1]))
+        if size < 1e-6 or k == iterations - 1:
+            break
+        limit = min(1.0, 0.02 / size)
+        x, y = x + limit * slide[0], y + limit * slide[1]
+    p, n = R_WA @ (foot + offset * normal), R_WA @ normal
+    for i in range(3):
+        p_W[i], n_W[i] = p[i] + p_WA[i], n[i]
+    return distance - offset

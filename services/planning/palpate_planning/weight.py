@@ -24,7 +24,8 @@ class ToolWeight:
 
     def __init__(self, mass: float, com_S: Array, gravity: float = GRAVITY) -> None:
         """`mass` [kg] below the sensor and its centre `com_S` [m] in sensor axes."""
-        self.mass, self.com_S, self._gravity = mass, com_S, gravity
+        self.mass, self.com_S = mass, com_S
+        self._weight_W = np.array((0.0, 0.0, -mass * gravity))
         self.bias = np.zeros(6)
         self._sum = np.zeros(6)
         self._count = 0
@@ -40,7 +41,7 @@ class ToolWeight:
 
     def wrench(self, R_WS: Array) -> Array:
         """The weight as the sensor sees it: force [N] and torque [N m] at its origin in its axes, shape (6,)."""
-        force = R_WS.T @ np.array((0.0, 0.0, -self.mass * self._gravity))
+        force = R_WS.T @ self._weight_W
         return np.concatenate((force, cross(self.com_S, force)))
 
     def start_tare(self) -> None:
@@ -63,5 +64,5 @@ class ToolWeight:
 
         `a_W`: acceleration of the tool [m/s^2], shape (3,): 0.5 m/s^2 of 0.35 kg would pass for a touch.
         """
-        force = R_WS @ (wrench_S - self.bias - self.wrench(R_WS))[:3]
+        force = R_WS @ (wrench_S[:3] - self.bias[:3] - R_WS.T @ self._weight_W)
         return np.asarray(force if a_W is None else force + self.mass * a_W)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from palpate_planning.poses import angular_velocity, centre, least_twist, pose, quaternion
+from palpate_models.rotations import quaternion
+from palpate_planning.poses import angular_velocity, centre, least_twist, pose
 from scipy.spatial.transform import Rotation
 
 coordinate = st.floats(-1.0, 1.0)
@@ -67,8 +68,8 @@ def test_near_normals_have_near_orientations(normal: np.ndarray, change: np.ndar
 @given(rotations)
 @settings(deadline=None)
 def test_quaternion_agrees_with_scipy(R: np.ndarray) -> None:
-    assert Rotation.from_quat(quaternion(R)).as_matrix() == pytest.approx(R, abs=1e-9)
-    assert quaternion(R)[3] >= 0
+    assert Rotation.from_quat(quaternion(R.tolist())).as_matrix() == pytest.approx(R, abs=1e-9)
+    assert quaternion(R.tolist())[3] >= 0
 
 
 @given(rotations, vectors)

@@ -67,3 +67,9 @@ def test_a_mesh_without_extent_is_refused() -> None:
         Surface.from_mesh(np.zeros((3, 3)), None, X_WA)
     with pytest.raises(ValueError, match="spans"):
         Surface.from_mesh(np.zeros((30, 3)), None, X_WA)
+
+
+def test_a_surface_of_no_numbers_is_refused() -> None:
+    normals = np.full_like(VERTICES, np.nan)
+    with pytest.raises(ValueError, match="perceived surface"):
+        Surface.from_mesh(apply(X_WA, VERTICES), normals, X_WA)

@@ -65,7 +65,7 @@ class Cause(IntEnum):
     """The arm, its controller, its sensor or the connection to them: of drivers of hardware."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Command:
     """Joint torques without gravity [N m], when they were sent [ns], and when they expire [ns]."""
 

@@ -32,6 +32,8 @@ from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY,
 
 LEAST_CLEARANCE_RAD: Final = 0.01
 """Closer than this, in angle, DART looks for contacts: far more than a step turns."""
+_FORCE_FIRST: Final = np.array((3, 4, 5, 0, 1, 2))
+"""Order of a wrench's parts where the engine's has the moment first."""
 LOOK_EVERY: Final = 20
 """Steps between looks at the clearance while there is too little."""
 
@@ -197,8 +199,7 @@ class Plant:
         At the sensor's origin, in its axes, averaged over the last step: contact, weight and inertia of the tool.
         It is minus the wrench that the joint above `ft_sensor` transmits (Featherstone's f_i), constraints included.
         """
-        moment_force = self._sensor.getBodyForce()
-        return -np.concatenate((moment_force[3:], moment_force[:3]))
+        return np.asarray(-self._sensor.getBodyForce()[_FORCE_FIRST])
 
     def tool_pose(self) -> tuple[Array, Any]:
         """Position p_WI [m], shape (3,), and orientation (DART quaternion) of the indenter in world."""

@@ -64,7 +64,8 @@ class RobotService(Service):
         self._driver = Driver(exam.limits.force_emergency_n)
         self._rng = joint_rng
         self._deviation = np.repeat((robot.position_noise_rad, robot.velocity_noise_radps), 7)
-        self._noise: Array = np.empty((0, 14))
+        self._q_noise: Array = np.empty((0, 7))
+        self._v_noise: Array = np.empty((0, 7))
         self._row = 0
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
@@ -74,9 +75,9 @@ class RobotService(Service):
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
         self._pressed = False
-        self._applied = np.zeros(7)
-        self._sums = np.zeros(20)  # of position, velocity and F/T reading since the last status
-        self._summed = 0
+        self._applied: Array = np.zeros(7)  # another array at every step: messages keep it
+        self._recent: tuple[list[Array], list[Array], list[Array]] = ([], [], [])
+        """Positions, velocities and F/T readings since the last status."""
         self._external_force = 0.0
         self._peak_force = 0.0
 
@@ -89,16 +90,14 @@ class RobotService(Service):
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """The same: first what control and tissue wait for."""
+        """The same: first what control waits for, then what tissue does."""
         self._obey_operator(t, inbox)
         self._drive(t, inbox)
         stamp = _Time(t // NS, t % NS)
+        yield {"joint_states": self._joint_state(stamp)}
         p_WI, q_WI = self._plant.tool_pose()
         w, x, y, z = q_WI.w(), q_WI.x(), q_WI.y(), q_WI.z()
-        yield {
-            "joint_states": self._joint_state(stamp),
-            "sim/tool_state": self._tool_state(stamp, p_WI, _Quaternion(x, y, z, w)),
-        }
+        yield {"sim/tool_state": self._tool_state(stamp, p_WI, _Quaternion(x, y, z, w))}
         up_S = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         outbox: dict[str, Message] = {"ft/wrench": self._wrench(stamp, up_S)}
         if not t % _STATUS_PERIOD:
@@ -172,21 +171,20 @@ class RobotService(Service):
             moment[0], moment[1], moment[2] = m.x, m.y, m.z
 
     def _joint_state(self, stamp: Message) -> Message:
-        if self._row == len(self._noise):
-            self._noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, 14))
+        if self._row == len(self._q_noise):
+            noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, 14))
+            self._q_noise, self._v_noise = noise[:, :7], noise[:, 7:]
             self._row = 0
-        noise = self._noise[self._row]
+        q, v = self._plant.q + self._q_noise[self._row], self._plant.v + self._v_noise[self._row]
         self._row += 1
-        q, v = self._plant.q + noise[:7], self._plant.v + noise[7:]
-        self._sums[:7] += q
-        self._sums[7:14] += v
-        self._summed += 1
-        return _JointState(_Header(stamp, ""), _NAMES, q, v, self._applied.copy())
+        self._recent[0].append(q)
+        self._recent[1].append(v)
+        return _JointState(_Header(stamp, ""), _NAMES, q, v, self._applied)
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
         reading = self._sensor.read(self._plant.sensor_wrench())
-        self._sums[14:] += reading
+        self._recent[2].append(reading)
         fx, fy, fz, mx, my, mz = reading.tolist()
         weight = self._weight
         external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
@@ -202,18 +200,18 @@ class RobotService(Service):
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
-        mean = self._sums / self._summed
-        self._sums[:] = 0.0
-        self._summed = 0
+        q, v, reading = (np.add.reduce(rows) / len(rows) for rows in self._recent)
+        for rows in self._recent:
+            rows.clear()
         return _RobotStatus(
             _Header(stamp, ""),
             int(driver.mode),
             int(driver.cause),
             driver.reason,
-            mean[:7],
-            mean[7:14],
-            _Wrench(_Vector3(*mean[14:17].tolist()), _Vector3(*mean[17:].tolist())),
-            self._applied.copy(),
+            q,
+            v,
+            _Wrench(_Vector3(*reading[:3].tolist()), _Vector3(*reading[3:].tolist())),
+            self._applied,
             driver.rejected,
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any, ClassVar
 
 import numpy as np
@@ -45,6 +46,7 @@ class SupervisorService(Service):
         self._sense = ToolSense(known.robot)
         self._watch = Watch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
+        RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it ahead of any deadline
         self._latch = Latch()
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
@@ -119,7 +121,7 @@ class SupervisorService(Service):
         wrench = np.array((force.x, force.y, force.z, moment.x, moment.y, moment.z))
         q, qd = np.array(status.position), np.array(status.velocity)
         for name, values in (("position", q), ("velocity", qd), ("wrench", wrench)):
-            if not np.isfinite(values).all():
+            if not all(map(isfinite, values.tolist())):
                 return [Breach(Level.EMERGENCY, Cause.INVALID, f"robot/status: {name} = {values}: must be finite")]
         self._tool = tool = self._sense.sense(q, qd, wrench)
         self._peak_force = max(self._peak_force, tool.force)

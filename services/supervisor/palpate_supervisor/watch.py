@@ -76,7 +76,7 @@ class Watch:
     def __init__(self, limits: Limits, X_AW: Array) -> None:
         """`X_AW`: world in the abdomen frame, in which the workspace is given, shape (4, 4)."""
         self._limits = limits
-        self._X_AW = X_AW
+        self._R_AW, self._p_AW = X_AW[:3, :3], X_AW[:3, 3]
         self._forces: deque[tuple[int, float]] = deque(maxlen=RATE_SAMPLES + 1)
         self._over_since: int | None = None
 
@@ -100,14 +100,15 @@ class Watch:
             self._over_since = None
         elif self._over_since is None:
             self._over_since = t
+        rising = soon > limits.force_soft_stop_n and rate > FAST_NPS
+        lasting = self._over_since is not None and t - self._over_since >= PATIENCE
+        if not (rising or lasting or soon > limits.force_emergency_n):
+            return []
         words = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
         if soon > limits.force_emergency_n:
             return [Breach(Level.EMERGENCY, Cause.FORCE, f"{words}, emergency limit {limits.force_emergency_n:g} N")]
-        rising = soon > limits.force_soft_stop_n and rate > FAST_NPS
-        if rising or (self._over_since is not None and t - self._over_since >= PATIENCE):
-            heed = HEED_RISING if rising else HEED
-            return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{words}, soft-stop limit {limits.force_soft_stop_n:g} N", heed)]
-        return []
+        heed = HEED_RISING if rising else HEED
+        return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{words}, soft-stop limit {limits.force_soft_stop_n:g} N", heed)]
 
     def _depth(self, depth: float, force: float) -> list[Breach]:
         limit = self._limits.depth_m + DEPTH_MARGIN_M
@@ -131,8 +132,10 @@ class Watch:
         return []
 
     def _workspace(self, p_W: Array) -> list[Breach]:
-        p_A = self._X_AW[:3, :3] @ p_W + self._X_AW[:3, 3]
-        for axis, value, low, high in zip("xyz", p_A, self._limits.workspace_min_m, self._limits.workspace_max_m, strict=True):
+        p_A = self._R_AW @ p_W + self._p_AW
+        for axis, value, low, high in zip(
+            "xyz", p_A.tolist(), self._limits.workspace_min_m, self._limits.workspace_max_m, strict=True
+        ):
             if not low <= value <= high:
                 words = f"tool at {axis} = {value:.3f} m in the abdomen frame, allowed {low:g} to {high:g} m"
                 return [Breach(Level.EMERGENCY, Cause.WORKSPACE, words)]

@@ -109,6 +109,15 @@ def test_depth_over_a_dome_is_that_of_geometry() -> None:
         assert surface.depth(n * (R - 0.010 + r)) == pytest.approx(0.010, abs=1e-4)
 
 
+def test_depth_is_that_at_the_nearest_vertex() -> None:
+    rng = np.random.default_rng(2)
+    vertices, normals = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
+    surface = RestSurface(vertices, normals, 0.015)
+    for p in rng.normal(size=(100, 3)):
+        i = int(np.argmin(np.linalg.norm(vertices - p, axis=1)))
+        assert surface.depth(p) == pytest.approx(0.015 - normals[i] @ (p - vertices[i]))
+
+
 @pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
 def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
     with pytest.raises(ValueError, match="perceived surface"):

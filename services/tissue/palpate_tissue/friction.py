@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import math
+from math import sqrt
 
+import numpy as np
+from numpy.typing import NDArray
+from palpate_models.compiled import compiled
+
+Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 REFERENCE_K_W = 1.7e5
@@ -32,11 +37,19 @@ class Friction:
     def __init__(self, coefficient: float, stiffness: float) -> None:
         self.coefficient = coefficient
         self.stiffness = stiffness
-        self.stretch: Vector = (0.0, 0.0, 0.0)
+        self.bristle: Array = np.zeros(3)
+        """How far the skin is sheared [m], which `rub` carries on."""
+        self.step(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0)  # compiles it, so that the first contact need not wait
+
+    @property
+    def stretch(self) -> Vector:
+        """How far the skin is sheared [m]."""
+        x, y, z = self.bristle.tolist()
+        return x, y, z
 
     def release(self) -> None:
         """Contact is lost: the skin springs back."""
-        self.stretch = (0.0, 0.0, 0.0)
+        self.bristle[:] = 0.0
 
     def step(self, dt: float, velocity: Vector, normal: Vector, load: float) -> Vector:
         """Friction force on the indenter [N] after `dt` [s].
@@ -44,18 +57,34 @@ class Friction:
         `velocity` [m/s] is of the indenter's surface against the tissue, `normal` of unit length, `load` the normal
         force [N]; all in one frame.
         """
-        limit = self.coefficient * load
-        if limit <= 0:
-            self.release()
-            return self.stretch
-        nx, ny, nz = normal
-        x, y, z = (s + v * dt for s, v in zip(self.stretch, velocity, strict=True))
-        along = x * nx + y * ny + z * nz
-        x, y, z = x - along * nx, y - along * ny, z - along * nz
-        pull = self.stiffness * math.sqrt(x * x + y * y + z * z)
-        if pull > limit:
-            share = limit / pull
-            x, y, z = x * share, y * share, z * share
-        self.stretch = (x, y, z)
-        k = -self.stiffness
-        return (k * x, k * y, k * z)
+        return rub(self.bristle, self.coefficient, self.stiffness, dt, *velocity, *normal, load)
+
+
+@compiled
+def rub(
+    bristle: Array,
+    coefficient: float,
+    stiffness: float,
+    dt: float,
+    vx: float,
+    vy: float,
+    vz: float,
+    nx: float,
+    ny: float,
+    nz: float,
+    load: float,
+) -> Vector:
+    """`Friction.step` for compiled code; `bristle` (3,) [m] is its state."""
+    limit = coefficient * load
+    if limit <= 0.0:
+        bristle[:] = 0.0
+        return 0.0, 0.0, 0.0
+    x, y, z = bristle[0] + vx * dt, bristle[1] + vy * dt, bristle[2] + vz * dt
+    along = x * nx + y * ny + z * nz
+    x, y, z = x - along * nx, y - along * ny, z - along * nz
+    pull = stiffness * sqrt(x * x + y * y + z * z)
+    if pull > limit:
+        share = limit / pull
+        x, y, z = x * share, y * share, z * share
+    bristle[0], bristle[1], bristle[2] = x, y, z
+    return -stiffness * x, -stiffness * y, -stiffness * z

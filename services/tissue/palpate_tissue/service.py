@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from math import sqrt
 from typing import Any, ClassVar
 
 import numpy as np
@@ -59,6 +60,7 @@ class TissueService(Service):
         self._R_AW = np.ascontiguousarray(self._X_WA[:3, :3].T)
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
         self._p_WA = self._X_WA[:3, 3].copy()
+        self._origin: list[float] = self._p_WA.tolist()
         self._triangles = self._model.triangles.astype(np.uint32).ravel()
         self._peak_n = self._recent_peak_n = 0.0
         self._contact_steps = 0
@@ -93,24 +95,25 @@ class TissueService(Service):
             force_W = torque_W = _NOTHING
         else:
             position, linear, angular = tool.pose.position, tool.twist.linear, tool.twist.angular
+            x, y, z = self._origin
             motion_W = np.array(
                 (
-                    (position.x, position.y, position.z),
-                    (linear.x, linear.y, linear.z),
-                    (angular.x, angular.y, angular.z),
+                    position.x - x, position.y - y, position.z - z,
+                    linear.x, linear.y, linear.z,
+                    angular.x, angular.y, angular.z,
                 )
-            )
-            motion_W[0] -= self._p_WA
-            p_A, v_A, w_A = motion_W @ self._R_WA
+            )  # fmt: skip
+            p_A, v_A, w_A = motion_W.reshape(3, 3).dot(self._R_WA)
             force_A, torque_A = self._tissue.step(t / NS, p_A, v_A, float(tool.radius), w_A)
             if self._tissue.touching:
-                force_W, torque_W = self._R_WA @ force_A, self._R_WA @ torque_A
+                force_W, torque_W = self._R_WA.dot(force_A), self._R_WA.dot(torque_A)
             else:
                 force_W = torque_W = _NOTHING
-        wrench = _Wrench(_Vector3(*force_W.tolist()), _Vector3(*torque_W.tolist()))
+        force = _Vector3(*force_W.tolist())
+        wrench = _Wrench(force, _Vector3(*torque_W.tolist()))
         yield {"sim/contact_wrench": _WrenchStamped(header(t, "world"), wrench)}
         if tool is not None:
-            self._count(force_W)
+            self._count(force)
         outbox: dict[str, Message | list[Message]] = {}
         if t % self._surface_period == 0:
             outbox["sim/surface"] = self._surface_message(t)
@@ -129,12 +132,14 @@ class TissueService(Service):
             "contact_onsets": self._onsets,
         }
 
-    def _count(self, force_W: Array) -> None:
+    def _count(self, force: Message) -> None:
+        """Counts the step and the force on the indenter, a Vector3 [N]."""
         touching = self._tissue.touching
         if touching:
             self._contact_steps += 1
             self._onsets += not self._touching
-            self._recent_peak_n = max(self._recent_peak_n, float(np.dot(force_W, force_W)) ** 0.5)
+            size = (force.x * force.x + force.y * force.y + force.z * force.z) ** 0.5
+            self._recent_peak_n = max(self._recent_peak_n, size)
         self._touching = touching
 
     def _surface_message(self, t: int) -> Message:
@@ -147,17 +152,17 @@ class TissueService(Service):
         if tool is None:
             return _IndentationTruth(header(t, "world"), _OUT_OF_REACH_M, 0.0, 0.0, 0.0, 0, _Point(0.0, 0.0, 0.0), 0.0)
         position = tool.pose.position
-        p_A = self._R_AW @ (np.array((position.x, position.y, position.z)) - self._p_WA)
+        p_A = self._R_AW.dot(np.array((position.x, position.y, position.z)) - self._p_WA)
         under = self._surface.nearest(p_A, self._tissue.excursion(t / NS))
-        normal_W = self._R_WA @ under.normal
-        normal_force = float(force_W @ normal_W)
-        tangential = float(np.linalg.norm(force_W - normal_force * normal_W))
-        point_W = self._R_WA @ under.position + self._p_WA
+        normal_W = self._R_WA.dot(under.normal)
+        normal_force = float(force_W.dot(normal_W))
+        tangential_W = force_W - normal_force * normal_W
+        point_W = self._R_WA.dot(under.position) + self._p_WA
         return _IndentationTruth(
             header(t, "world"),
             float(tool.radius) - under.height,
             max(normal_force, 0.0),
-            tangential,
+            sqrt(tangential_W.dot(tangential_W)),
             self._recent_peak_n,
             len(self._tissue.contacts),
             _Point(*point_W.tolist()),

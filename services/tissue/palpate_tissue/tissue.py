@@ -37,13 +37,11 @@ class _Candidates:
     """Vertices that the sphere might hold while its centre stays near `origin`; m of them."""
 
     origin: list[float]  # [m], in A
+    zero: Array  # the same for compiled code, shape (3,)
     reach: float  # [m] how far the centre may go from origin
     radius: float  # [m] of the sphere
     index: NDArray[np.uint32]  # vertices, shape (m,)
-    normals: Array  # outward, shape (m, 3)
-    positions: Array  # from origin [m], shape (m, 3)
-    breathing: Array  # share of the breathing excursion, shape (m,)
-    gain: Array  # C / h [N/m], shape (m,)
+    vertices: Array  # outward normal, position from origin [m], share of breathing, C / h [N/m], shape (m, 8)
     force: Array  # of each in the last step [N], shape (m,)
 
 
@@ -88,8 +86,9 @@ class Tissue:
         self._free = free
         self._tree = cKDTree(model.vertices[free])
         self._candidates: _Candidates | None = None
-        self._q: Array = np.zeros(3)
-        self._sums: Array = np.zeros(9)
+        self._rub: Array = np.array((self.friction.coefficient, self.friction.stiffness, self._h))
+        self._sphere: Array = np.zeros((3, 3))
+        """The sphere's centre [m], velocity [m/s] and angular velocity [rad/s]."""
         self._at: list[float] | None = None
         self.disturbed = False
         """Whether anything has ever moved; until then the field is left at its exact rest."""
@@ -101,8 +100,8 @@ class Tissue:
         """Compiles what steps call, on a field at rest, so that the first contact need not wait for it."""
         kernel.relax(*self._advance, self.branches, self._strain, self.displacement)
         kernel.remember(self.branches, self._decay, self._feed, self.displacement)
-        none, points, index = np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.uint32)
-        kernel.hold(index, points, points, none, none, self._q, 0.0, _RIM, 0.0, self.displacement, none, self._sums)
+        empty = _Candidates([], np.zeros(3), 0.0, 0.0, np.zeros(0, np.uint32), np.zeros((0, 8)), np.zeros(0))
+        self._contact(empty, np.zeros(6))
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
@@ -119,18 +118,24 @@ class Tissue:
             raise ValueError(f"tissue: the indenter's position is not finite: {end}")
         start = self._at or end  # where the sphere was a period ago
         self._at = end
-        velocity = v_A.tolist()
-        spin = w_A.tolist() if w_A is not None else None
+        sphere = self._sphere
+        sphere[0] = p_A
+        sphere[1] = v_A
+        sphere[2] = 0.0 if w_A is None else w_A
+        wrench = np.zeros(6)
         if self.substeps == 1:
-            wrench = self._substep(self.excursion(t_s), end, velocity, spin, radius)
-            return np.array(wrench[:3]), np.array(wrench[3:])
-        total = np.zeros(6)
+            self._substep(self.excursion(t_s), end, radius, wrench)
+            return wrench[:3], wrench[3:]
+        part = np.zeros(6)
         for k in range(1, self.substeps + 1):
             share = k / self.substeps
             at = [a + share * (b - a) for a, b in zip(start, end, strict=True)]
-            total += self._substep(self.excursion(t_s - self.dt * (1 - share)), at, velocity, spin, radius)
-        total /= self.substeps
-        return total[:3], total[3:]
+            sphere[0] = at
+            part[:] = 0.0
+            self._substep(self.excursion(t_s - self.dt * (1 - share)), at, radius, part)
+            wrench += part
+        wrench /= self.substeps
+        return wrench[:3], wrench[3:]
 
     def idle(self, t_s: float) -> None:
         """Advances by one period to time `t_s` [s] with no sphere anywhere."""
@@ -140,18 +145,18 @@ class Tissue:
             self._no_contact()
             self._remember()
 
-    def _substep(
-        self, excursion: float, p: list[float], velocity: list[float], spin: list[float] | None, radius: float
-    ) -> tuple[float, float, float, float, float, float]:
-        """One explicit step; returns force and torque on the sphere."""
+    def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
+        """One explicit step; `wrench` (6,) gets force [N] and torque [N m] on the sphere, and is left alone out of contact."""
         self._excursion = excursion
         near = self._candidates
         if near is None or radius != near.radius or math.dist(p, near.origin) > near.reach:
             near = self._gather(p, radius)
         self._relax()
-        wrench = self._contact(near, p, velocity, spin) if len(near.index) else self._no_contact()
+        if len(near.index) and self._contact(near, wrench):
+            self.touching = self.disturbed = True
+        else:
+            self._no_contact()
         self._remember()
-        return wrench
 
     def _relax(self) -> None:
         """The field as it moves by itself: u += -h C^-1 K (u - sum y). A surface never touched is at rest exactly."""
@@ -163,45 +168,27 @@ class Tissue:
         if self.disturbed:
             kernel.remember(self.branches, self._decay, self._feed, self.displacement)
 
-    def _contact(
-        self, near: _Candidates, p: list[float], velocity: list[float], spin: list[float] | None
-    ) -> tuple[float, float, float, float, float, float]:
-        """Holds the vertices under the sphere on it, and returns what that takes."""
-        q, sums = self._q, self._sums
-        for axis in range(3):
-            q[axis] = p[axis] - near.origin[axis]
-        load = kernel.hold(
+    def _contact(self, near: _Candidates, wrench: Array) -> bool:
+        """Holds the vertices under the sphere on it; `wrench` (6,) gets what that takes. False where it touches nothing."""
+        return kernel.contact(
             near.index,
-            near.normals,
-            near.positions,
-            near.breathing,
-            near.gain,
-            q,
+            near.vertices,
+            near.zero,
+            self._sphere,
             near.radius,
             _RIM,
             self._excursion,
             self.displacement,
             near.force,
-            sums,
+            self.friction.bristle,
+            self._rub,
+            wrench,
         )
-        if load <= 0:
-            return self._no_contact()
-        self.touching = self.disturbed = True
-        fx, fy, fz, nx, ny, nz, rx, ry, rz = sums.tolist()
-        vx, vy, vz = velocity
-        if spin is not None:
-            wx, wy, wz = spin
-            vx, vy, vz = vx + wy * rz - wz * ry, vy + wz * rx - wx * rz, vz + wx * ry - wy * rx
-        normal_load = math.sqrt(nx * nx + ny * ny + nz * nz)
-        normal = (nx / normal_load, ny / normal_load, nz / normal_load)
-        tx, ty, tz = self.friction.step(self._h, (vx, vy, vz), normal, normal_load)
-        return (fx + tx, fy + ty, fz + tz, ry * tz - rz * ty, rz * tx - rx * tz, rx * ty - ry * tx)
 
-    def _no_contact(self) -> tuple[float, float, float, float, float, float]:
+    def _no_contact(self) -> None:
         if self.touching:
             self.touching = False
             self.friction.release()
-        return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def _gather(self, p: list[float], radius: float) -> _Candidates:
         """The vertices that a sphere near `p` might hold, found by the tree."""
@@ -220,13 +207,11 @@ class Tissue:
         index, normals, positions = index[keep], normals[keep], positions[keep]
         self._candidates = _Candidates(
             origin=list(p),
+            zero=np.array(p),
             reach=reach,
             radius=radius,
             index=index.astype(np.uint32),
-            normals=np.ascontiguousarray(normals),
-            positions=np.ascontiguousarray(positions),
-            breathing=model.breathing[index],
-            gain=self._gain[index],
+            vertices=np.column_stack((normals, positions, model.breathing[index], self._gain[index])),
             force=np.zeros(len(index)),
         )
         return self._candidates
