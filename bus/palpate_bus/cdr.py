@@ -40,11 +40,13 @@ _FORMAT = {
     "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
 _DTYPE = {name: np.dtype({"bool": "?", "byte": "i1", "char": "u1"}.get(name, name)) for name in _FORMAT}
-_PADS = tuple(bytes(n) for n in range(8))
 
 
-def _run(formats: str, offset: int) -> tuple[struct.Struct, ...]:
-    """Structs of a run of numbers, one for each (position + offset) modulo 8, with the padding between them."""
+def _run(formats: str, offset: int, align: int = 1) -> tuple[struct.Struct, ...]:
+    """Structs of a run of numbers, one for each (position + offset) modulo 8, with the padding between them.
+
+    What follows is aligned to `align` bytes.
+    """
     structs = []
     for index in range(8):
         position = phase = (index + offset) % 8
@@ -54,6 +56,8 @@ def _run(formats: str, offset: int) -> tuple[struct.Struct, ...]:
             pad = -position % size
             text += "x" * pad + code
             position += pad + size
+        text += "x" * (-position % align)
+        position += -position % align
         structs.append(struct.Struct(text))
         assert structs[-1].size == position - phase
     return tuple(structs)
@@ -123,7 +127,7 @@ class _Writer:
         self.formats: list[str] = []
         """The run of numbers that is being collected, and where they come from or go to."""
         self.numbers: list[str] = []
-        self.names: dict[str, Any] = {"frombuffer": np.frombuffer, "ndarray": np.ndarray, "PADS": _PADS, "array": _array}
+        self.names: dict[str, Any] = {"frombuffer": np.frombuffer, "ndarray": np.ndarray, "array": _array}
         self.names |= {"pack_strings": _pack_strings, "new": object.__new__, "join": b"".join}
         self._counter = count()
 
@@ -142,9 +146,9 @@ class _Writer:
         self.numbers.append(variable)
         return variable
 
-    def take_run(self, offset: int) -> tuple[str, str]:
+    def take_run(self, offset: int, align: int = 1) -> tuple[str, str]:
         """The name of the run's Structs and its variables; the next run begins empty."""
-        structs, variables = self.name(_run("".join(self.formats), offset)), ", ".join(self.numbers)
+        structs, variables = self.name(_run("".join(self.formats), offset, align)), ", ".join(self.numbers)
         self.formats.clear()
         self.numbers.clear()
         return structs, variables
@@ -163,10 +167,12 @@ class _Encoder(_Writer):
 
     def flush(self) -> None:
         if self.formats:
-            structs, values = self.take_run(0)
-            part = self.variable()
-            self.lines.append(f"s = {structs}[p & 7]; {part} = s.pack({values}); p += s.size")
-            self.parts.append(part)
+            self._pack(*self.take_run(0))
+
+    def _pack(self, structs: str, values: str) -> None:
+        part = self.variable()
+        self.lines.append(f"s = {structs}[p & 7]; {part} = s.pack({values}); p += s.size")
+        self.parts.append(part)
 
     def string(self, path: str) -> None:
         part = self.variable()
@@ -178,21 +184,22 @@ class _Encoder(_Writer):
 
     def array(self, path: str, dtype: np.dtype[Any], length: int) -> None:
         part, c, size = self.variable(), self.name(dtype), dtype.itemsize
-        right_size = f"{part}.nbytes == {length * size if length >= 0 else f'len({part}) * {size}'}"
+        wrong = f"{part}.__class__ is not ndarray or {part}.dtype is not {c} or {part}.ndim != 1"
         self.lines.append(f"{part} = {path}")
-        self.lines.append(f"if {part}.__class__ is not ndarray or {part}.dtype is not {c} or not {right_size}:")
+        self.lines.append(f"if {wrong}{f' or len({part}) != {length}' if length >= 0 else ''}:")
         self.lines.append(f"  {part} = array({part}, {c}, {length}, {path[2:]!r})")
-        if length < 0:
-            self.number("I", f"len({part})")
-        self.flush()
-        if size > 1:
-            pad = self.variable()
-            self.lines.append(f"{pad} = PADS[-p & {size - 1}]{'' if length >= 0 else f' if len({part}) else PADS[0]'}")
-            self.lines.append(f"p += len({pad})")
-            self.parts.append(pad)
-        self.lines.append(f"p += {part}.nbytes")
+        if length >= 0:
+            n = str(length)
+            self._pack(*self.take_run(0, size if length else 1))
+        else:  # padding stands only where items follow
+            n = self.number("I", self.variable())
+            self.lines.append(f"{n} = len({part})")
+            plain = self.name(_run("".join(self.formats), 0))
+            structs, values = self.take_run(0, size)
+            self._pack(f"({structs} if {n} else {plain})", values)
+        self.lines.append(f"p += {n} * {size}")
         # Small arrays are copied, which is quicker than a look at whether they are contiguous.
-        self.lines.append(f"if {part}.nbytes < 512 or not {part}.flags.c_contiguous: {part} = {part}.tobytes()")
+        self.lines.append(f"if {n} < {512 // size} or not {part}.flags.c_contiguous: {part} = {part}.tobytes()")
         self.parts.append(part)
 
     def items(self, path: str, item: Any, length: int) -> None:
@@ -234,7 +241,7 @@ class _Decoder(_Writer):
         self.lines.append(f"e = p + {n}")
         self.lines.append(f"if {n} < 1 or e > len(b) or b[e - 1]:")
         self.lines.append(f"  raise ValueError(f'{path[2:]}: invalid string of length {{{n}}} at {{p}}')")
-        self.lines.append(f"{value} = b[p:e - 1].decode(); p = e")
+        self.lines.append(f"{value} = b[p:e - 1].decode() if {n} > 1 else ''; p = e")
         self.values[path] = value
 
     def array(self, path: str, dtype: np.dtype[Any], length: int) -> None:
@@ -244,7 +251,7 @@ class _Decoder(_Writer):
             align = f"p += -(p - 4) & {dtype.itemsize - 1}"
             self.lines.append(align if length >= 0 else f"if {n}: {align}")
         value = self.values[path] = self.variable()
-        self.lines.append(f"{value} = frombuffer(b, {self.name(dtype)}, {n}, p); p += {value}.nbytes")
+        self.lines.append(f"{value} = frombuffer(b, {self.name(dtype)}, {n}, p); p += {n} * {dtype.itemsize}")
 
     def items(self, path: str, item: Any, length: int) -> None:
         n = str(length) if length >= 0 else self.number("I", self.variable())

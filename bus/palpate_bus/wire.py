@@ -22,6 +22,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 
 from palpate_bus.codec import type_hash
 from palpate_bus.contract import Topic
@@ -90,6 +91,7 @@ def topic_key(topic: Topic, domain: int) -> str:
     return message_key(topic.name, topic.type, domain)
 
 
+@lru_cache(maxsize=256)
 def parse_key(key: str) -> TopicKey:
     """The parts of a key expression. Raises WireError if it is not of rmw_zenoh's form."""
     chunks = key.split("/")
