@@ -248,9 +248,9 @@ class Stepper:
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
-            packed = port.pack(message)
-            port.chain(packed[1], 0, packed[2])
-            sent.append(packed)
+            _, payload, sequence = port.pack(message)
+            port.chain(payload, 0, sequence)
+            sent.append((port, payload, sequence))
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
             raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
@@ -265,7 +265,9 @@ class Stepper:
 
         Raises LockstepError when the service leaves out a periodic message or sends one off its tick.
         """
-        self._take(t)
+        for buffer in self._all:
+            if buffer.pending or buffer.new:
+                buffer.take(t)
         blame = self.blame
         begin, decoded = perf_counter_ns(), blame.decode
         for outbox in self.service.parts(t, self.inbox):
@@ -281,25 +283,15 @@ class Stepper:
             stepped = perf_counter_ns()
             blame.encode += stepped - begin
             begin = stepped
-        self._close(t)
-
-    def _take(self, t: int) -> None:
-        for buffer in self._all:
-            if buffer.pending or buffer.new:
-                buffer.take(t)
-
-    def _close(self, t: int) -> None:
-        """Ends a step: holds the service to its periods."""
-        if self._strict:
-            for port in self._periodic:
-                if not t % port.period and port.sequence != t // port.period + 1:
-                    raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
-        self.blame.steps += 1
+        for port in self._periodic if self._strict else ():
+            if not t % port.period and port.sequence != t // port.period + 1:
+                raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+        blame.steps += 1
 
     def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
         sent: list[Sent] = []
         for name, message in outbox.items():
-            port = self.ports.get(name) or self._port(name)
+            port = self._port(name)
             if port.event:
                 sent += map(port.pack, message) if isinstance(message, list) else (port.pack(message),)
             elif t % port.period:

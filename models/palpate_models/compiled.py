@@ -4,19 +4,24 @@ Compiled code is kept beside its source, or in NUMBA_CACHE_DIR, or in the user's
 anew by every process. A function compiles at its first call, so whoever has a deadline calls it once before.
 
 numba compiles a function anew when its own file has changed. What it calls is compiled into it, and may stand in another file of
-the package; so here it is compiled anew when any file beside its own is newer than what is kept.
+the package; so here all that is kept of a package goes when any of its files has changed. A compiled function must not call one
+of another package.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
 _F = TypeVar("_F", bound=Callable[..., Any])
+STAMP = "palpate.stamp"
+"""Beside the compiled code: which sources it was made of."""
 
 
 def compiled(function: _F) -> _F:
@@ -25,13 +30,22 @@ def compiled(function: _F) -> _F:
         dispatcher = numba.njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # numba found no folder to keep the code in
         return cast("_F", numba.njit(error_model="numpy")(function))
-    with suppress(OSError):
-        _forget_stale(Path(function.__code__.co_filename), function.__qualname__, Path(str(dispatcher.stats.cache_path)))
+    if dispatcher is not function:  # which it is where NUMBA_DISABLE_JIT is set
+        with suppress(OSError):
+            _renew(Path(function.__code__.co_filename).parent, Path(str(dispatcher.stats.cache_path)))
     return cast("_F", dispatcher)
 
 
-def _forget_stale(source: Path, name: str, kept: Path) -> None:
-    newest = max(path.stat().st_mtime_ns for path in source.parent.glob("*.py"))
-    for index in kept.glob(f"{source.stem}.{name}-*.nbi"):
-        if index.stat().st_mtime_ns < newest:
-            index.unlink(missing_ok=True)
+@cache
+def _renew(package: Path, kept: Path) -> None:
+    """Removes what is kept of a package unless it was made of its sources as they are."""
+    digest = sha256()
+    for path in sorted(package.glob("*.py")):
+        digest.update(path.name.encode() + path.read_bytes())
+    stamp = kept / STAMP
+    if stamp.is_file() and stamp.read_text() == digest.hexdigest():
+        return
+    for index in kept.glob("*.nbi"):
+        index.unlink(missing_ok=True)
+    kept.mkdir(parents=True, exist_ok=True)
+    stamp.write_text(digest.hexdigest())

@@ -1,4 +1,4 @@
-"""Rotation vectors, matrices and quaternions of plain floats: for one at a time, where scipy's Rotation takes 30 us."""
+"""Quaternions of plain floats: for one at a time, which scipy's Rotation takes tens of times as long for."""
 
 from __future__ import annotations
 
@@ -12,18 +12,12 @@ Rows = Sequence[Sequence[float]]
 """A matrix, row by row, as numpy's `tolist` gives it."""
 
 
-def rotation(r: Sequence[float]) -> Rows:
-    """Rotation matrix, 3 rows of 3, of a rotation vector [rad], length 3, by way of its quaternion."""
+def quaternion_of(r: Sequence[float]) -> tuple[float, float, float, float]:
+    """Unit quaternion (x, y, z, w) of a rotation vector [rad] no longer than pi, length 3; w >= 0."""
     square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     angle = sqrt(square)
     scale = sin(angle / 2.0) / angle if angle > _SMALL_RAD else 0.5 - square / 48.0 + square * square / 3840.0
-    x, y, z, w = scale * r[0], scale * r[1], scale * r[2], cos(angle / 2.0)
-    xx, yy, zz, ww = x * x, y * y, z * z, w * w
-    return (
-        (xx - yy - zz + ww, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
-        (2.0 * (x * y + z * w), -xx + yy - zz + ww, 2.0 * (y * z - x * w)),
-        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -xx - yy + zz + ww),
-    )
+    return scale * r[0], scale * r[1], scale * r[2], cos(angle / 2.0)
 
 
 def quaternion(R: Rows) -> tuple[float, float, float, float]:

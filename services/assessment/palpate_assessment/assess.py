@@ -87,7 +87,7 @@ def assess(
     rest = scanned & ~np.any([f.nodes for f in found], axis=0) if found else scanned
     felt = felt_modulus(posterior.mean, grid, contact)
     kept = 1.0 - np.array([s.lost for s in good]) / contact.force(np.array([s.depth for s in good]))
-    unit = contact.flat_force(contact.common_depth) * float(np.median(kept))
+    unit = float(contact.force(np.array(contact.common_depth))) * float(np.median(kept))
     return Assessment(
         grid=grid,
         force=felt * unit,

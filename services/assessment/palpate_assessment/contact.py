@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.polyline import Polyline
 from palpate_models.scenario import Stiffness
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
@@ -110,7 +109,6 @@ class ReferenceContact:
         wider = np.array([static_contact(float(d), 1.02 * sphere, length).force for d in self._depths])
         self._radius_exponent = np.log(wider / self._force) / np.log(1.02)
         self._log_depths, self._log_force = np.log(self._depths), np.log(self._force)
-        self._log_line = Polyline(self._log_depths, self._log_force)
         self._exponent = np.gradient(self._log_force, self._log_depths)
         self._footprints: dict[tuple[int, float], Array] = {}
         self._overlap = self._overlap_table()
@@ -124,11 +122,6 @@ class ReferenceContact:
         flat = np.exp(np.interp(np.log(d), self._log_depths, self._log_force))
         exponent = np.interp(d, self._depths, self._radius_exponent)
         return np.asarray(flat * np.maximum(1.0 + self.sphere * np.asarray(curvature), 0.5) ** -exponent)
-
-    def flat_force(self, depth: float) -> float:
-        """`force` at one depth [m] on a flat surface."""
-        d = min(max(depth, float(self._depths[0])), float(self._depths[-1]))
-        return float(np.exp(self._log_line.at(float(np.log(d)))))
 
     def exponent(self, depth: Array) -> Array:
         """Local exponent d log F / d log depth [1]."""

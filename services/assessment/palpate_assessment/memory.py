@@ -59,6 +59,6 @@ class PathMemory:
             return
         if self._count == len(self._slices):
             self._slices = np.concatenate([self._slices, np.zeros_like(self._slices)])
-        impulse = self._contact.flat_force(depth) * float(total[1])
+        impulse = float(self._contact.force(np.array(depth))) * float(total[1])
         self._slices[self._count] = (time, impulse, x, y, z)
         self._count += 1

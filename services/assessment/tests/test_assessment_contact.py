@@ -44,12 +44,6 @@ def test_impossible_depth_is_refused(depth: float) -> None:
         static_contact(depth, 0.015, 0.015)
 
 
-@pytest.mark.parametrize("depth", [0.0, 1e-4, 0.0031, 0.011, 0.1])
-def test_force_at_one_depth_is_that_of_many_to_the_bit(depth: float) -> None:
-    contact = ReferenceContact(0.015, 0.01)
-    assert contact.flat_force(depth) == contact.force(np.array((depth, depth)))[0]
-
-
 def test_convex_surface_feels_softer() -> None:
     contact = ReferenceContact(0.015, 0.010)
     depth = np.array([0.010])

@@ -131,10 +131,16 @@ _FLOATS: Final = {"depth": "depth", "setpoint": "depth_setpoint", "force": "norm
 _FLAGS: Final = ("in_contact", "steady", "force_limited")
 
 
+def read_figures(folder: Path) -> dict[str, Any]:
+    """report.json of the run in `folder`, as it stands. Raises OSError or ValueError."""
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    return report
+
+
 def completed(folder: Path) -> dict[str, Any] | None:
     """report.json of a completed run with its evidence; None where there is none."""
     with suppress(OSError, ValueError):
-        report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        report = read_figures(folder)
         return report if report["failure"] is None and (folder / FILE).is_file() else None
     return None
 

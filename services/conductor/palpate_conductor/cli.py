@@ -86,9 +86,8 @@ RUN_EXAMPLES = """
 
 
 def _usable(name: str, settings: Sequence[str], seed: int | None) -> Scenario:
-    """A scenario whose services are installed and whose phantom can be made. Raises ScenarioError or MeshError."""
+    """A scenario whose phantom can be made. Raises ScenarioError or MeshError."""
     scenario = load_scenario(name, settings, seed)
-    chosen_services(scenario)
     if scenario.tissue.implementation != NONE:
         build_phantom(scenario.phantom, scenario.seed)
     return scenario
@@ -135,6 +134,7 @@ def run(
     quiet = quiet or as_json
     try:
         chosen = _usable(scenario, settings or (), seed)
+        chosen_services(chosen)
         own = own_services(services or ())
         absent = Absent(tuple(without or ()), wait, partial(console.print, highlight=False, soft_wrap=True))
     except (ScenarioError, MeshError, OwnServiceError, JoinError) as error:
@@ -202,8 +202,8 @@ def prepare(
     """Write scenario.yaml (for tissue and scoring) and exam.yaml (for everybody else): the first step of a run in containers."""
     console = Console(stderr=True)
     try:
-        chosen = load_scenario(scenario, settings or (), seed)
-    except ScenarioError as error:
+        chosen = _usable(scenario, settings or (), seed)
+    except (ScenarioError, MeshError) as error:
         _fail(console, EXIT_BAD_INPUT, str(error))
     write_scenario_files(chosen, out)
 

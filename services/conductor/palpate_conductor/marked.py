@@ -22,17 +22,20 @@ def doc_option(name: str) -> Any:
 
 
 def write_part(path: Path, name: str, text: str) -> None:
-    """Replaces the part `name` of a document. Raises typer.BadParameter where it has none, and OSError."""
+    """Replaces the part `name` of a document. Raises typer.BadParameter where it has none or cannot be written."""
     before, after = _around(path, name)
-    write_text(path, f"{before}{text}{after}")
+    try:
+        write_text(path, f"{before}{text}{after}")
+    except OSError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 def _around(path: Path, name: str) -> tuple[str, str]:
     begin, end = (f"<!-- palpate {name}: {word} -->\n" for word in ("begin", "end"))
     try:
         before, first, rest = path.read_text(encoding="utf-8").partition(begin)
-    except OSError as error:
-        raise typer.BadParameter(str(error)) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise typer.BadParameter(f"{path}: {error}") from None
     _, last, after = rest.partition(end)
     if not (first and last):
         raise typer.BadParameter(f"{path} has no part to replace: it wants the lines {begin.strip()} and {end.strip()}")

@@ -106,7 +106,9 @@ def how(code: int, log: Path) -> str:
     """How a process ended, in words: its signal, or its exit status `code` and the last line of its log."""
     if code < 0:
         return f"killed by signal {-code}"
-    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines: list[str] = []
+    with suppress(OSError):
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     said = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
     return f"left with status {code}: {said}"
 
@@ -155,6 +157,7 @@ class LocalProcesses:
         )
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, Child] = {}
+        self._ends: dict[str, str] = {}
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """What a service is given beyond the environment of this process."""
@@ -169,6 +172,7 @@ class LocalProcesses:
 
     def start(self, process: ServiceProcess) -> None:
         """Starts a service."""
+        self._ends.pop(process.role, None)
         environment = {**os.environ, **self.environment(process)}
         path = self._out / "logs" / f"{process.role}.log"
         if self._forks is not None:
@@ -187,8 +191,10 @@ class LocalProcesses:
 
     def ended(self) -> dict[str, str]:
         """How each process that has ended did so, by role: by a signal, or with a status and the last line of its log."""
-        gone = {role: code for role, child in self.running.items() if (code := child.poll()) is not None}
-        return {role: how(code, self._out / "logs" / f"{role}.log") for role, code in gone.items()}
+        for role, child in self.running.items():
+            if role not in self._ends and (code := child.poll()) is not None:
+                self._ends[role] = how(code, self._out / "logs" / f"{role}.log")
+        return dict(self._ends)
 
     def stop(self, patience_s: float = 5.0) -> None:
         """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets."""

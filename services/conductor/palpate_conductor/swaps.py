@@ -6,7 +6,6 @@ settings that it gives to `prepare` are those of `palpate run --set`.
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from palpate_conductor.archive import completed
+from palpate_conductor.archive import completed, read_figures
 from palpate_conductor.processes import ProcessListError
 
 REFERENCE = "reference"
@@ -76,13 +75,7 @@ def examine(scenario: str, settings: Sequence[str], folder: Path, record: bool) 
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{folder.name}: status {done.returncode}\n{done.stderr}")
-    return read_report(folder)
-
-
-def read_report(folder: Path) -> dict[str, Any]:
-    """report.json of a run's folder."""
-    report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    return report
+    return read_figures(folder)
 
 
 def measure(

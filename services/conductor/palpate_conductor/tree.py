@@ -11,7 +11,7 @@ from palpate_bus.stamps import header
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.lbr_kinematics import link_transforms
-from palpate_models.rotations import quaternion, rotation
+from palpate_models.rotations import quaternion, quaternion_of
 from palpate_models.scenario import ExamInput
 
 _AXES = np.array(lbr.JOINT_AXIS)
@@ -32,7 +32,7 @@ class FrameTree:
         turns = np.array(q, np.float64)[:, None] * _AXES
         transforms = self._transforms.copy()
         for i, turn in enumerate(turns.tolist(), _FIRST_JOINT):
-            transforms[i] = Transform(transforms[i].translation, Quaternion(*quaternion(rotation(turn))))
+            transforms[i] = Transform(transforms[i].translation, Quaternion(*quaternion_of(turn)))
         return TFMessage(
             [
                 TransformStamped(header(t, parent), child, transform)

@@ -14,8 +14,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from palpate_conductor.archive import read_figures
 from palpate_conductor.marked import doc_option, write_part
-from palpate_conductor.swaps import read_report
 
 FAST = ("robot", "tissue", "control")
 LEGS = (("state to controller", "control", "joint_states"), ("command to robot", "robot", "control/joint_torque"))
@@ -31,7 +31,7 @@ def _run(scenario: str, settings: list[str], folder: Path, rate: int, *options: 
     done = subprocess.run([*command, *options, *words], capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         raise RuntimeError(f"{rate} Hz {' '.join(options)}: status {done.returncode}\n{done.stderr}")
-    report = read_report(folder)
+    report = read_figures(folder)
     planning = report["services"]["planning"]["facts"]
     if planning["phase"] != "DONE":
         raise RuntimeError(f"{rate} Hz {' '.join(options)}: {planning['message']} (load {os.getloadavg()[0]:.1f})")

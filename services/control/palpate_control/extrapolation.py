@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from palpate_models.compiled import compiled
 
-from palpate_control.layout import F_W, P_WD, QD, QDD, R_WD, SETPOINT, V_WD, Q
+from palpate_control.layout import F_W, P_WD, QD, QDD, R_WD, V_WD, Q
 from palpate_control.rotations import exp3
 
 Array = NDArray[np.float64]
@@ -19,17 +19,17 @@ _DOF = 7
 
 @compiled
 def carry(setpoint: Array, acceleration: Array, age: float, standing: bool, reference: Array) -> None:
-    """The set-point (57,) carried on by `age` [s] into `reference` (64,): pose (+) twist * age, and the joints likewise.
+    """The set-point (64,) carried on by `age` [s] into `reference` (64,): pose (+) twist * age, and the joints likewise.
 
     `acceleration` (7,) is the joints' [rad/s^2]. A standing reference has no velocity.
     """
-    for i in range(SETPOINT):
+    for i in range(reference.size):
         reference[i] = setpoint[i]
     turn = np.empty(3)
     for i in range(3):
         turn[i] = setpoint[V_WD + 3 + i] * age
         reference[P_WD + i] = setpoint[P_WD + i] + setpoint[V_WD + i] * age
-    _turned(turn, setpoint[R_WD:SETPOINT], reference[R_WD:SETPOINT])
+    _turned(turn, setpoint[R_WD:QDD], reference[R_WD:QDD])
     for i in range(_DOF):
         qd, qdd = setpoint[QD + i], acceleration[i]
         reference[Q + i] = setpoint[Q + i] + (qd + qdd * (0.5 * age)) * age
@@ -49,7 +49,7 @@ def bridge(fade: float, gap: Array, reference: Array) -> None:
         gap[i] *= fade
     for i in range(3):
         reference[P_WD + i] += gap[i]
-    _turned(gap[3:6], reference[R_WD:SETPOINT].copy(), reference[R_WD:SETPOINT])
+    _turned(gap[3:6], reference[R_WD:QDD].copy(), reference[R_WD:QDD])
     for i in range(6):
         reference[V_WD + i] += gap[6 + i]
         reference[F_W + i] += gap[12 + i]
@@ -81,7 +81,7 @@ def change_over(before: Array, after: Array, turn: Array, gap: Array) -> None:
 
 @compiled
 def joint_acceleration(before: Array, after: Array, spacing: float, bound: float, acceleration: Array) -> None:
-    """`acceleration` (7,) [rad/s^2], within `bound`, that the velocities of two set-points (57,) `spacing` [s] apart tell."""
+    """`acceleration` (7,) [rad/s^2], within `bound`, that the velocities of two set-points (64,) `spacing` [s] apart tell."""
     for i in range(_DOF):
         acceleration[i] = min(max((after[QD + i] - before[QD + i]) / spacing, -bound), bound)
 

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from palpate_control import kernel
 from palpate_control.kernel import JOINT_DAMPING_RATIO, LEAST_DAMPING
+from palpate_control.layout import QDD
 from palpate_control.model import DOF, SLOW_S, ArmModel
 from palpate_control.reference import Mode, Reference, Setpoint
 from palpate_control.safety import SafetyNet
@@ -90,12 +91,12 @@ class ImpedanceController:
         model, q, qd = self.model, self._q, self._qd
         model.update_gravity(q)
         if self._outdated(reference.setpoint):
-            self._design_joint(q, reference.joint_stiffness)
+            self._design_joint(q, reference["joint_stiffness"])
         kernel.joint_errors(q, qd, reference.values, self._position_error, self._velocity_error)
         kernel.joint_torque(
             self._joint_stiffness.dot(self._position_error),
             self._joint_damping.dot(self._velocity_error),
-            model.inverse_dynamics(q, qd, reference.qdd),
+            model.inverse_dynamics(q, qd, reference.values[QDD:]),
             model.gravity,
             reference.values,
             self._joints,

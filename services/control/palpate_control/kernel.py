@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from palpate_models.compiled import compiled
 
-from palpate_control.layout import DAMPING_RATIO, F_W, JOINT_STIFFNESS, P_WD, QD, R_WD, SETPOINT, STIFFNESS, V_WD, Q
+from palpate_control.layout import DAMPING_RATIO, F_W, JOINT_STIFFNESS, P_WD, QD, QDD, R_WD, STIFFNESS, V_WD, Q
 from palpate_control.rotations import jlog3_times, log3
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ def _regular_inverse(A: Array, out: Array) -> None:
 @compiled
 def task_space(reference: Array, J_W: Array, W: Array, J: Array, JW: Array, inertia: Array) -> None:
     """The task in axes of D: J (6, 7), J W (6, 7) and (J W J')^-1 (6, 6), regularised where the arm is singular."""
-    R = reference[R_WD:SETPOINT]
+    R = reference[R_WD:QDD]
     for part in range(0, 6, 3):
         for i in range(3):
             for j in range(_DOF):
@@ -183,7 +183,7 @@ def cartesian_torque(
     torque: Array,
 ) -> None:
     """`torque` (7,) [N m] by the Cartesian law, before limits; J, JW, slow_inertia in D's axes."""
-    R, p = reference[R_WD:SETPOINT], reference[P_WD:V_WD]
+    R, p = reference[R_WD:QDD], reference[P_WD:V_WD]
     stiffness, damping, posture_damping = gains[:6], gains[6:12], gains[12:]
     R_DI = np.empty((3, 3))
     for i in range(3):

@@ -1,4 +1,4 @@
-"""Where the numbers of a set-point stand in one flat array.
+"""Where the numbers of a set-point, and of the reference that follows from it, stand in one flat array.
 
 Compiled code takes one such array instead of ten small ones: each costs it time at every call.
 """
@@ -7,27 +7,41 @@ from __future__ import annotations
 
 from typing import Final
 
-STIFFNESS: Final = 0
-"""In axes of D: translation [N/m], rotation [N m/rad], 6."""
-DAMPING_RATIO: Final = 6
-"""[1], 6."""
-JOINT_STIFFNESS: Final = 12
-"""[N m/rad], 7."""
-P_WD: Final = 19
-"""[m], 3."""
-V_WD: Final = 22
-"""Linear [m/s] then angular [rad/s], 6."""
-F_W: Final = 28
-"""Force [N] then torque [N m], 6."""
-Q: Final = 34
-"""[rad], 7."""
-QD: Final = 41
-"""[rad/s], 7."""
-R_WD: Final = 48
-"""Row by row, 9."""
-SETPOINT: Final = 57
-"""Numbers of a set-point."""
-QDD: Final = 57
-"""[rad/s^2], 7: a reference has them besides."""
-REFERENCE: Final = 64
-"""Numbers of a reference."""
+import numpy as np
+
+NUMBERS: Final = np.dtype(
+    [
+        ("stiffness", np.float64, 6),  # in axes of D: translation [N/m], rotation [N m/rad]
+        ("damping_ratio", np.float64, 6),  # [1]
+        ("joint_stiffness", np.float64, 7),  # [N m/rad]
+        ("p_WD", np.float64, 3),  # [m]
+        ("V_WD", np.float64, 6),  # linear [m/s] then angular [rad/s]
+        ("F_W", np.float64, 6),  # force [N] then torque [N m]
+        ("q", np.float64, 7),  # [rad]
+        ("qd", np.float64, 7),  # [rad/s]
+        ("R_WD", np.float64, (3, 3)),
+        ("qdd", np.float64, 7),  # [rad/s^2]: zero in a set-point, and in mode CARTESIAN
+    ]
+)
+"""What set-points and references consist of."""
+
+
+def _start(name: str) -> int:
+    """Where a part begins."""
+    fields = NUMBERS.fields
+    assert fields is not None
+    return int(fields[name][1]) // np.dtype(np.float64).itemsize
+
+
+STIFFNESS: Final = _start("stiffness")
+DAMPING_RATIO: Final = _start("damping_ratio")
+JOINT_STIFFNESS: Final = _start("joint_stiffness")
+P_WD: Final = _start("p_WD")
+V_WD: Final = _start("V_WD")
+F_W: Final = _start("F_W")
+Q: Final = _start("q")
+QD: Final = _start("qd")
+R_WD: Final = _start("R_WD")
+QDD: Final = _start("qdd")
+COUNT: Final = NUMBERS.itemsize // np.dtype(np.float64).itemsize
+"""How many numbers that are."""

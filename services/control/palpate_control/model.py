@@ -17,7 +17,7 @@ _AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 class ArmModel:
     """Kinematics and dynamics of the arm, evaluated by `update(q, qd)` into its attributes.
 
-    Attributes after `update` (valid until the next, most of them views of pinocchio's own memory):
+    Attributes after `update` (valid until the next and as long as this object; most are views of pinocchio's own memory):
         R_WI: rotation of the indenter frame I in world, shape (3, 3), in Fortran order.
         p_WI: origin of I in world [m], shape (3,).
         J_W: Jacobian of V_WI_W (linear first, then angular, world axes, at I's origin), shape (6, 7).

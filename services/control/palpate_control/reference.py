@@ -57,26 +57,17 @@ class Setpoint:
     joint_stiffness: Array
     """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
     values: Array = field(init=False, repr=False, compare=False)
-    """All of them as in `layout`, shape (57,)."""
+    """All of them as in `layout`, shape (64,)."""
 
     def __post_init__(self) -> None:
-        everything = np.concatenate(
-            (
-                self.stiffness,
-                self.damping_ratio,
-                self.joint_stiffness,
-                self.p_WD,
-                self.V_WD,
-                self.F_W,
-                self.q,
-                self.qd,
-                self.R_WD.ravel(),
-            )
-        )
-        if not ((everything >= _LOW) & (everything <= _HIGH)).all():  # so it is, too, where one is NaN
+        numbers = np.zeros(1, layout.NUMBERS)
+        for name in _NAMES:
+            numbers[name] = getattr(self, name)
+        values = numbers.view(np.float64)
+        if not ((values >= _LOW) & (values <= _HIGH)).all():  # so it is, too, where one is NaN
             raise ValueError(self._wrong())
-        object.__setattr__(self, "values", everything)
-        a, b, c, d, e, f, g, h, i = everything[layout.R_WD :].tolist()
+        object.__setattr__(self, "values", values)
+        a, b, c, d, e, f, g, h, i = values[layout.R_WD : layout.QDD].tolist()
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if abs(determinant - 1) > 1e-6:
             raise ValueError(f"set-point: R_WD has determinant {determinant}: must be a rotation")
@@ -107,9 +98,20 @@ RANGES: Final = (
 )
 """What a set-point may ask for: attribute, part of it, the message's field, least and largest value; as in the contract, where it
 says."""
-_SIZES: Final = (6, 6, 7, 3, 3, 3, 3, 3, 7, 7)
-_LOW: Final = np.repeat([row[3] for row in RANGES] + [-2.0], (*_SIZES, 9))
-_HIGH: Final = np.repeat([row[4] for row in RANGES] + [2.0], (*_SIZES, 9))
+_NAMES: Final = tuple(name for name in layout.NUMBERS.names or () if name != "qdd")
+
+
+def _bounds(column: int, of_rotation: float) -> Array:
+    """Least or greatest values (`column` of `RANGES`) of all numbers, shape (64,)."""
+    numbers = np.zeros(1, layout.NUMBERS)
+    numbers["R_WD"] = of_rotation
+    for row in RANGES:
+        numbers[row[0]][:, row[1]] = row[column]
+    return numbers.view(np.float64)
+
+
+_LOW: Final = _bounds(3, -2.0)
+_HIGH: Final = _bounds(4, 2.0)
 
 
 def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
@@ -123,62 +125,17 @@ def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
 
 @dataclass(slots=True)
 class Reference:
-    """What the law follows at one tick; the properties are views of `values`, and as in `Setpoint`."""
+    """What the law follows at one tick."""
 
     setpoint: Setpoint
     """The set-point that it comes from."""
     values: Array
     """That set-point's numbers carried on to the tick, and the joints' acceleration, as in `layout`, shape (64,)."""
 
-    @property
-    def mode(self) -> Mode:
-        """The set-point's."""
-        return self.setpoint.mode
-
-    @property
-    def R_WD(self) -> Array:
-        """Shape (3, 3)."""
-        return self.values[layout.R_WD : layout.SETPOINT].reshape(3, 3)
-
-    @property
-    def p_WD(self) -> Array:
-        """[m], shape (3,)."""
-        return self.values[layout.P_WD : layout.V_WD]
-
-    @property
-    def V_WD(self) -> Array:
-        """Linear [m/s] then angular [rad/s], shape (6,)."""
-        return self.values[layout.V_WD : layout.F_W]
-
-    @property
-    def F_W(self) -> Array:
-        """Force [N] then torque [N m], shape (6,)."""
-        return self.values[layout.F_W : layout.Q]
-
-    @property
-    def stiffness(self) -> Array:
-        """Translation [N/m], rotation [N m/rad], shape (6,)."""
-        return self.values[layout.STIFFNESS : layout.DAMPING_RATIO]
-
-    @property
-    def joint_stiffness(self) -> Array:
-        """[N m/rad], shape (7,)."""
-        return self.values[layout.JOINT_STIFFNESS : layout.P_WD]
-
-    @property
-    def q(self) -> Array:
-        """Joint position [rad], shape (7,)."""
-        return self.values[layout.Q : layout.QD]
-
-    @property
-    def qd(self) -> Array:
-        """Joint velocity [rad/s], shape (7,)."""
-        return self.values[layout.QD : layout.R_WD]
-
-    @property
-    def qdd(self) -> Array:
-        """Joint acceleration [rad/s^2], shape (7,); zero in mode CARTESIAN."""
-        return self.values[layout.QDD :]
+    def __getitem__(self, name: str) -> Array:
+        """The part of `values` that `layout.NUMBERS` has under this name, as a view of its shape."""
+        part: Array = self.values.view(layout.NUMBERS)[name][0]
+        return part
 
 
 class Extrapolator:
@@ -223,13 +180,13 @@ class Extrapolator:
         self._current = setpoint
         after = self._raw(setpoint, t)
         self._standing = False
-        change_over(before.values, after.values, pin.log3(before.R_WD @ after.R_WD.T), self._gap)
+        change_over(before.values, after.values, pin.log3(before["R_WD"] @ after["R_WD"].T), self._gap)
         if setpoint.mode is Mode.JOINT:
             self._gap[:18] = 0.0  # a joint reference has no pose of its own
 
     def _raw(self, setpoint: Setpoint, t: int) -> Reference:
         """The set-point extrapolated to `t` alone."""
-        values = np.empty(layout.REFERENCE)
+        values = np.empty(layout.COUNT)
         age = t - setpoint.stamp
         carry(setpoint.values, self._acceleration, _bounded(age) * 1e-9, age > MAX_EXTRAPOLATION_NS, values)
         return Reference(setpoint, values)
@@ -249,7 +206,7 @@ class Extrapolator:
         elapsed = t - self._time
         fade = exp(-elapsed * 1e-9 / SMOOTHING_S) if self._time and elapsed > 0 else 1.0
         self._time = t
-        values = np.empty(layout.REFERENCE)
+        values = np.empty(layout.COUNT)
         follow(setpoint.values, self._acceleration, _bounded(age) * 1e-9, standing, fade, self._gap, values)
         return Reference(setpoint, values)
 

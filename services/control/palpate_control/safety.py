@@ -28,7 +28,7 @@ class SafetyNet:
         One torque comes every `period_s`.
         """
         cap = REPULSION_FRACTION * torque_limit
-        gain = cap / max(zone, 1e-9) ** 2 if zone > 0 else np.zeros_like(lower)
+        gain = cap / zone**2 if zone > 0 else np.zeros_like(lower)
         self._zone = np.stack(((lower + upper) / 2, (upper - lower) / 2 - zone, gain, cap))
         self._limit = torque_limit
         self._rate = TORQUE_RATE_NM * period_s / 1e-3

@@ -88,4 +88,4 @@ def setpoint(arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: Mode = Mode.CA
 
 def reference(setpoint_: Setpoint) -> Reference:
     """A set-point as the law follows it, without extrapolation."""
-    return Reference(setpoint_, np.concatenate((setpoint_.values, np.zeros(7))))
+    return Reference(setpoint_, setpoint_.values.copy())

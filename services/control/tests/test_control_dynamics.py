@@ -60,11 +60,11 @@ def test_stiffness_is_what_was_asked_for(axis: int) -> None:
     R_now, p_now, _ = plant.tip()
     if axis < 3:
         moved = R.T @ (p_now - p)
-        assert moved[axis] == pytest.approx(size / ref.stiffness[axis], rel=0.02)
+        assert moved[axis] == pytest.approx(size / ref["stiffness"][axis], rel=0.02)
         assert np.abs(np.delete(moved, axis)).max() < 0.02 * moved[axis]
     else:
         turned = pin.log3(R.T @ R_now)
-        assert turned[axis - 3] == pytest.approx(size / ref.stiffness[axis], rel=0.02)
+        assert turned[axis - 3] == pytest.approx(size / ref["stiffness"][axis], rel=0.02)
 
 
 @pytest.mark.parametrize("q", WORKING)
@@ -97,7 +97,7 @@ def test_stable_where_friction_is_not_what_it_is_thought_to_be(q: np.ndarray, as
     plant = Plant(q, real)
     simulate(plant, robot, lambda _: moved, 1500)
     assert plant.energy() < 1e-4
-    assert np.linalg.norm(plant.tip()[1] - moved.p_WD) < 3e-3  # of 12: twice the friction also takes twice the time
+    assert np.linalg.norm(plant.tip()[1] - moved["p_WD"]) < 3e-3  # of 12: twice the friction also takes twice the time
 
 
 @pytest.mark.parametrize("q", WORKING)

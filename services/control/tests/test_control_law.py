@@ -68,8 +68,8 @@ def test_springs_are_the_gradient_of_their_energy(arm: ArmModel, unlimited: Impe
 
     def energy(at: np.ndarray) -> float:
         arm.update(at, REST)
-        error = np.concatenate(((ref.p_WD - arm.p_WI) @ ref.R_WD, pin.log3(ref.R_WD.T @ arm.R_WI)))
-        return 0.5 * float(ref.stiffness @ error**2)
+        error = np.concatenate(((ref["p_WD"] - arm.p_WI) @ ref["R_WD"], pin.log3(ref["R_WD"].T @ arm.R_WI)))
+        return 0.5 * float(ref["stiffness"] @ error**2)
 
     slope = [(energy(q + dq) - energy(q - dq)) / 2e-6 for dq in 1e-6 * np.eye(7)]
     np.testing.assert_allclose(unlimited.torque(q, REST, ref), -np.array(slope), rtol=1e-5, atol=1e-4)
@@ -79,7 +79,7 @@ def test_springs_are_the_gradient_of_their_energy(arm: ArmModel, unlimited: Impe
 def test_no_energy_is_gained_around_a_loop(arm: ArmModel, unlimited: ImpedanceController, size: float) -> None:
     """Work of the springs around closed joint paths, through the clipped range too (the larger size)."""
     ref = offset(arm, WORKING[0], np.array([0.02, 0.01, -0.02, 0.1, 0.05, -0.1]))
-    ref.stiffness[:] *= 0.2  # no torque saturates
+    ref["stiffness"][:] *= 0.2  # no torque saturates
     rng = np.random.default_rng(7)
     angle = np.linspace(0, 2 * np.pi, 401)
     across, along = rng.normal(size=(2, 7)) * size
@@ -108,8 +108,8 @@ def test_position_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController
     q = WORKING[1]
     far, farther = (offset(arm, q, np.array([0.0, 0.0, z, 0, 0, 0])) for z in (0.2, 0.4))
     for ref in (far, farther):  # axis-aligned with W, so that the clip of z is the clip of D's z
-        ref.R_WD[:] = np.diag([1.0, -1.0, -1.0])
-        ref.stiffness[:] = np.array([2000.0, 2000.0, 500.0, 0, 0, 0])
+        ref["R_WD"][:] = np.diag([1.0, -1.0, -1.0])
+        ref["stiffness"][:] = np.array([2000.0, 2000.0, 500.0, 0, 0, 0])
     once, twice = unlimited.torque(q, REST, far), unlimited.torque(q, REST, farther)
     np.testing.assert_allclose(once, twice, atol=1e-9)
     np.testing.assert_allclose(once, arm.J_W[2] * 500 * kernel.POSITION_CLIP_M, atol=1e-9)
@@ -176,7 +176,7 @@ def test_joint_limits_repel(arm: ArmModel, unlimited: ImpedanceController, joint
 
 def test_repulsion_can_be_switched_off(arm: ArmModel) -> None:
     off = safety.SafetyNet(arm.position_lower, arm.position_upper, arm.torque_limit, 0.0)
-    assert not off.torque(np.zeros(7), POSITION_LIMIT - 1e-3, np.zeros(7)).any()
+    assert not off.torque(np.zeros(7), POSITION_LIMIT + 1e-3, np.zeros(7)).any()
 
 
 def test_stretched_out_arm_gives_finite_torque(arm: ArmModel) -> None:

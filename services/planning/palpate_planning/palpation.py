@@ -364,7 +364,7 @@ class Palpation:
         rate, regulation = self._s.velocity, self._regulation
         arm = self._radius + self.offset - regulation.depth
         linear = (place.dp + place.dn * arm) * rate - place.n * regulation.rate
-        p_W = place.p + place.n * arm
+        p_W = place.p + place.n * arm  # as `centre` has it
         if self._aside is not None:
             p_W, linear = p_W + self._aside.offset, linear + self._aside.velocity
         setpoint = Setpoint(

@@ -92,10 +92,11 @@ class SurfacePath:
 
 
 def compile_ahead() -> None:
-    """Compiles what a path needs where it is first looked at, which takes seconds: for whoever has a deadline then."""
+    """Compiles what paths and surfaces need where they are first looked at; that takes seconds, and then there is a deadline."""
     ends, s, normals = np.arange(2), np.array((0.0, 1.0)), np.tile((0.0, 0.0, 1.0), (2, 1))
     path = SurfacePath(s, np.eye(2, 3), normals, np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 7)), ends, ends)
     path.at(0.5)
+    Surface.plane(np.eye(4)).nearest(np.zeros(3))
 
 
 @compiled

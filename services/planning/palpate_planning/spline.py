@@ -57,7 +57,7 @@ def value_at(axes: Array, coefficients: Array, x: float, y: float) -> Array:
 
 @compiled
 def _place(axis: Array, x: float) -> float:
-    """Where x is along an axis, in steps from its origin, on the grid. What is no number is at the origin: it makes an index."""
+    """Where x is along an axis, in steps from its origin, on the grid; at its origin where x is NaN: it makes an index."""
     u = (x - axis[0]) / axis[1]
     return min(u, axis[2]) if u > 0.0 else 0.0
 

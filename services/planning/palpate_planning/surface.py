@@ -6,7 +6,7 @@ are smooth enough to regulate depth against: a mesh's facets would show as rippl
 
 from __future__ import annotations
 
-from math import isfinite, sqrt
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +36,19 @@ class Surface:
         self._field = field
         self.offset = 0.0
         """Shift of the whole surface along its outward normals [m], from the onset of force."""
-        self.nearest(self._p_WA)  # compiles it
 
     @staticmethod
     def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> Surface:
         """Fits the field to a mesh: vertices [m] shape (n, 3), outward unit normals of the same shape or None.
 
         Slopes come from the normals where they are given (perception smooths them), else from the heights. Outside the
-        mesh the nearest vertex's height and slope hold. Raises ValueError for fewer than four vertices or no extent.
+        mesh the nearest vertex's height and slope hold. Raises ValueError for fewer than four vertices, no extent, or what is not
+        finite.
         """
         if len(vertices_W) < 4:
             raise ValueError(f"perceived surface has {len(vertices_W)} vertices, at least 4 are needed")
+        if not (np.isfinite(vertices_W).all() and (normals_W is None or np.isfinite(normals_W).all())):
+            raise ValueError("perceived surface has vertices or normals that are not finite")
         p_A = apply(inverse(X_WA), np.asarray(vertices_W, dtype=float))
         xy = p_A[:, :2]
         low, high = xy.min(axis=0), xy.max(axis=0)
@@ -95,8 +97,6 @@ class Surface:
         distance = _nearest(
             self._R_WA, self._p_WA, self._R_AW, self._p_AW, field.axes, field.coefficients, self.offset, c_W, iterations, p_W, n_W
         )
-        if not isfinite(distance):
-            raise ValueError(f"perceived surface: distance {distance} of {c_W.tolist()} in world")
         return p_W, n_W, distance
 
 

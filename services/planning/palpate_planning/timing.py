@@ -10,7 +10,6 @@ import numpy as np
 import ruckig
 from numpy.typing import NDArray
 from palpate_models import lbr
-from palpate_models.polyline import Polyline
 from palpate_models.scenario import Limits
 
 from palpate_planning.kinematics import Kinematics
@@ -84,11 +83,11 @@ class SpeedLimit:
         reachable = np.array(speed, dtype=float)
         for k in range(len(s) - 2, -1, -1):
             reachable[k] = min(reachable[k], np.sqrt(reachable[k + 1] ** 2 + 2 * acceleration * (s[k + 1] - s[k])))
-        self._line = Polyline(s, reachable)
+        self._s, self._speed = s, reachable
 
     def at(self, s: float) -> float:
         """Speed allowed at s."""
-        return self._line.at(s)
+        return float(np.interp(s, self._s, self._speed))
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,7 +82,7 @@ class World:
         self.exam = Exam(settings)
         self.kinematics = Kinematics(settings.robot, settings.limits)
         self.weight = ToolWeight.of(settings.robot)
-        self.bias = np.array([0.7, -0.4, 1.1, 0.02, -0.03, 0.01])
+        self.bias = np.array([0.7, -0.4, 1.1])
         self.q = np.array(lbr.HOME)
         self.dome = seen_dome(settings)
         self.truth = seen_dome(settings).surface
@@ -128,7 +128,7 @@ class World:
         qd = (self.q - self._q_before) / PERIOD_S
         velocity = (self.kinematics.jacobian(self.q) @ qd)[:3]
         inertia = R_WS.T @ (self.weight.mass * (velocity - self._velocity) / PERIOD_S)
-        wrench = np.concatenate((contact - inertia, np.cross(arm, contact))) + self.weight.wrench(R_WS) + self.bias
+        wrench = np.concatenate((contact - inertia + self.weight.force(R_WS) + self.bias, np.cross(arm, contact)))
         self._q_before, self._velocity = self.q, velocity
         answer = None
         if self._answer_at is not None and self.t >= self._answer_at:

@@ -70,6 +70,7 @@ def test_a_mesh_without_extent_is_refused() -> None:
 
 
 def test_a_surface_of_no_numbers_is_refused() -> None:
-    normals = np.full_like(VERTICES, np.nan)
-    with pytest.raises(ValueError, match="perceived surface"):
-        Surface.from_mesh(apply(X_WA, VERTICES), normals, X_WA)
+    nowhere = np.full_like(VERTICES, np.nan)
+    for vertices, normals in ((VERTICES, nowhere), (nowhere, None)):
+        with pytest.raises(ValueError, match="not finite"):
+            Surface.from_mesh(vertices, normals, X_WA)

@@ -75,7 +75,7 @@ class RobotService(Service):
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
         self._pressed = False
-        self._applied: Array = np.zeros(7)  # another array at every step: messages keep it
+        self._applied: Array = np.zeros(7)  # never written to: messages keep it
         self._recent: tuple[list[Array], list[Array], list[Array]] = ([], [], [])
         """Positions, velocities and F/T readings since the last status."""
         self._external_force = 0.0

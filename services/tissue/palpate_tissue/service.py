@@ -35,9 +35,9 @@ _Wrench: Any = message_type("geometry_msgs/msg/Wrench")
 _WrenchStamped: Any = message_type("geometry_msgs/msg/WrenchStamped")
 
 _OUT_OF_REACH_M = -3.0
+"""Depth before the first tool state: the lower end of the contract's range."""
 _NOTHING = np.zeros(3)
 _NOTHING.flags.writeable = False
-"""Depth before the first tool state: the lower end of the contract's range."""
 
 _log = logging.getLogger("palpate.tissue")
 

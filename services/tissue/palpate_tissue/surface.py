@@ -8,9 +8,9 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 from palpate_models.compiled import compiled
+from palpate_models.nearest import nearest_vertex
 from palpate_models.phantom import PhantomModel
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,6 @@ class Surface:
 
     def __init__(self, model: PhantomModel) -> None:
         self._model = model
-        self._tree = cKDTree(model.vertices)
         corners = model.vertices[model.triangles]
         sides = corners[:, 1:] - corners[:, :1]
         self._triangles = np.ascontiguousarray(model.triangles, np.uint32)
@@ -50,10 +49,7 @@ class Surface:
     def nearest(self, p: Array, excursion: float = 0.0) -> RestPoint:
         """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m]."""
         model = self._model
-        distance, vertex, alone = nearest_vertex(p, model.vertices)
-        if not alone:
-            found = self._tree.query(p)  # of several, the one that it comes upon first
-            distance, vertex = float(found[0]), int(found[1])
+        distance, vertex = nearest_vertex(p, model.vertices)
         weights = self._weights
         if distance > _FAR_M:
             corners = np.array([vertex, vertex, vertex])
@@ -102,23 +98,6 @@ def _gradient(model: PhantomModel, flat: Array) -> sparse.csr_array:
     columns = np.broadcast_to(model.triangles[:, None, :, None], (m, 3, 3, 3))
     rows = np.broadcast_to(rows, (m, 3, 3, 3))
     return sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * n, n))
-
-
-@compiled
-def nearest_vertex(p: Array, vertices: Array) -> tuple[float, int, bool]:
-    """The vertex (n, 3) that is nearest to `p` (3,): its distance, which it is, and whether no other is as near.
-
-    Looking at all of some thousands takes a fifth of the time of a call of scipy's tree.
-    """
-    least, best, alone = np.inf, 0, False
-    x, y, z = p[0], p[1], p[2]
-    for i in range(vertices.shape[0]):
-        dx, dy, dz = vertices[i, 0] - x, vertices[i, 1] - y, vertices[i, 2] - z
-        square = dx * dx + dy * dy + dz * dz
-        if square <= least:
-            alone = square < least
-            least, best = square, i
-    return sqrt(least), best, alone
 
 
 @compiled

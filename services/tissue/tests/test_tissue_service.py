@@ -12,7 +12,7 @@ from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Breathing, Lesion, Phantom, Pose, Registration, Scenario
 from palpate_tissue import bench
 from palpate_tissue.service import create
-from palpate_tissue.surface import Surface, nearest_on_faces, nearest_vertex
+from palpate_tissue.surface import Surface, nearest_on_faces
 
 LESION = Lesion(centre_m=(-0.02, 0.0))
 
@@ -215,16 +215,3 @@ def test_bench_measures_a_step_in_contact():
     assert result["vertices"] > 2700
     assert result["contacts"] > 5
     assert result["step_us_p50"] > 0
-
-
-def test_the_nearest_vertex_is_the_tree_s():
-    model = build_phantom(Phantom(), 0)
-    tree = Surface(model)._tree
-    rng = np.random.default_rng(2)
-    for p in rng.uniform(-0.2, 0.2, size=(500, 3)):
-        distance, vertex, alone = nearest_vertex(p, model.vertices)
-        assert alone
-        assert (distance, vertex) == tree.query(p)
-    between = model.vertices[:2].mean(axis=0)
-    assert not nearest_vertex(between, np.stack((between - 0.5, between + 0.5, between + 1.0)))[2]
-    assert nearest_vertex(between, np.stack((between - 0.5, between + 0.5, between)))[1:] == (2, True)
