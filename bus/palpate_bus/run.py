@@ -25,7 +25,7 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.distributed import LockstepNode, RunAborted
 from palpate_bus.member import Member
 from palpate_bus.observer import ObserverNode
-from palpate_bus.priority import in_the_background
+from palpate_bus.priority import give_way, in_lockstep, in_the_background
 from palpate_bus.recording import RawRecorder, RecorderNode
 from palpate_bus.service import Service
 from palpate_bus.wallclock import WallClockNode
@@ -76,6 +76,8 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         rules = contract()
         domain = domain_from_env()
         service = create(load(_scenario()))
+        if runtime() == "lockstep":
+            give_way(in_lockstep(rules.roles[role].period))  # before zenoh starts its threads, which take it over
         session = open_session()
         member = Member(session, role, rules, domain)
         node = node_type(service, rules)(service, member)
