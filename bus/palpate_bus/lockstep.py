@@ -50,7 +50,7 @@ class InputBuffer:
     """
 
     __slots__ = (
-        "_advances", "_blocks", "_last_sequence", "_latched", "_unstamped",
+        "_advances", "_blocks", "_last_sequence", "_latched", "_periodic", "_unstamped",
         "advanced", "decode", "delay", "edge", "grid", "latest", "lost", "new", "pending", "period", "topic",
     )  # fmt: skip
 
@@ -65,7 +65,7 @@ class InputBuffer:
         self.latest: Received | None = None
         self.new: list[Received] = []
         self.lost = False
-        self._blocks, self._latched = edge.blocking, edge is Edge.LATCHED
+        self._blocks, self._latched, self._periodic = edge.blocking, edge is Edge.LATCHED, topic.periodic
         self.pending: deque[Received] = deque()
         self._unstamped: deque[Received] = deque()
         self._advances: deque[tuple[int, int]] = deque()
@@ -89,7 +89,7 @@ class InputBuffer:
                 f"{self.topic.name}: messages {self._last_sequence + 1}..{sequence - 1} of {self.topic.producer} are missing"
             )
         self._last_sequence = sequence
-        if self.topic.periodic:
+        if self._periodic:
             stamp = (sequence - 1) * self.period
             self.pending.append(Received(payload, stamp, sequence))
             self.advanced = stamp

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,15 +45,13 @@ class Spool:
         self._role = role
         self._topics = topics
         self._index = {name: index for index, name in enumerate(topics)}
-        self._entries: list[tuple[int, int, int, int]] = []
-        self._data: list[bytes] = []
+        self._sent: list[tuple[str, bytes, int, int]] = []
         self._bytes = 0
         self._next = CHUNK_PERIOD
 
     def add(self, topic: str, payload: bytes, stamp: int, sequence: int) -> None:
         """Takes a message that was sent."""
-        self._entries.append((self._index[topic], stamp, sequence, len(payload)))
-        self._data.append(payload)
+        self._sent.append((topic, payload, stamp, sequence))
         self._bytes += len(payload)
 
     def due(self, t: int) -> bool:
@@ -63,19 +61,18 @@ class Spool:
     def chunk(self, t: int) -> bytes:
         """What was sent since the last chunk, up to tick `t` [ns], in CDR."""
         self._next = t + CHUNK_PERIOD
-        columns: Any = np.array(self._entries, np.int64).reshape(-1, 4)
+        topics, payloads, stamps, sequences = zip(*self._sent, strict=True) if self._sent else ((), (), (), ())
         message = RecordChunk(
             self._role,
             t,
             list(self._topics),
-            columns[:, 0].astype(np.uint16),
-            np.ascontiguousarray(columns[:, 1]),
-            columns[:, 2].astype(np.uint32),
-            columns[:, 3].astype(np.uint32),
-            np.frombuffer(b"".join(self._data), np.uint8),
+            np.fromiter(map(self._index.__getitem__, topics), np.uint16),
+            np.array(stamps, np.int64),
+            np.array(sequences, np.uint32),
+            np.fromiter(map(len, payloads), np.uint32),
+            np.frombuffer(b"".join(payloads), np.uint8),
         )
-        self._entries.clear()
-        self._data.clear()
+        self._sent.clear()
         self._bytes = 0
         return _encode(message)
 

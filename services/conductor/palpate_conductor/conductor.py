@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 AFTER_LOSS = NS
 """Simulated time that survivors run after a loss, so that the safe reaction is simulated and recorded."""
-POLL_S = 0.01
+POLL_S = 0.02
 OBSERVERS_FINISH_S = 60.0
 
 

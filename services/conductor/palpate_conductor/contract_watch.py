@@ -23,7 +23,7 @@ FAST_MS = 10
 """Topics of a shorter period are listened to in turn."""
 LOOK_S = 1.5
 """As long as a rate needs to be judged, and the start of listening."""
-ROUND_S = 6.0
+ROUND_S = 12.0
 
 
 class ContractWatch:
