@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from pathlib import Path
 
 from palpate_bus.contract import MS
 
@@ -13,8 +12,8 @@ WORKER = 15
 BACKGROUND = 15
 """Niceness of observers, and in lockstep of services slower than the 1 kHz loop, which have a period's time to answer.
 
-Alternating short runs with recorder and viewer on two cores: 1.27, 1.31 and 1.30 times real time with services at 15 and
-observers at 10, 1.31, 1.24 and 1.39 with both at 15, 1.21, 1.14 and 1.23 with services at 0.
+Alternating short runs with recorder and viewer on two cores, times real time. Services at 0, observers at 10: 1.21, 1.14, 1.23;
+both at 15: 1.31, 1.24, 1.39. Later, services as batch work, too: 1.55, 1.55, 1.61, not so: 1.50, 1.54, 1.51.
 """
 _BY_PERIOD = ((100 * MS, 10), (10 * MS, 5))
 
@@ -26,24 +25,17 @@ def give_way(niceness: int) -> None:
         os.setpriority(os.PRIO_PROCESS, 0, here + niceness)
 
 
-def in_lockstep(period: int) -> int:
-    """Niceness of a service in lockstep: all that its period [ns] lets wait stay behind the loop that everything waits for."""
-    return BACKGROUND if period > MS else 0
-
-
 def by_period(period: int) -> int:
     """Niceness of a service on its own timer: who steps more seldom [ns] gives way (rate-monotonic)."""
     return next((niceness for least, niceness in _BY_PERIOD if period >= least), 0)
 
 
 def in_the_background() -> None:
-    """Puts all threads of this process behind others: for observers, once they have started.
+    """Puts the calling thread behind others, and the threads that it starts later: call it before zenoh starts its own.
 
     As batch work they take no core from who is running when they wake, which with the usual policy costs a tick milliseconds; and
     with a small weight they still go on where others load the machine. SCHED_IDLE would not: a viewer did not even start.
     """
     with suppress(OSError, AttributeError):  # Linux
-        for thread in (int(path.name) for path in Path("/proc/self/task").iterdir()):
-            with suppress(OSError):
-                os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
-                os.setpriority(os.PRIO_PROCESS, thread, BACKGROUND)
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    give_way(BACKGROUND)
