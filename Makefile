@@ -1,5 +1,4 @@
-# `make run` and `make test` do all the set-up they need: Python 3.11 with venv is enough. PYTHON says which, if not the quickest.
-PYTHON ?= $(shell tools/quickest-python)
+# `make run` and `make test` do all the set-up they need: Python 3.11 with venv is enough. PYTHON=... says which, if not the quickest.
 VENV := .venv
 BIN := $(VENV)/bin
 PACKAGES := bus models fmus/abdomen $(patsubst %/pyproject.toml,%,$(wildcard services/*/pyproject.toml)) dashboards
@@ -47,9 +46,9 @@ install: $(VENV)/.installed
 
 # All local packages in one command, so that none of their names is ever looked up in a public registry.
 $(VENV)/.installed: constraints.txt requirements-dev.txt $(addsuffix /pyproject.toml,$(PACKAGES))
-	test -x $(BIN)/python || { python=$(PYTHON) && echo "Python: $$python" \
-	&& $$python -c 'import sys; sys.exit(0 if sys.version_info[:2] == (3, 11) else "Palpate needs Python 3.11; set PYTHON=...")' \
-	&& $$python -m venv $(VENV); }
+	test -x $(BIN)/python || { python=$${PYTHON:-$$(tools/quickest-python)} && echo "Python: $$python" \
+	&& "$$python" -c 'import sys; sys.exit(0 if sys.version_info[:2] == (3, 11) else "Palpate needs Python 3.11; set PYTHON=...")' \
+	&& "$$python" -m venv $(VENV); }
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-dev.txt $(addprefix -e ./,$(PACKAGES))
 	touch $@
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import zenoh
 
-from palpate_bus.contract import MS, Contract, contract
+from palpate_bus.contract import MS, Contract, Role, contract
 from palpate_bus.distributed import LockstepNode, RunAborted
 from palpate_bus.member import Member
 from palpate_bus.observer import ObserverNode
@@ -52,6 +52,11 @@ def runtime() -> str:
     return name
 
 
+def stands_back(role: Role, runtime_name: str) -> bool:
+    """Whether a service gives way to others: an observer, and in lockstep who is not of the 1 kHz loop that all wait for."""
+    return role.observer or (runtime_name == "lockstep" and role.period > MS)
+
+
 def _scenario() -> str:
     """The scenario file. Raises BusConfigError when the environment names none."""
     try:
@@ -76,8 +81,7 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         rules = contract()
         domain = domain_from_env()
         service = create(load(_scenario()))
-        row = rules.roles[role]
-        if row.observer or (runtime() == "lockstep" and row.period > MS):  # none of the 1 kHz loop that all others wait for
+        if stands_back(rules.roles[role], runtime()):
             in_the_background()
         session = open_session()
         member = Member(session, role, rules, domain)

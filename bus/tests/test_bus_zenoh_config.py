@@ -1,5 +1,6 @@
 """How processes find each other: options, meshes, routers, and sessions that end in order."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -166,3 +167,28 @@ def test_closing_twice_is_harmless() -> None:
     opened = open_session(BusOptions())
     assert close_session(opened)
     assert close_session(opened)
+
+
+POOLS_PROGRAM = """
+import sys, time
+from pathlib import Path
+from palpate_bus.zenoh_config import mesh, session
+options = mesh(["a", "b"], Path(sys.argv[1]))
+with session(options["a"]) as a, session(options["b"]):
+    a.put("test/key", b"")
+    time.sleep(1)  # until they are linked, and each pool has started
+    threads = {name.read_text().partition("-")[0] for name in Path("/proc/self/task").glob("*/comm")}
+    print(*threads)
+"""
+
+
+@pytest.mark.parametrize(("own", "pools"), [(None, {"net", "tx"}), ("(acc: (worker_threads: 1))", {"net", "tx", "rx", "acc"})])
+def test_sockets_are_read_by_the_threads_that_watch_them(tmp_path: Path, own: str | None, pools: set[str]) -> None:
+    """Unless the environment has pools of its own."""
+    environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
+    if own is not None:
+        environment["ZENOH_RUNTIME"] = own
+    words = [sys.executable, "-c", POOLS_PROGRAM, str(tmp_path)]
+    threads = subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout.split()
+    if sys.platform == "linux":  # elsewhere threads do not tell their names
+        assert set(threads) & {"net", "tx", "rx", "acc"} == pools

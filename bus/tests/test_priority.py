@@ -6,6 +6,9 @@ import os
 import subprocess
 import sys
 
+from palpate_bus.contract import contract
+from palpate_bus.run import stands_back
+
 PROGRAM = """
 import os, sys, threading, time
 from palpate_bus.priority import BACKGROUND, in_the_background
@@ -21,3 +24,10 @@ for thread in (0, after.native_id) if sys.platform == "linux" else ():
 def test_a_service_goes_behind_others_with_the_threads_that_it_starts() -> None:
     here = os.getpriority(os.PRIO_PROCESS, 0)
     subprocess.run([sys.executable, "-c", PROGRAM], check=True, env={**os.environ, "HERE": str(here)})
+
+
+def test_all_but_the_loop_stand_back_in_lockstep_and_observers_always() -> None:
+    roles = contract().roles
+    assert {name for name, role in roles.items() if not stands_back(role, "lockstep")} == {"robot", "tissue", "control"}
+    observers = {name for name, role in roles.items() if role.observer}
+    assert {name for name, role in roles.items() if stands_back(role, "wallclock")} == observers

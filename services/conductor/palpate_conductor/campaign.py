@@ -2,7 +2,7 @@
 
 A case starts the local processes of the compose file, waits until the indenter slides at depth (or, for what is sent only before,
 until the camera looks), does the damage, and watches: who noticed it first, how long after, the highest true force since, how
-the run ended. Times are of the wall clock, read every 10 ms.
+the run ended. Times are of the wall clock, read every 20 ms.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class _Watch:
     signs: list[str] = field(default_factory=list)
 
     def tell(self, progress: Progress) -> None:
-        """Called every 10 ms of wall time."""
+        """Called every 20 ms of wall time (`palpate_conductor.conductor.POLL_S`)."""
         if self.finding.injected_s is None:
             self._strike(progress)
             return

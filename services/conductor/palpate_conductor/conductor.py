@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 AFTER_LOSS = NS
 """Simulated time that survivors run after a loss, so that the safe reaction is simulated and recorded."""
 POLL_S = 0.02
+"""How often it looks [s]: at who died, at reports, and at what there is to grant."""
 OBSERVERS_FINISH_S = 60.0
 
 
