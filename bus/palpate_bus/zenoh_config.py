@@ -23,22 +23,23 @@ it gets the usual transport.
 
 **Thread pools.** By default zenoh watches the sockets in one pool of threads and reads them in another, so that each message
 that comes in wakes two threads before it wakes the service. Here one pool of two threads does both (`POOLS`): the barrier of
-three services (`palpate bench`) makes 3,400 ticks a second instead of 3,000, an examination 13 % more of real time.
+three services makes 3,400 ticks a second instead of 3,000 (medians of six alternating runs of 4,000), a short examination without
+recorder and viewer 1.38 times real time instead of 1.21 (medians of three).
 
 **A reader that does not keep up.** Where a publisher drops on congestion, a put waits for room before it drops. In lockstep that
 wait is a second, since a lost message ends the run; a reader that stays frozen costs its publishers that second once (measured:
 1000 ms) and is skipped from then on. In wall-clock mode it is a millisecond (measured at 1 kHz: 1.1 ms once).
 
-Round trip of 300 bytes between two Python processes (SimpleQueue receivers, five interleaved repeats of 3,500, two busy cores):
+Round trip of 300 bytes between two Python processes (SimpleQueue receivers, five interleaved repeats of 3,500, two cores):
 
 | transport | best p50 | median p50 | median p99 |
 |---|---|---|---|
-| unix socket | 116 us | 142 us | 321 us |
-| loopback TCP | 112 us | 184 us | 421 us |
-| unix socket, no batching | 83 us | 136 us | 278 us |
-| unix socket, no QoS | 96 us | 119 us | 214 us |
-| unix socket, low latency | 79 us | 94 us | 173 us |
-| TCP, low latency | 83 us | 103 us | 328 us |
+| unix socket | 94 us | 100 us | 147 us |
+| loopback TCP | 134 us | 137 us | 171 us |
+| unix socket, no batching | 93 us | 100 us | 145 us |
+| unix socket, no QoS | 95 us | 102 us | 150 us |
+| unix socket, low latency | 74 us | 78 us | 116 us |
+| TCP, low latency | 79 us | 108 us | 138 us |
 """
 
 from __future__ import annotations

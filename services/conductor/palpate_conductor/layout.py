@@ -2,8 +2,8 @@
 
 The processes of a run take turns on a core every few hundred microseconds. With address-space randomisation each has the same
 interpreter and libraries at other addresses, so what a core's branch predictor has learnt serves one of them only [A].
-Alternating short runs on an idle machine gave 1.66 and 1.68 times real time without randomisation, 1.28 and 1.25 with it; that
-was with one receiving thread in zenoh, where there are two now. It is left on in secure mode.
+Alternating short runs with recorder and viewer: 1.65, 1.57, 1.50, 1.54, 1.57 and 1.57 times real time without randomisation,
+1.57, 1.56, 1.51, 1.48, 1.52 and 1.53 with it. It is left on in secure mode.
 """
 
 from __future__ import annotations
