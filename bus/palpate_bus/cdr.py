@@ -3,8 +3,9 @@
 The 1 kHz loop pays about ten codec calls a tick. rosbags packs and unpacks field by field; here neighbouring numbers, across
 nested messages, become one `struct` call. The bytes are the same, which the contract tests compare for every type.
 
-CDR aligns each number to its own size, counted from the end of the four-byte encapsulation header. Behind a string the
-alignment is known only at run time, so a run of numbers has eight Structs, one a phase of the position modulo 8.
+CDR aligns each number to its own size, counted from the end of the four-byte encapsulation header. Up to the first string or
+sequence every position is known when the code is written. Behind it a run of numbers has eight Structs, one a phase of the
+position modulo 8.
 """
 
 from __future__ import annotations
@@ -22,11 +23,15 @@ HEADER = b"\x00\x01\x00\x00"
 """Encapsulation header of little-endian CDR."""
 
 
-class Codec(NamedTuple):
-    """The generated functions of a message type."""
+class CodecError(ValueError):
+    """Bytes that are not a message of the expected type, or a message that does not fit its type."""
 
-    encode: Callable[..., bytes]
-    """`encode(message, position, head)` gives `head` and the bytes that follow `position`, which counts without the header."""
+
+class Codec(NamedTuple):
+    """The generated functions of a type that stands in sequences of other messages."""
+
+    encode: Callable[[Any, int], bytes]
+    """`encode(message, position)` gives the bytes that follow `position`, which counts without the header."""
     decode: Callable[[bytes, int], tuple[Any, int]]
     """`decode(data, position)` gives (message, next position); here the header counts in."""
     least_size: int
@@ -42,25 +47,20 @@ _FORMAT = {
 _DTYPE = {name: np.dtype({"bool": "?", "byte": "i1", "char": "u1"}.get(name, name)) for name in _FORMAT}
 
 
-def _run(formats: str, offset: int, align: int = 1) -> tuple[struct.Struct, ...]:
-    """Structs of a run of numbers, one for each (position + offset) modulo 8, with the padding between them.
+@lru_cache(maxsize=4096)
+def _struct(formats: tuple[str, ...], phase: int, align: int) -> struct.Struct:
+    """The Struct of a run of numbers that begins at a position of this phase (modulo 8), with the padding between them.
 
     What follows is aligned to `align` bytes.
     """
-    structs = []
-    for index in range(8):
-        position = phase = (index + offset) % 8
-        text = "<"
-        for code in formats:
-            size = struct.calcsize("<" + code)
-            pad = -position % size
-            text += "x" * pad + code
-            position += pad + size
-        text += "x" * (-position % align)
-        position += -position % align
-        structs.append(struct.Struct(text))
-        assert structs[-1].size == position - phase
-    return tuple(structs)
+    text = "<"
+    position = phase
+    for code in formats:
+        size = struct.calcsize("<" + code)
+        pad = -position % size
+        text += "x" * pad + code
+        position += pad + size
+    return struct.Struct(text + "x" * (-position % align))
 
 
 def _array(value: Any, dtype: np.dtype[Any], length: int, where: str) -> Any:
@@ -114,13 +114,26 @@ class _StringsReader:
         return values, end
 
 
+class _Field(NamedTuple):
+    """A field that is no message: an expression for it where code is written, its path in the message, rosbags' description."""
+
+    value: str
+    path: str
+    kind: Any
+
+
 class _Writer:
     """Collects the lines and constants of a function under construction.
 
-    In the generated code `p` is the position, `s` a Struct and `d` one item of a sequence of messages.
+    In the generated code `p` is the position, once it is no longer known beforehand, `s` a Struct and `d` one item of a sequence
+    of messages.
     """
 
-    def __init__(self, store: Any, fast: Fast) -> None:
+    counted: int
+    """Bytes of the encapsulation header that the position counts in."""
+
+    def __init__(self, store: Any, fast: Fast, at: int | None) -> None:
+        """`at`: the position at the start; None when the function gets it as its argument `p`."""
         self.store = store
         self.fast = fast
         self.lines: list[str] = []
@@ -128,8 +141,13 @@ class _Writer:
         """The run of numbers that is being collected, and where they come from or go to."""
         self.numbers: list[str] = []
         self.names: dict[str, Any] = {"frombuffer": np.frombuffer, "ndarray": np.ndarray, "array": _array}
-        self.names |= {"pack_strings": _pack_strings, "new": object.__new__, "join": b"".join}
+        self.names |= {"pack_strings": _pack_strings, "new": object.__new__, "join": b"".join, "CodecError": CodecError}
         self._counter = count()
+        self._at = at
+        self._ahead: list[str] = []
+        """Sizes that `p` has still to be advanced by."""
+        self._held = at is None
+        """Whether `p` is set."""
 
     def name(self, value: Any) -> str:
         """A name for a constant in the generated function."""
@@ -140,136 +158,207 @@ class _Writer:
     def variable(self) -> str:
         return f"v{next(self._counter)}"
 
+    def position(self) -> str:
+        """An expression for the position, which `p` is brought up to where it has to be."""
+        if self._at is not None:
+            return str(self._at)
+        if self._ahead:
+            self.lines.append(f"p {'+=' if self._held else '='} {' + '.join(self._ahead)}")
+            self.held()
+        return "p"
+
+    def advance(self, size: int | str) -> None:
+        """The position moves on by `size` [bytes], or by what this expression gives."""
+        if self._at is not None:
+            if isinstance(size, int):
+                self._at += size
+                return
+            self._ahead, self._at = [str(self._at)], None
+        self._ahead.append(str(size))
+
     def number(self, code: str, variable: str) -> str:
         """Appends a number to the run."""
         self.formats.append(code)
         self.numbers.append(variable)
         return variable
 
-    def take_run(self, offset: int, align: int = 1) -> tuple[str, str]:
-        """The name of the run's Structs and its variables; the next run begins empty."""
-        structs, variables = self.name(_run("".join(self.formats), offset, align)), ", ".join(self.numbers)
+    def take_run(self, align: int = 1, align_if: str = "") -> tuple[str, str]:
+        """An expression for the run's Struct, and its variables; the next run begins empty.
+
+        What follows is aligned to `align` bytes: always, or if the variable `align_if` is not zero. Advances.
+        """
+        formats, values = tuple(self.formats), ", ".join(self.numbers)
         self.formats.clear()
         self.numbers.clear()
-        return structs, variables
+        offset, at = -self.counted, self._at
+
+        def structs(align: int) -> str:
+            if at is not None:
+                return self.name(_struct(formats, (at + offset) % 8, align))
+            phases = tuple(_struct(formats, (index + offset) % 8, align) for index in range(8))
+            return f"{self.name(phases)}[{self.position()} & 7]"
+
+        if align_if:
+            chosen = f"({structs(align)} if {align_if} else {structs(1)})"
+        elif at is not None:
+            chosen = structs(align)
+            self.advance(self.names[chosen].size)
+            return chosen, values
+        else:
+            chosen = structs(align)
+        self.lines.append(f"s = {chosen}")
+        self.advance("s.size")  # taken up before `s` becomes another: that one's phase needs the position
+        return "s", values
+
+    def hold(self) -> None:
+        """From here on the position is in `p`."""
+        place = self.position()
+        if place != "p":
+            self.lines.append(f"p = {place}")
+        self.held()
+
+    def held(self) -> None:
+        """What was written last has set `p`."""
+        self._at, self._ahead, self._held = None, [], True
 
     def function(self, head: str, name: str) -> Any:
         exec("\n".join([head, *("  " + line for line in self.lines)]), self.names)
         return self.names[name]
 
+    def guarded(self, what: str) -> None:
+        """Turns everything so far that may go wrong into a CodecError; `what` is the code of an f-string."""
+        body = ["  " + line for line in self.lines]
+        self.lines = ["try:", *body, "except Exception as error:", f"  raise CodecError(f{what!r}) from error"]
+
 
 class _Encoder(_Writer):
-    """Writes `encode(m, p, h)`: each field adds a variable to `parts`, which are joined at the end."""
+    """Writes the bytes of a message `m`: each field adds a variable to `parts`, which are joined at the end."""
 
-    def __init__(self, store: Any, fast: Fast) -> None:
-        super().__init__(store, fast)
-        self.parts = ["h"]
+    counted = 0
+
+    def __init__(self, store: Any, fast: Fast, *, whole: bool) -> None:
+        """`whole`: with the encapsulation header in front."""
+        super().__init__(store, fast, -len(HEADER) if whole else None)
+        self.parts: list[str] = []
+        if whole:
+            self.number(f"{len(HEADER)}s", self.name(HEADER))
 
     def flush(self) -> None:
         if self.formats:
-            self._pack(*self.take_run(0))
+            self._pack(*self.take_run())
 
     def _pack(self, structs: str, values: str) -> None:
         part = self.variable()
-        self.lines.append(f"s = {structs}[p & 7]; {part} = s.pack({values}); p += s.size")
+        self.lines.append(f"{part} = {structs}.pack({values})")
         self.parts.append(part)
 
-    def string(self, path: str) -> None:
+    def scalar(self, field: _Field, code: str) -> None:
+        self.number(code, field.value)
+
+    def string(self, field: _Field) -> None:
         part = self.variable()
-        self.lines.append(f"{part} = {path}.encode() + b'\\0'")
+        self.lines.append(f"{part} = {field.value}.encode() + b'\\0'")
         self.number("I", f"len({part})")
         self.flush()
-        self.lines.append(f"p += len({part})")
+        self.advance(f"len({part})")
         self.parts.append(part)
 
-    def array(self, path: str, dtype: np.dtype[Any], length: int) -> None:
+    def array(self, field: _Field, dtype: np.dtype[Any], length: int) -> None:
         part, c, size = self.variable(), self.name(dtype), dtype.itemsize
         wrong = f"{part}.__class__ is not ndarray or {part}.dtype is not {c} or {part}.ndim != 1"
-        self.lines.append(f"{part} = {path}")
+        self.lines.append(f"{part} = {field.value}")
         self.lines.append(f"if {wrong}{f' or len({part}) != {length}' if length >= 0 else ''}:")
-        self.lines.append(f"  {part} = array({part}, {c}, {length}, {path[2:]!r})")
+        self.lines.append(f"  {part} = array({part}, {c}, {length}, {field.path!r})")
         if length >= 0:
             n = str(length)
-            self._pack(*self.take_run(0, size if length else 1))
+            self._pack(*self.take_run(size if length else 1))
+            self.advance(length * size)
         else:  # padding stands only where items follow
             n = self.number("I", self.variable())
             self.lines.append(f"{n} = len({part})")
-            plain = self.name(_run("".join(self.formats), 0))
-            structs, values = self.take_run(0, size)
-            self._pack(f"({structs} if {n} else {plain})", values)
-        self.lines.append(f"p += {n} * {size}")
+            self._pack(*self.take_run(size, align_if=n))
+            self.advance(f"{n} * {size}")
         # Small arrays are copied, which is quicker than a look at whether they are contiguous.
         self.lines.append(f"if {n} < {512 // size} or not {part}.flags.c_contiguous: {part} = {part}.tobytes()")
         self.parts.append(part)
 
-    def items(self, path: str, item: Any, length: int) -> None:
+    def items(self, field: _Field, item: Any, length: int) -> None:
         part = self.variable()
         if length >= 0:
-            self.lines.append(f"if len({path}) != {length}: raise ValueError('{path[2:]}: wants {length} items')")
+            wrong = f"{field.path}: wants {length} items"
+            self.lines.append(f"if len({field.value}) != {length}: raise ValueError({wrong!r})")
         else:
-            self.number("I", f"len({path})")
+            self.number("I", f"len({field.value})")
         self.flush()
+        self.hold()
         if item[0] == Nodetype.BASE:
-            self.lines.append(f"{part} = pack_strings(tuple({path}), p & 3); p += len({part})")
+            self.lines.append(f"{part} = pack_strings(tuple({field.value}), p & 3); p += len({part})")
         else:
             encode = self.name(self.fast(item[1]).encode)
-            self.lines += [f"{part} = []", f"for d in {path}: d = {encode}(d, p); p += len(d); {part}.append(d)"]
+            self.lines += [f"{part} = []", f"for d in {field.value}: d = {encode}(d, p); p += len(d); {part}.append(d)"]
             part = f"*{part}"
         self.parts.append(part)
 
-    def finish(self) -> Callable[..., bytes]:
+    def give(self) -> None:
+        """Writes the return."""
         self.flush()
-        self.lines.append(f"return join(({', '.join(self.parts)},))")
-        return self.function("def encode(m, p, h=b''):", "encode")  # type: ignore[no-any-return]
+        alone = len(self.parts) == 1 and not self.parts[0].startswith("*")
+        self.lines.append(f"return {self.parts[0]}" if alone else f"return join(({', '.join(self.parts)},))")
 
 
 class _Decoder(_Writer):
-    """Writes `decode(b, p)`: each field puts a variable into `values`, of which the messages are made at the end."""
+    """Reads a message out of bytes `b`: each field puts a variable into `values`, of which the messages are made at the end."""
 
-    def __init__(self, store: Any, fast: Fast) -> None:
-        super().__init__(store, fast)
+    counted = len(HEADER)
+
+    def __init__(self, store: Any, fast: Fast, *, whole: bool) -> None:
+        """`whole`: the bytes begin with the encapsulation header."""
+        super().__init__(store, fast, len(HEADER) if whole else None)
         self.values: dict[str, str] = {}
 
     def flush(self) -> None:
         if self.formats:
-            structs, targets = self.take_run(4)
-            self.lines.append(f"s = {structs}[p & 7]; {targets}, = s.unpack_from(b, p); p += s.size")
+            place = self.position()
+            structs, targets = self.take_run()
+            self.lines.append(f"{targets}, = {structs}.unpack_from(b, {place})")
 
-    def string(self, path: str) -> None:
+    def scalar(self, field: _Field, code: str) -> None:
+        self.values[field.path] = self.number(code, self.variable())
+
+    def string(self, field: _Field) -> None:
         value, n = self.variable(), self.number("I", self.variable())
         self.flush()
-        self.lines.append(f"e = p + {n}")
+        place = self.position()
+        self.lines.append(f"e = {place} + {n}")
         self.lines.append(f"if {n} < 1 or e > len(b) or b[e - 1]:")
-        self.lines.append(f"  raise ValueError(f'{path[2:]}: invalid string of length {{{n}}} at {{p}}')")
-        self.lines.append(f"{value} = b[p:e - 1].decode() if {n} > 1 else ''; p = e")
-        self.values[path] = value
+        self.lines.append(f"  raise ValueError(f'{field.path}: invalid string of length {{{n}}} at {{{place}}}')")
+        self.lines.append(f"{value} = b[{place}:e - 1].decode() if {n} > 1 else ''; p = e")
+        self.held()
+        self.values[field.path] = value
 
-    def array(self, path: str, dtype: np.dtype[Any], length: int) -> None:
+    def array(self, field: _Field, dtype: np.dtype[Any], length: int) -> None:
         n = str(length) if length >= 0 else self.number("I", self.variable())
         self.flush()
         if dtype.itemsize > 1:  # alignment counts from the end of the encapsulation header
-            align = f"p += -(p - 4) & {dtype.itemsize - 1}"
-            self.lines.append(align if length >= 0 else f"if {n}: {align}")
-        value = self.values[path] = self.variable()
-        self.lines.append(f"{value} = frombuffer(b, {self.name(dtype)}, {n}, p); p += {n} * {dtype.itemsize}")
+            pad = f"(-({self.position()} - {self.counted}) & {dtype.itemsize - 1})"
+            self.advance(pad if length >= 0 else f"({pad} if {n} else 0)")
+        value = self.values[field.path] = self.variable()
+        self.lines.append(f"{value} = frombuffer(b, {self.name(dtype)}, {n}, {self.position()})")
+        self.advance(f"{n} * {dtype.itemsize}")
 
-    def items(self, path: str, item: Any, length: int) -> None:
+    def items(self, field: _Field, item: Any, length: int) -> None:
         n = str(length) if length >= 0 else self.number("I", self.variable())
         self.flush()
-        value = self.values[path] = self.variable()
+        self.hold()
+        value = self.values[field.path] = self.variable()
         if item[0] == Nodetype.BASE:
             self.lines.append(f"{value}, p = {self.name(_StringsReader())}(b, p, {n})")
             return
         nested = self.fast(item[1])
         self.lines.append(f"if {n} * {nested.least_size} > len(b) - p:")
-        self.lines.append(f"  raise ValueError(f'{path[2:]}: {{{n}}} items cannot fit into {{len(b) - p}} bytes')")
+        self.lines.append(f"  raise ValueError(f'{field.path}: {{{n}}} items cannot fit into {{len(b) - p}} bytes')")
         self.lines.append(f"{value} = []")
         self.lines.append(f"for _ in range({n}): d, p = {self.name(nested.decode)}(b, p); {value}.append(d)")
-
-    def finish(self, name: str) -> Callable[[bytes, int], tuple[Any, int]]:
-        self.flush()
-        self.lines.append(f"return {self.build(name, 'm')}, p")
-        return self.function("def decode(b, p):", "decode")  # type: ignore[no-any-return]
 
     def build(self, name: str, path: str) -> str:
         """Makes the message at `path` of its values; returns its variable.
@@ -277,7 +366,7 @@ class _Decoder(_Writer):
         Attributes are set directly: a dataclass's `__init__` would take twice as long.
         """
         parts = [
-            (field, self.build(desc[1], f"{path}.{field}") if desc[0] == Nodetype.NAME else self.values[f"{path}.{field}"])
+            (field, self.build(desc[1], f"{path}{field}.") if desc[0] == Nodetype.NAME else self.values[path + field])
             for field, desc in self.store.get_msgdef(name).fields
         ]
         message = self.variable()
@@ -286,11 +375,14 @@ class _Decoder(_Writer):
         return message
 
 
-def _flat(store: Any, name: str, path: str) -> list[tuple[str, Any]]:
-    """The fields of a message with nested messages opened up, as (path, description)."""
-    out: list[tuple[str, Any]] = []
-    for field, desc in store.get_msgdef(name).fields:
-        out += _flat(store, desc[1], f"{path}.{field}") if desc[0] == Nodetype.NAME else [(f"{path}.{field}", desc)]
+def _flat(store: Any, name: str, value: str, path: str = "") -> list[_Field]:
+    """The fields of a message with nested messages opened up; those stand as their paths below `value`."""
+    out: list[_Field] = []
+    for field, kind in store.get_msgdef(name).fields:
+        inner = f"{value}.{field}"
+        out += (
+            _flat(store, kind[1], inner, f"{path}{field}.") if kind[0] == Nodetype.NAME else [_Field(inner, path + field, kind)]
+        )
     return out
 
 
@@ -306,26 +398,81 @@ def _least_size(desc: Any, fast: Fast) -> int:
     return 4
 
 
-def generate(store: Any, name: str, fast: Fast) -> Codec:
-    """The codec of a message type of a rosbags typestore; `fast` gives the codec of a nested type.
-
-    Raises KeyError for a type that has a field we have no fast way for.
-    """
-    encoder, decoder = _Encoder(store, fast), _Decoder(store, fast)
-    for path, (kind, detail) in _flat(store, name, "m"):
+def _write(writer: _Encoder | _Decoder, fields: list[_Field]) -> None:
+    """Code for all fields. Raises KeyError for one that we have no fast way for."""
+    for field in fields:
+        kind, detail = field.kind
         if kind == Nodetype.BASE and detail[0] != "string":
-            encoder.number(_FORMAT[detail[0]], path)
-            decoder.values[path] = decoder.number(_FORMAT[detail[0]], decoder.variable())
+            writer.scalar(field, _FORMAT[detail[0]])
         elif kind == Nodetype.BASE:
-            encoder.string(path)
-            decoder.string(path)
+            writer.string(field)
         else:
             item, length = detail if kind == Nodetype.ARRAY else (detail[0], -1)
-            numeric = item[0] == Nodetype.BASE and item[1][0] != "string"
-            for writer in (encoder, decoder):
-                if numeric:
-                    writer.array(path, _DTYPE[item[1][0]], length)
-                else:
-                    writer.items(path, item, length)
+            if item[0] == Nodetype.BASE and item[1][0] != "string":
+                writer.array(field, _DTYPE[item[1][0]], length)
+            else:
+                writer.items(field, item, length)
+    writer.flush()
+
+
+def _encoder(store: Any, name: str, fast: Fast, *, whole: bool) -> _Encoder:
+    """The code of an encoder, up to its return. A message inside others is looked up once."""
+    writer = _Encoder(store, fast, whole=whole)
+    fields = []
+    inner: dict[str, str] = {}
+    for field in _flat(store, name, "m"):
+        *steps, last = field.value.split(".")
+        owner = steps[0]
+        for step in steps[1:]:
+            owner = inner.setdefault(f"{owner}.{step}", f"m{len(inner)}")
+        fields.append(field._replace(value=f"{owner}.{last}"))
+    writer.lines += [f"{variable} = {value}" for value, variable in inner.items()]
+    _write(writer, fields)
+    return writer
+
+
+def _decoder(store: Any, name: str, fast: Fast, *, whole: bool) -> _Decoder:
+    """The code of a decoder, up to its return."""
+    writer = _Decoder(store, fast, whole=whole)
+    _write(writer, _flat(store, name, "m"))
+    return writer
+
+
+def nested(store: Any, name: str, fast: Fast) -> Codec:
+    """The codec of a message type of a rosbags typestore, inside others; `fast` gives the codec of what is inside it.
+
+    Raises KeyError for a type that has a field we have no fast way for; so do `encoder` and `decoder`.
+    """
+    encode, decode = _encoder(store, name, fast, whole=False), _decoder(store, name, fast, whole=False)
+    encode.give()
+    decode.lines.append(f"return {decode.build(name, '')}, {decode.position()}")
     least_size = sum(_least_size(desc, fast) for _, desc in store.get_msgdef(name).fields)
-    return Codec(encoder.finish(), decoder.finish(name), least_size)
+    return Codec(encode.function("def encode(m, p):", "encode"), decode.function("def decode(b, p):", "decode"), least_size)
+
+
+def encoder(store: Any, name: str, fast: Fast) -> Callable[[Any], bytes]:
+    """The encoder of a whole message, which raises CodecError if a field does not fit."""
+    writer = _encoder(store, name, fast, whole=True)
+    writer.give()
+    writer.guarded(f"{name}: cannot encode: {{error}}")
+    return writer.function("def encode(m):", "encode")  # type: ignore[no-any-return]
+
+
+def decoder(store: Any, name: str, fast: Fast, other: Callable[[bytes], Any]) -> Callable[[bytes | memoryview], Any]:
+    """The decoder of a whole message, which raises CodecError on anything malformed.
+
+    `other` decodes what does not begin as little-endian CDR: big-endian messages, or none at all.
+    """
+    writer = _decoder(store, name, fast, whole=True)
+    writer.lines.append(f"m, p = {writer.build(name, '')}, {writer.position()}")
+    writer.guarded(f"{name}: cannot decode {{len(b)}} bytes: {{error}}")
+    head = [
+        "if b.__class__ is not bytes: b = bytes(b)",
+        f"if b[:2] != {HEADER[:2]!r}: return {writer.name(other)}(b)",
+    ]
+    end = [  # some encoders pad the end to a multiple of four
+        "if 0 <= len(b) - p < 4: return m",
+        f"raise CodecError(f'{name}: {{len(b)}} bytes, but the message ends at {{p}}')",
+    ]
+    writer.lines = head + writer.lines + end
+    return writer.function("def decode(b):", "decode")  # type: ignore[no-any-return]

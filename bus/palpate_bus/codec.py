@@ -8,20 +8,30 @@ puts into the key.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from palpate_bus import cdr
+from palpate_bus.cdr import CodecError
+
+__all__ = [
+    "CodecError",
+    "Message",
+    "decode",
+    "decoder",
+    "encode",
+    "encoder",
+    "message_type",
+    "palpation_definitions",
+    "store",
+    "type_hash",
+]
 
 Message = Any
 """A message instance. Message classes are generated at run time from .msg files, so they have no static type."""
-
-
-class CodecError(ValueError):
-    """Bytes that are not a message of the expected type, or a message that does not fit its type."""
 
 
 def _interface_package() -> Path:
@@ -73,8 +83,8 @@ def type_hash(name: str) -> str:
 
 @cache
 def _fast(name: str) -> cdr.Codec:
-    """The generated codec of a type. Raises KeyError if it has a field that only rosbags knows how to encode."""
-    return cdr.generate(store, name, _fast)
+    """The generated codec of a type inside others. Raises KeyError if it has a field that only rosbags knows how to encode."""
+    return cdr.nested(store, name, _fast)
 
 
 def encode(message: Message, name: str) -> bytes:
@@ -92,51 +102,30 @@ def encoder(name: str) -> Callable[[Message], bytes]:
     """`encode` for one type, for hot paths."""
     message_type(name)
     try:
-        fast = _fast(name).encode
+        return cdr.encoder(store, name, _fast)
     except KeyError:
-        return lambda message: _rosbags_encode(message, name)
-
-    def encode_one(message: Message) -> bytes:
-        try:
-            return fast(message, 0, cdr.HEADER)
-        except Exception as error:
-            raise CodecError(f"{name}: cannot encode: {error}") from error
-
-    return encode_one
+        return partial(_rosbags_encode, name)
 
 
 @cache
 def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
     """`decode` for one type, for hot paths."""
     message_type(name)
+    other = partial(_rosbags_decode, name)
     try:
-        fast = _fast(name).decode
+        return cdr.decoder(store, name, _fast, other)
     except KeyError:
-        return lambda payload: _rosbags_decode(payload, name)
-
-    def decode_one(payload: bytes | memoryview) -> Message:
-        data = payload if payload.__class__ is bytes else bytes(payload)
-        if data[:2] != b"\x00\x01":
-            return _rosbags_decode(data, name)  # big-endian, or no CDR at all
-        try:
-            message, end = fast(data, 4)
-        except Exception as error:
-            raise CodecError(f"{name}: cannot decode {len(data)} bytes: {error}") from error
-        if not 0 <= len(data) - end < 4:  # some encoders pad the end to a multiple of four
-            raise CodecError(f"{name}: {len(data)} bytes, but the message ends at {end}")
-        return message
-
-    return decode_one
+        return other
 
 
-def _rosbags_encode(message: Message, name: str) -> bytes:
+def _rosbags_encode(name: str, message: Message) -> bytes:
     try:
         return bytes(store.serialize_cdr(message, name))
     except Exception as error:
         raise CodecError(f"{name}: cannot encode: {error}") from error
 
 
-def _rosbags_decode(payload: bytes | memoryview, name: str) -> Message:
+def _rosbags_decode(name: str, payload: bytes | memoryview) -> Message:
     try:
         return store.deserialize_cdr(payload, name)
     except Exception as error:

@@ -10,7 +10,7 @@ from contextlib import nullcontext, suppress
 from typing import Any
 
 from palpate_bus.contract import MS, Contract, Topic, contract
-from palpate_bus.lockstep import InputBuffer, OutputPort, Received, Sent, Stepper, run_hash
+from palpate_bus.lockstep import OutputPort, Received, Sent, Stepper, run_hash
 from palpate_bus.service import Service
 from palpate_bus.suspects import failure
 
@@ -50,8 +50,8 @@ class Composed:
         observers = [role for role in order if self.contract.roles[role].observer]
         self.steppers = {role: Stepper(by_role[role], self.contract) for role in (*workers, *observers)}
         self._taps = tuple(taps)
-        self._readers: dict[OutputPort, tuple[InputBuffer, ...]] = {
-            port: tuple(stepper.buffers[name] for stepper in self.steppers.values() if name in stepper.buffers)
+        self._readers: dict[OutputPort, tuple[Callable[[Received], None], ...]] = {
+            port: tuple(stepper.buffers[name].deliver for stepper in self.steppers.values() if name in stepper.buffers)
             for sender in self.steppers.values()
             for name, port in sender.ports.items()
         }
@@ -67,8 +67,8 @@ class Composed:
         for port, payload, sequence in sent:
             if readers := self._readers[port]:
                 received = Received(payload, t, sequence)
-                for buffer in readers:
-                    buffer.deliver(received)
+                for deliver in readers:
+                    deliver(received)
             for tap in self._taps:
                 try:
                     tap(port.topic, payload, t, sequence)

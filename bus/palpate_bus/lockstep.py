@@ -11,6 +11,7 @@ import hashlib
 import struct
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from time import perf_counter_ns
 
 from palpate_bus import codec
@@ -22,6 +23,8 @@ from palpate_bus.service import Outbox, Service
 _CHAIN = struct.Struct("<qqq")
 _SMALL = 4096
 """A payload up to this size [bytes] is cheaper copied behind its head than hashed in a call of its own."""
+_CHAIN_NS = 64_000_000
+"""Simulated time [ns] over which what was sent is gathered for the digests: hashing each by itself would meet cold code."""
 NEVER = -1
 """The tick of something that has not happened."""
 
@@ -152,22 +155,27 @@ class TickInbox:
         self._blame = blame
         self.lost_roles: set[str] = set()
 
-    def _message(self, buffer: InputBuffer, received: Received) -> Message:
-        if received.message is None:
-            start = perf_counter_ns()
-            received.message = buffer.decode(received.payload)
-            self._blame.decode += perf_counter_ns() - start
-        return received.message
+    def _decode(self, buffer: InputBuffer, received: Received) -> Message:
+        start = perf_counter_ns()
+        message = received.message = buffer.decode(received.payload)
+        self._blame.decode += perf_counter_ns() - start
+        return message
 
     def latest(self, topic: str) -> Message | None:
         """The newest message, or None before the first."""
         buffer = self._buffers[topic]
-        return None if buffer.latest is None else self._message(buffer, buffer.latest)
+        received = buffer.latest
+        if received is None:
+            return None
+        message = received.message
+        return self._decode(buffer, received) if message is None else message
 
     def new(self, topic: str) -> list[Message]:
         """The messages since the step before, oldest first."""
         buffer = self._buffers[topic]
-        return [self._message(buffer, received) for received in buffer.new] if buffer.new else []
+        if not buffer.new:
+            return []
+        return [self._decode(buffer, one) if one.message is None else one.message for one in buffer.new]
 
     def raw(self, topic: str) -> Sequence[Received]:
         """The messages since the step before, undecoded."""
@@ -199,8 +207,8 @@ class OutputPort:
 
     def pack(self, message: Message) -> Sent:
         """Encodes and numbers a message."""
-        self.sequence += 1
-        return self, self.encode(message), self.sequence
+        sequence = self.sequence = self.sequence + 1
+        return self, self.encode(message), sequence
 
     def chain(self, payload: bytes, stamp: int, sequence: int) -> None:
         """Takes a sent message into the digest."""
@@ -238,8 +246,15 @@ class Stepper:
         self.blame = Blame()
         self.inbox = TickInbox(self.buffers, self.blame)
         self._all = tuple(self.buffers.values())
-        self._strict = strict and not self.role.observer
-        self._periodic = tuple(port for port in self.ports.values() if not (port.event or port.latched))
+        self._whole = type(service).parts is Service.parts
+        periodic = tuple(port for port in self.ports.values() if not (port.event or port.latched))
+        if not strict or self.role.observer:
+            periodic = ()
+        self._steady = tuple(port for port in periodic if port.period == self.role.period)
+        self._rarer = tuple(port for port in periodic if port.period != self.role.period)
+        self._unchained: list[tuple[int, list[Sent]]] = []
+        """What has been sent, by tick, and is not in the digests yet: many small messages are hashed in one go."""
+        self._chain_every = max(_CHAIN_NS // self.role.period, 1)
 
     def start(self) -> list[Sent]:
         """The latched messages, packed. They are numbered and stamped zero."""
@@ -258,7 +273,7 @@ class Stepper:
 
     def step(self, t: int) -> list[Sent]:
         """Steps the service at `t` [ns] and returns all that it sends, packed, in outbox order. Raises as `parts`."""
-        return [sent for part in self.parts(t) for sent in part]
+        return list(chain.from_iterable(self.parts(t)))
 
     def parts(self, t: int) -> Iterator[list[Sent]]:
         """Steps the service at `t` [ns]; yields what each part of the step sends, packed, in outbox order.
@@ -268,30 +283,44 @@ class Stepper:
         for buffer in self._all:
             if buffer.pending or buffer.new:
                 buffer.take(t)
-        blame = self.blame
+        blame, service, unchained = self.blame, self.service, self._unchained
         begin, decoded = perf_counter_ns(), blame.decode
-        for outbox in self.service.parts(t, self.inbox):
+        for outbox in (service.step(t, self.inbox),) if self._whole else service.parts(t, self.inbox):
             stepped = perf_counter_ns()
             blame.compute += stepped - begin - (blame.decode - decoded)
             sent = self._pack(outbox, t)
+            unchained.append((t, sent))
             begin = perf_counter_ns()
             blame.encode += begin - stepped
             yield sent
             begin, decoded = perf_counter_ns(), blame.decode
-            for port, payload, sequence in sent:  # after they are on their way
-                port.chain(payload, t, sequence)
-            stepped = perf_counter_ns()
-            blame.encode += stepped - begin
-            begin = stepped
-        for port in self._periodic if self._strict else ():
+        number = t // self.role.period + 1
+        for port in self._steady:
+            if port.sequence != number:
+                raise self._missing(port, t)
+        for port in self._rarer:
             if not t % port.period and port.sequence != t // port.period + 1:
-                raise LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+                raise self._missing(port, t)
+        if len(unchained) >= self._chain_every:  # after they are on their way
+            self._chain()
+            blame.encode += perf_counter_ns() - begin
         blame.steps += 1
+
+    def _missing(self, port: OutputPort, t: int) -> LockstepError:
+        return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+
+    def _chain(self) -> None:
+        """Brings the digests up to date."""
+        for t, sent in self._unchained:
+            for port, payload, sequence in sent:
+                port.chain(payload, t, sequence)
+        self._unchained.clear()
 
     def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
         sent: list[Sent] = []
+        ports = self.ports
         for name, message in outbox.items():
-            port = self._port(name)
+            port = ports.get(name) or self._port(name)
             if port.event:
                 sent += map(port.pack, message) if isinstance(message, list) else (port.pack(message),)
             elif t % port.period:
@@ -310,12 +339,13 @@ class Stepper:
 
     def digests(self) -> dict[str, str]:
         """Digest by topic, of the hashed ones."""
+        self._chain()
         return {name: digest for name, port in self.ports.items() if (digest := port.digest()) is not None}
 
 
 def run_hash(digests: Mapping[str, str]) -> str:
     """The run hash: SHA-256 over the sorted (topic, digest) pairs of all services."""
-    chain = hashlib.sha256()
+    pairs = hashlib.sha256()
     for topic, digest in sorted(digests.items()):
-        chain.update(f"{topic} {digest}\n".encode())
-    return chain.hexdigest()
+        pairs.update(f"{topic} {digest}\n".encode())
+    return pairs.hexdigest()
