@@ -18,6 +18,7 @@ from palpate_bus.composed import Composed
 from palpate_bus.contract import Topic, contract
 from palpate_bus.service import Service
 from palpate_bus.stamps import NS
+from palpate_conductor.__main__ import FIXED
 from palpate_conductor.collector import Collector
 from palpate_conductor.processes import compose_file
 from palpate_conductor.run import WORKERS, load_services
@@ -192,7 +193,7 @@ def test_an_examination_with_the_fmu_has_the_same_findings(with_native: Examined
 @pytest.mark.timeout(1500)
 def test_one_line_of_the_compose_file_puts_it_on_the_bus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a process of its own it gives, to the bit, what it gives in one process with all others, under the same environment."""
-    fixed = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
+    fixed = {**os.environ, **FIXED}
     composed = subprocess.run([sys.executable, __file__], env=fixed, capture_output=True, text=True, timeout=900, check=True)
     text = compose_file().read_text(encoding="utf-8")
     assert text.count("palpate_tissue") == 1

@@ -140,3 +140,47 @@ def contact(
     wrench[0], wrench[1], wrench[2] = sums[0] + tx, sums[1] + ty, sums[2] + tz
     wrench[3], wrench[4], wrench[5] = ry * tz - rz * ty, rz * tx - rx * tz, rx * ty - ry * tx
     return True
+
+
+@compiled
+def step(
+    indptr: Index,
+    indices: Index,
+    rate: Array,
+    branches: Array,
+    decay: Array,
+    feed: Array,
+    strain: Array,
+    u: Array,
+    disturbed: bool,
+    index: Index,
+    vertices: Array,
+    origin: Array,
+    sphere: Array,
+    radius: float,
+    rim: float,
+    excursion: float,
+    f: Array,
+    bristle: Array,
+    friction: Array,
+    wrench: Array,
+) -> bool:
+    """One explicit step of field, contact and branches; see `relax`, `contact` and `remember`. Whether the sphere touches.
+
+    A surface that is not `disturbed` is at rest exactly, and stays so until it is touched.
+    """
+    if disturbed:
+        relax(indptr, indices, rate, branches, strain, u)
+    touching = contact(index, vertices, origin, sphere, radius, rim, excursion, u, f, bristle, friction, wrench)
+    if disturbed or touching:
+        remember(branches, decay, feed, u)
+    return touching
+
+
+@compiled
+def turn(vectors: Array, R: Array, out: Array) -> None:
+    """Vectors (k, 3) in other axes: `out` (k, 3) gets R times each, for a rotation `R` (3, 3)."""
+    for k in range(vectors.shape[0]):
+        x, y, z = vectors[k, 0], vectors[k, 1], vectors[k, 2]
+        for i in range(3):
+            out[k, i] = R[i, 0] * x + R[i, 1] * y + R[i, 2] * z

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
-from math import sqrt
+from collections.abc import Iterator, Mapping, Sequence
+from math import hypot
+from operator import add
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Pose, Scenario
 from scipy.spatial.transform import Rotation
 
+from palpate_tissue import kernel
 from palpate_tissue.soft_body import SoftBody
 from palpate_tissue.surface import Surface
 from palpate_tissue.tissue import Tissue
@@ -36,8 +38,8 @@ _WrenchStamped: Any = message_type("geometry_msgs/msg/WrenchStamped")
 
 _OUT_OF_REACH_M = -3.0
 """Depth before the first tool state: the lower end of the contract's range."""
-_NOTHING = np.zeros(3)
-_NOTHING.flags.writeable = False
+_NOTHING = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+"""Force [N] and torque [N m]."""
 
 _log = logging.getLogger("palpate.tissue")
 
@@ -62,6 +64,10 @@ class TissueService(Service):
         self._p_WA = self._X_WA[:3, 3].copy()
         self._origin: list[float] = self._p_WA.tolist()
         self._triangles = self._model.triangles.astype(np.uint32).ravel()
+        self._motion = np.zeros((3, 3))
+        """The indenter's position [m], velocity [m/s] and angular velocity [rad/s], in A."""
+        self._load, self._load_W = np.zeros((2, 3)), np.zeros((2, 3))
+        """Force [N] and torque [N m] on it, in A and in world."""
         self._peak_n = self._recent_peak_n = 0.0
         self._contact_steps = 0
         self._onsets = 0
@@ -92,25 +98,24 @@ class TissueService(Service):
         tool = inbox.latest("sim/tool_state")
         if tool is None:
             self._tissue.idle(t / NS)
-            force_W = torque_W = _NOTHING
+            force_W, torque_W = _NOTHING
         else:
             position, linear, angular = tool.pose.position, tool.twist.linear, tool.twist.angular
             x, y, z = self._origin
             motion_W = np.array(
                 (
-                    position.x - x, position.y - y, position.z - z,
-                    linear.x, linear.y, linear.z,
-                    angular.x, angular.y, angular.z,
+                    (position.x - x, position.y - y, position.z - z),
+                    (linear.x, linear.y, linear.z),
+                    (angular.x, angular.y, angular.z),
                 )
-            )  # fmt: skip
-            p_A, v_A, w_A = motion_W.reshape(3, 3).dot(self._R_WA)
-            force_A, torque_A = self._tissue.step(t / NS, p_A, v_A, float(tool.radius), w_A)
-            if self._tissue.touching:
-                force_W, torque_W = self._R_WA.dot(force_A), self._R_WA.dot(torque_A)
-            else:
-                force_W = torque_W = _NOTHING
-        force = _Vector3(*force_W.tolist())
-        wrench = _Wrench(force, _Vector3(*torque_W.tolist()))
+            )
+            kernel.turn(motion_W, self._R_AW, self._motion)
+            p_A, v_A, w_A = self._motion
+            self._load[0], self._load[1] = self._tissue.step(t / NS, p_A, v_A, float(tool.radius), w_A)
+            kernel.turn(self._load, self._R_WA, self._load_W)
+            force_W, torque_W = self._load_W.tolist() if self._tissue.touching else _NOTHING
+        force = _Vector3(*force_W)
+        wrench = _Wrench(force, _Vector3(*torque_W))
         yield {"sim/contact_wrench": _WrenchStamped(header(t, "world"), wrench)}
         if tool is not None:
             self._count(force)
@@ -148,24 +153,23 @@ class TissueService(Service):
         vertices_W = vertices_A @ self._R_AW + self._p_WA
         return _SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_A @ self._R_AW), self._triangles)
 
-    def _truth(self, t: int, tool: Message | None, force_W: Array) -> Message:
+    def _truth(self, t: int, tool: Message | None, force_W: Sequence[float]) -> Message:
         if tool is None:
             return _IndentationTruth(header(t, "world"), _OUT_OF_REACH_M, 0.0, 0.0, 0.0, 0, _Point(0.0, 0.0, 0.0), 0.0)
-        position = tool.pose.position
-        p_A = self._R_AW.dot(np.array((position.x, position.y, position.z)) - self._p_WA)
-        under = self._surface.nearest(p_A, self._tissue.excursion(t / NS))
-        normal_W = self._R_WA.dot(under.normal)
-        normal_force = float(force_W.dot(normal_W))
-        tangential_W = force_W - normal_force * normal_W
-        point_W = self._R_WA.dot(under.position) + self._p_WA
+        under = self._surface.nearest(self._motion[0], self._tissue.excursion(t / NS))
+        place_W = np.empty((2, 3))
+        kernel.turn(np.stack((under.normal, under.position)), self._R_WA, place_W)
+        (nx, ny, nz), point = place_W.tolist()
+        fx, fy, fz = force_W
+        normal_force = fx * nx + fy * ny + fz * nz
         return _IndentationTruth(
             header(t, "world"),
             float(tool.radius) - under.height,
             max(normal_force, 0.0),
-            sqrt(tangential_W.dot(tangential_W)),
+            hypot(fx - normal_force * nx, fy - normal_force * ny, fz - normal_force * nz),
             self._recent_peak_n,
             len(self._tissue.contacts),
-            _Point(*point_W.tolist()),
+            _Point(*map(add, point, self._origin)),
             under.stiffness,
         )
 

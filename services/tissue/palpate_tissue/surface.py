@@ -43,29 +43,19 @@ class Surface:
         self._faces = _incident_faces(model)
         # Maps an offset from the first corner to its barycentric coordinates, shape (m, 2, 3).
         self._gradient = _gradient(model, np.linalg.pinv(sides.transpose(0, 2, 1)).astype(np.float64))
-        self._weights = np.zeros(3)
+        self._fields = np.column_stack((model.breathing, model.stiffness))
         self.nearest(model.vertices[0].copy())  # compiles what it calls
 
     def nearest(self, p: Array, excursion: float = 0.0) -> RestPoint:
         """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m]."""
         model = self._model
         distance, vertex = nearest_vertex(p, model.vertices)
-        weights = self._weights
-        if distance > _FAR_M:
-            corners = np.array([vertex, vertex, vertex])
-            weights[:] = (1.0, 0.0, 0.0)
-        else:
-            shifted = p - excursion * model.breathing[vertex] * model.normals[vertex] if excursion else p
-            face = nearest_on_faces(shifted, self._faces[vertex], self._triangles, model.vertices, weights)
-            corners = model.triangles[face]
-        normal = weights.dot(model.normals[corners])
-        normal /= sqrt(normal.dot(normal))
-        position = weights.dot(model.vertices[corners])
-        if excursion:
-            position += excursion * weights.dot(model.breathing[corners]) * normal
-        offset = p - position
-        height = float(offset.dot(normal)) if distance <= _FAR_M else sqrt(offset.dot(offset))
-        return RestPoint(position, normal, height, float(weights.dot(model.stiffness[corners])))
+        faces = self._faces[vertex]
+        found = np.empty(8)
+        rest_point(
+            p, vertex, distance <= _FAR_M, excursion, faces, self._triangles, model.vertices, model.normals, self._fields, found
+        )
+        return RestPoint(found[0:3], found[3:6], float(found[6]), float(found[7]))
 
     def normals(self, inward: Array) -> Array:
         """Unit vertex normals (n, 3) of the surface whose vertices have moved inward by (n,) [m] along their normals.
@@ -132,6 +122,46 @@ def nearest_on_faces(p: Array, faces: NDArray[np.uint32], triangles: NDArray[np.
             least, best = distance, int(face)
             weights[0], weights[1], weights[2] = 1.0 - v - w, v, w
     return best
+
+
+@compiled
+def rest_point(
+    p: Array,
+    vertex: int,
+    near: bool,
+    excursion: float,
+    faces: NDArray[np.uint32],
+    triangles: NDArray[np.uint32],
+    vertices: Array,
+    normals: Array,
+    fields: Array,
+    out: Array,
+) -> None:
+    """The rest point under `p` (3,), near a vertex with its `faces`: position, unit normal, height and stiffness in `out` (8,).
+
+    Where `p` is not `near`, the vertex itself. `fields` (n, 2): share of the breathing excursion, k_w [N/m^3].
+    """
+    weights = np.empty(3)
+    a = b = c = vertex
+    weights[0], weights[1], weights[2] = 1.0, 0.0, 0.0
+    if near:
+        shifted = np.empty(3)
+        for k in range(3):
+            shifted[k] = p[k] - excursion * fields[vertex, 0] * normals[vertex, k]
+        face = nearest_on_faces(shifted, faces, triangles, vertices, weights)
+        a, b, c = triangles[face, 0], triangles[face, 1], triangles[face, 2]
+    length = height = distance = 0.0
+    for k in range(3):
+        out[3 + k] = weights[0] * normals[a, k] + weights[1] * normals[b, k] + weights[2] * normals[c, k]
+        length += out[3 + k] * out[3 + k]
+    lift = excursion * (weights[0] * fields[a, 0] + weights[1] * fields[b, 0] + weights[2] * fields[c, 0])
+    for k in range(3):
+        out[3 + k] /= sqrt(length)
+        out[k] = weights[0] * vertices[a, k] + weights[1] * vertices[b, k] + weights[2] * vertices[c, k] + lift * out[3 + k]
+        height += (p[k] - out[k]) * out[3 + k]
+        distance += (p[k] - out[k]) ** 2
+    out[6] = height if near else sqrt(distance)
+    out[7] = weights[0] * fields[a, 1] + weights[1] * fields[b, 1] + weights[2] * fields[c, 1]
 
 
 @compiled

@@ -80,7 +80,8 @@ class Tissue:
         self._strain = np.zeros(n)
         advance = -self._h * self.mechanics.stiffness
         advance.data /= np.repeat(self.mechanics.damping, np.diff(advance.indptr))
-        self._advance = (advance.indptr.astype(np.uint32), advance.indices.astype(np.uint32), advance.data)
+        self._matrix = (advance.indptr.astype(np.uint32), advance.indices.astype(np.uint32), advance.data)
+        self._field = (*self._matrix, self.branches, self._decay, self._feed, self._strain)
         self._gain = self.mechanics.damping / self._h
         free = np.flatnonzero(~model.fixed)
         self._free = free
@@ -98,10 +99,10 @@ class Tissue:
 
     def _warm_up(self) -> None:
         """Compiles what steps call, on a field at rest, so that the first contact need not wait for it."""
-        kernel.relax(*self._advance, self.branches, self._strain, self.displacement)
+        kernel.relax(*self._matrix, self.branches, self._strain, self.displacement)
         kernel.remember(self.branches, self._decay, self._feed, self.displacement)
         empty = _Candidates([], np.zeros(3), 0.0, 0.0, np.zeros(0, np.uint32), np.zeros((0, 8)), np.zeros(0))
-        self._contact(empty, np.zeros(6))
+        self._press(empty, np.zeros(6))
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
@@ -141,9 +142,10 @@ class Tissue:
         """Advances by one period to time `t_s` [s] with no sphere anywhere."""
         for k in range(1, self.substeps + 1):
             self._excursion = self.excursion(t_s - self.dt * (1 - k / self.substeps))
-            self._relax()
             self._no_contact()
-            self._remember()
+            if self.disturbed:
+                kernel.relax(*self._matrix, self.branches, self._strain, self.displacement)
+                kernel.remember(self.branches, self._decay, self._feed, self.displacement)
 
     def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
         """One explicit step; `wrench` (6,) gets force [N] and torque [N m] on the sphere, and is left alone out of contact."""
@@ -151,26 +153,17 @@ class Tissue:
         near = self._candidates
         if near is None or radius != near.radius or math.dist(p, near.origin) > near.reach:
             near = self._gather(p, radius)
-        self._relax()
-        if len(near.index) and self._contact(near, wrench):
+        if self._press(near, wrench):
             self.touching = self.disturbed = True
         else:
             self._no_contact()
-        self._remember()
 
-    def _relax(self) -> None:
-        """The field as it moves by itself: u += -h C^-1 K (u - sum y). A surface never touched is at rest exactly."""
-        if self.disturbed:
-            kernel.relax(*self._advance, self.branches, self._strain, self.displacement)
-
-    def _remember(self) -> None:
-        """The Prony branches: exact for a displacement that is held over the step."""
-        if self.disturbed:
-            kernel.remember(self.branches, self._decay, self._feed, self.displacement)
-
-    def _contact(self, near: _Candidates, wrench: Array) -> bool:
-        """Holds the vertices under the sphere on it; `wrench` (6,) gets what that takes. False where it touches nothing."""
-        return kernel.contact(
+    def _press(self, near: _Candidates, wrench: Array) -> bool:
+        """The compiled step; `wrench` (6,) gets what holding the vertices under the sphere takes. False where none is touched."""
+        return kernel.step(
+            *self._field,
+            self.displacement,
+            self.disturbed,
             near.index,
             near.vertices,
             near.zero,
@@ -178,7 +171,6 @@ class Tissue:
             near.radius,
             _RIM,
             self._excursion,
-            self.displacement,
             near.force,
             self.friction.bristle,
             self._rub,
