@@ -7,8 +7,11 @@ damp the joints, without any stiffness: tissue that is pressed pushes the arm aw
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import repeat
+from operator import add, le, sub
 from typing import Final
 
 import numpy as np
@@ -37,6 +40,9 @@ _LIMITS: Final = tuple(
         strict=True,
     )
 )
+_POSITION_LIMIT: Final = tuple(lbr.POSITION_LIMIT.tolist())
+_VELOCITY_LIMIT: Final = tuple(lbr.VELOCITY_LIMIT.tolist())
+_TORQUE_LIMIT: Final = tuple(lbr.TORQUE_LIMIT.tolist())
 _ZERO: Final = np.zeros(7)
 _ZERO.setflags(write=False)
 
@@ -149,7 +155,10 @@ class Driver:
         return np.asarray(np.minimum(wanted, np.maximum(room, 0.0) / np.maximum(np.abs(v), 1e-9)))
 
     def _check_joints(self, t: int, q: Array, v: Array) -> None:
-        for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, q.tolist(), v.tolist(), strict=True):
+        positions, velocities = q.tolist(), v.tolist()
+        if _within(positions, _POSITION_LIMIT) and _within(velocities, _VELOCITY_LIMIT):
+            return
+        for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, positions, velocities, strict=True):
             if not -q_max <= q_i <= q_max:
                 self.hold(t, Cause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limit +-{q_max:.4f} rad")
             elif not -v_max <= v_i <= v_max:
@@ -178,12 +187,15 @@ class Driver:
         if command.stamp > t + AHEAD:
             self._reject(t, Cause.INVALID_COMMAND, f"control stamps its command {(command.stamp - t) / 1e6:.0f} ms ahead")
             return
-        torques = command.torque.tolist()
+        torques, weights = command.torque.tolist(), gravity.tolist()
         before, apart = self._before or torques, 1.0
         if self._judged is not None:
             apart = max((command.stamp - self._judged.stamp) / 1e6, 1.0)
         change = TORQUE_RATE * apart
-        for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, torques, before, gravity.tolist(), strict=True):
+        if _within(map(add, torques, weights), _TORQUE_LIMIT) and _within(map(sub, torques, before), repeat(change)):
+            self._before = torques
+            return
+        for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, torques, before, weights, strict=True):
             if torque - torque != 0.0:  # NaN or infinite
                 self._reject(t, Cause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
                 return
@@ -195,8 +207,12 @@ class Driver:
                 text = f"control commands {joint} {torque:.1f} N m after {last:.1f} N m, {apart:.0f} ms apart"
                 self._reject(t, Cause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
                 return
-        self._before = torques
 
     def _reject(self, t: int, cause: Cause, reason: str) -> None:
         self.rejected += 1
         self.hold(t, cause, reason)
+
+
+def _within(values: Iterable[float], limits: Iterable[float]) -> bool:
+    """Whether every value is finite and at most its limit in size."""
+    return all(map(le, map(abs, values), limits))

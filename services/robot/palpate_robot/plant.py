@@ -32,6 +32,7 @@ from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY,
 
 LEAST_CLEARANCE_RAD: Final = 0.01
 """Closer than this, in angle, DART looks for contacts: far more than a step turns."""
+_WORLD: Final = dart.dynamics.Frame.World()
 _FORCE_FIRST: Final = np.array((3, 4, 5, 0, 1, 2))
 """Order of a wrench's parts where the engine's has the moment first."""
 LOOK_EVERY: Final = 20
@@ -164,7 +165,8 @@ class Plant:
             arm.integrateVelocities(DT)
             arm.integratePositions(DT)
             arm.clearInternalForces()
-            arm.clearExternalForces()
+            if force_W is not None:
+                arm.clearExternalForces()
         else:
             self._world.step()  # clears torques and external forces, too
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
@@ -203,16 +205,17 @@ class Plant:
 
     def tool_pose(self) -> tuple[Array, Any]:
         """Position p_WI [m], shape (3,), and orientation (DART quaternion) of the indenter in world."""
-        X_WI = self._indenter.getWorldTransform()
+        X_WI = self._indenter.getTransform()  # in world; dartpy takes three times as long over `getWorldTransform`
         return X_WI.translation(), X_WI.quaternion()
 
     def tool_twist(self) -> tuple[Array, Array]:
         """Linear velocity [m/s] of the sphere's centre and angular velocity [rad/s], world axes, shapes (3,)."""
-        return self._indenter.getLinearVelocity(), self._indenter.getAngularVelocity()
+        V_WI = self._indenter.getSpatialVelocity(_WORLD, _WORLD)
+        return V_WI[3:], V_WI[:3]
 
     def link_pose(self, link: str) -> tuple[Array, Any]:
         """Position [m], shape (3,), and orientation (DART quaternion) of a link of `lbr.LINK_NAMES` in world."""
-        X_WL = self._links[link].getWorldTransform()
+        X_WL = self._links[link].getTransform()
         return X_WL.translation(), X_WL.quaternion()
 
     def contacts(self) -> int:

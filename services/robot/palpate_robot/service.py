@@ -200,7 +200,7 @@ class RobotService(Service):
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
-        q, v, reading = (np.add.reduce(rows) / len(rows) for rows in self._recent)
+        q, v, reading = (np.add.reduce(np.concatenate(rows).reshape(len(rows), -1)) / len(rows) for rows in self._recent)
         for rows in self._recent:
             rows.clear()
         return _RobotStatus(
