@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
+from math import lcm
 from typing import Any
 
 from palpate_bus.contract import MS, Contract, Topic, contract
@@ -55,7 +56,7 @@ class Composed:
             for sender in self.steppers.values()
             for name, port in sender.ports.items()
         }
-        self._schedule = tuple((stepper, stepper.role.period) for stepper in self.steppers.values())
+        self._schedule = _schedule(tuple(self.steppers.values()))
         self._started = False
         self.t = 0
         self.lost: dict[str, int] = {}
@@ -88,16 +89,14 @@ class Composed:
     def tick(self) -> None:
         """Steps every service whose tick this is, then advances simulated time by a millisecond."""
         t = self.t
-        for stepper, period in self._schedule:
-            if t % period:
-                continue
+        for stepper in self._schedule[t // MS % len(self._schedule)]:
             try:
                 sent = stepper.step(t)
             except Exception as error:
                 if not stepper.role.observer or stepper.role.name == CONDUCTOR:
                     raise ServiceFailed(stepper, t, error) from error
-                self._schedule = tuple(entry for entry in self._schedule if entry[0] is not stepper)
                 self._leave_out(stepper.role.name, t, failure(error, stepper.buffers.values()))
+                self._schedule = _schedule(tuple(one for role, one in self.steppers.items() if role not in self.lost))
                 continue
             if sent:
                 self._send(sent, t)
@@ -137,3 +136,9 @@ class Composed:
         for stepper in self.steppers.values():
             digests.update(stepper.digests())
         return digests
+
+
+def _schedule(steppers: Sequence[Stepper]) -> tuple[tuple[Stepper, ...], ...]:
+    """Who steps at each tick of a cycle, after which it is the same again."""
+    cycle = lcm(*(stepper.role.period // MS for stepper in steppers))
+    return tuple(tuple(one for one in steppers if not tick * MS % one.role.period) for tick in range(cycle))

@@ -76,8 +76,8 @@ class RobotService(Service):
         self._moment_W = np.zeros(3)
         self._pressed = False
         self._applied: Array = np.zeros(7)  # never written to: messages keep it
-        self._recent: tuple[list[Array], list[Array], list[Array]] = ([], [], [])
-        """Positions, velocities and F/T readings since the last status."""
+        self._recent: list[Array] = []
+        """Positions, velocities and F/T reading of each tick since the last status."""
         self._external_force = 0.0
         self._peak_force = 0.0
 
@@ -177,14 +177,13 @@ class RobotService(Service):
             self._row = 0
         q, v = self._plant.q + self._q_noise[self._row], self._plant.v + self._v_noise[self._row]
         self._row += 1
-        self._recent[0].append(q)
-        self._recent[1].append(v)
+        self._recent += (q, v)
         return _JointState(_Header(stamp, ""), _NAMES, q, v, self._applied)
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
         reading = self._sensor.read(self._plant.sensor_wrench())
-        self._recent[2].append(reading)
+        self._recent.append(reading)
         fx, fy, fz, mx, my, mz = reading.tolist()
         weight = self._weight
         external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
@@ -200,17 +199,18 @@ class RobotService(Service):
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
-        q, v, reading = (np.add.reduce(np.concatenate(rows).reshape(len(rows), -1)) / len(rows) for rows in self._recent)
-        for rows in self._recent:
-            rows.clear()
+        ticks = len(self._recent) // 3
+        mean = np.add.reduce(np.concatenate(self._recent).reshape(ticks, -1)) / ticks
+        self._recent.clear()
+        fx, fy, fz, mx, my, mz = mean[14:].tolist()
         return _RobotStatus(
             _Header(stamp, ""),
             int(driver.mode),
             int(driver.cause),
             driver.reason,
-            q,
-            v,
-            _Wrench(_Vector3(*reading[:3].tolist()), _Vector3(*reading[3:].tolist())),
+            mean[:7],
+            mean[7:14],
+            _Wrench(_Vector3(fx, fy, fz), _Vector3(mx, my, mz)),
             self._applied,
             driver.rejected,
         )
