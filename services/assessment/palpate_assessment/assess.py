@@ -109,16 +109,16 @@ def surroundings(z: Array, observations: Observations, grid: MapGrid, healthy: F
     """
     level = np.full(z.size, float(np.quantile(z[scanned], 0.4)))
     H = observations.footprint
+    seen = healthy.factor(H)
+    sigma = seen @ seen.T + observations.covariance
     for _ in range(3):
         out = (z - level > np.log(CANDIDATE_RATIO)) & scanned
         wide = binary_dilation(out.reshape(grid.z.shape), iterations=max(1, round(0.005 / grid.pitch))).ravel()
         clear = H @ wide.astype(float) < 0.15
         if clear.sum() < 10:
             return level
-        rows = H[clear]
-        spread = healthy.times(rows)
-        sigma = spread @ rows.T + observations.covariance[np.ix_(clear, clear)]
-        level = mean + np.linalg.solve(sigma, observations.value[clear] - mean) @ spread
+        weights = np.linalg.solve(sigma[np.ix_(clear, clear)], observations.value[clear] - mean)
+        level = mean + healthy.unfold((weights @ seen[clear])[None])[0]
     return np.asarray(level)
 
 

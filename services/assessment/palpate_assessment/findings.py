@@ -91,7 +91,8 @@ def weigh(areas: list[Mask], posterior: Posterior, observations: Observations, h
     Under the healthy field, with the areas' log-modulus raised by c: shape (k,) and (k, k).
     """
     J = posterior.jacobian
-    sigma = healthy.times(J) @ J.T + observations.covariance
+    seen = healthy.factor(J)
+    sigma = seen @ seen.T + observations.covariance
     template = J @ np.array(areas, dtype=float).T
     weighted = cho_solve(cho_factor(sigma, lower=True), template)
     covariance = np.linalg.inv(template.T @ weighted)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyvander
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
@@ -12,6 +13,8 @@ Array = NDArray[np.float64]
 
 _DEGREE = 4
 """Degree of the polynomial that stands for the abdomen's shape: its curvature is that of the trunk, not of the noise."""
+_POWER_X, _POWER_Y = np.array([(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]).T
+"""Exponents of its terms."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,7 @@ class MapGrid:
 
 
 def _terms(x: Array, y: Array) -> Array:
-    u, v = x / 0.1, y / 0.1
-    return np.stack([u**i * v**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=-1)
+    return np.asarray(polyvander(x / 0.1, _DEGREE)[..., _POWER_X] * polyvander(y / 0.1, _DEGREE)[..., _POWER_Y])
 
 
 def map_grid(surface: Array, centre: tuple[float, float], size: tuple[float, float], margin: float, pitch: float) -> MapGrid:

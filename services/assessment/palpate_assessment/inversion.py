@@ -60,13 +60,23 @@ class Noise:
         `steep`: d log F / d depth [1/m]; `squared_distance` of the samples [m^2], shape (m, m); `relative` force noise [1];
         `spread`: standard deviation of log k_w under each footprint [1].
         """
-        smooth = self.depth_smooth**2 * np.exp(-0.5 * squared_distance / self.depth_length**2) + self.depth_common**2
-        covariance = np.outer(steep, steep) * smooth + self.model_common**2
+        covariance = self.of_depth(steep, squared_distance) + self.of_model(squared_distance, relative, spread)
+        covariance[np.diag_indices(len(steep))] += (steep * self.depth_white) ** 2
+        return np.asarray(covariance)
+
+    def of_depth(self, steep: Array, squared_distance: Array) -> Array:
+        """The part of `covariance` that errors of depth make, but for the white one, which is on the diagonal alone."""
+        smooth = self.depth_smooth**2 * np.exp(squared_distance * (-0.5 / self.depth_length**2)) + self.depth_common**2
+        return np.asarray(np.outer(steep, steep) * smooth)
+
+    def of_model(self, squared_distance: Array, relative: Array, spread: Array) -> Array:
+        """The part of `covariance` that is not of depth: the contact model's errors and the noise of the force."""
+        covariance = np.full_like(squared_distance, self.model_common**2)
         if spread.any():
             edge = self.model_edge * spread
-            covariance += np.outer(edge, edge) * np.exp(-0.5 * squared_distance / self.edge_length**2)
-        covariance[np.diag_indices(len(steep))] += (steep * self.depth_white) ** 2 + relative**2 + self.model_white**2
-        return np.asarray(covariance)
+            covariance += np.outer(edge, edge) * np.exp(squared_distance * (-0.5 / self.edge_length**2))
+        covariance[np.diag_indices(len(relative))] += relative**2 + self.model_white**2
+        return covariance
 
 
 @dataclass(frozen=True)
@@ -99,14 +109,24 @@ class Posterior:
 
     mean: Array
     """Shape (n,)."""
-    sd: Array
-    """Shape (n,)."""
     jacobian: Array
-    """df/dz at the mode, shape (m, n)."""
+    """J = df/dz at the mode, shape (m, n)."""
     residual: Array
     """Linearised data minus the prior's mean, y - f(z) + J (z - m), shape (m,)."""
     weights: Array
     """(J K J' + R)^-1 residual, shape (m,): a component's own posterior mean is its covariance times J' weights."""
+    prior: Field
+    """The field that was assumed."""
+    seen: Array
+    """J B with the prior's factor K = B B', shape (m, modes)."""
+    triangle: Array
+    """Lower Cholesky factor of J K J' + R, shape (m, m); above the diagonal it is anything."""
+
+    @cached_property
+    def sd(self) -> Array:
+        """Shape (n,). It costs as much as an iteration, and only a map that is shown wants it."""
+        half = solve_triangular(self.triangle, self.prior.unfold(self.seen), lower=True, overwrite_b=True)
+        return np.asarray(np.sqrt(np.maximum(self.prior.variance - np.einsum("ij,ij->j", half, half), 1e-8)))
 
 
 def reference_force(samples: Sequence[Sample], contact: ReferenceContact, curvature: Array) -> Array:
@@ -147,17 +167,19 @@ def spread_under(footprint: Array, z: Array) -> Array:
 def footprints(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact) -> Array:
     """Weight of each node in each sample, shape (m, n), rows sum to 1: distances along the surface are taken in space."""
     centre = np.array([s.position for s in samples]) + contact.advance(np.array([s.velocity for s in samples]))
-    depth = np.array([s.depth for s in samples])
+    levels = np.round(np.clip([s.depth for s in samples], 0.002, 0.02) * 1000)
     distance = cdist(centre, grid.nodes)
-    rows = np.zeros_like(distance)
-    levels = np.round(np.clip(depth, 0.002, 0.02) * 1000)
+    near = np.flatnonzero(distance <= REACH)
+    sample, node = np.divmod(near, len(grid.area))
+    apart, deep = distance.ravel()[near], levels[sample]
+    weights = np.empty_like(apart)
     for level in np.unique(levels):
-        mine = levels == level
-        r, weight = contact.footprint(float(level) / 1000, grid.pitch)
-        rows[mine] = np.interp(distance[mine], r, weight)
-    rows[distance > REACH] = 0.0
-    rows *= grid.area
-    return np.asarray(rows / rows.sum(axis=1, keepdims=True))
+        mine = deep == level
+        weights[mine] = np.interp(apart[mine], *contact.footprint(float(level) / 1000, grid.pitch))
+    rows = np.zeros_like(distance)
+    rows.ravel()[near] = weights * grid.area[node]
+    rows /= rows.sum(axis=1, keepdims=True)
+    return rows
 
 
 def invert(observations: Observations, prior: Field, mean: float, start: Array | None = None, iterations: int = 6) -> Posterior:
@@ -165,22 +187,20 @@ def invert(observations: Observations, prior: Field, mean: float, start: Array |
     y, H = observations.value, observations.footprint
     z = np.full(H.shape[1], float(np.median(y))) if start is None else start
     for last in range(iterations):
-        power = H * np.exp(POWER * (z - z.max()))
-        total = power.sum(axis=1)
-        predicted = np.log(total) / POWER + z.max()
-        jacobian = power / total[:, None]
-        residual = y - predicted + jacobian @ (z - mean)
-        spread = prior.times(jacobian)
-        factor = cho_factor(spread @ jacobian.T + observations.covariance, lower=True)
-        weights = cho_solve(factor, residual)
-        step = mean + weights @ spread - z
+        power = np.exp(POWER * (z - z.max()))
+        total = H @ power
+        jacobian = H * power
+        jacobian /= total[:, None]
+        residual = y - (np.log(total) / POWER + z.max()) + jacobian @ (z - mean)
+        seen = prior.factor(jacobian)
+        triangle, _ = cho_factor(seen @ seen.T + observations.covariance, lower=True)
+        weights = cho_solve((triangle, True), residual)
+        step = mean + prior.times((weights @ jacobian)[None])[0] - z
         size = float(np.abs(step).max())
         z = z + step * min(1.0, 1.5 / max(size, 1e-9))
         if size < 0.02 and last:
             break
-    half = solve_triangular(factor[0], spread, lower=True)
-    variance = np.maximum(prior.variance - np.einsum("ij,ij->j", half, half), 1e-8)
-    return Posterior(z, np.sqrt(variance), jacobian, residual, weights)
+    return Posterior(z, jacobian, residual, weights, prior, seen, triangle)
 
 
 _SMOOTH = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
@@ -194,17 +214,20 @@ def estimate_noise(observations: Observations, posterior: Posterior, prior: Fiel
     Depth errors are told from stiffness by being rougher than the footprint lets a change of stiffness appear.
     What all samples share cannot be seen; half the perceived surface's own error is assumed, but not less than the default.
     """
-    J = posterior.jacobian
-    signal = prior.times(J) @ J.T
     o = observations
-    noise = chosen = o.noise
-    best = -np.inf
+    seen = prior.factor(posterior.jacobian)
+    rest = seen @ seen.T + o.noise.of_model(o.squared_distance, o.relative, o.spread)
+    diagonal = np.diag_indices(len(rest))
+    chosen, best = o.noise, -np.inf
     for smooth in _SMOOTH:
+        common = max(Noise.depth_common, 0.5e-3 * smooth)
+        correlated = replace(o.noise, depth_smooth=1e-3 * smooth, depth_white=0.0, depth_common=common)
+        covariance = rest + correlated.of_depth(o.steep, o.squared_distance)
+        without_white = covariance[diagonal]
         for white in _WHITE:
-            common = max(Noise.depth_common, 0.5e-3 * smooth)
-            tried = replace(noise, depth_smooth=1e-3 * smooth, depth_white=1e-3 * white, depth_common=common)
-            covariance = tried.covariance(o.steep, o.squared_distance, o.relative, o.spread)
-            half = cholesky(signal + covariance, lower=True)
+            tried = replace(correlated, depth_white=1e-3 * white)
+            covariance[diagonal] = without_white + (o.steep * tried.depth_white) ** 2
+            half = cholesky(covariance, lower=True)
             scaled = solve_triangular(half, posterior.residual, lower=True)
             evidence = -0.5 * float(scaled @ scaled) - float(np.log(np.diag(half)).sum())
             if evidence > best:

@@ -36,29 +36,29 @@ class PathMemory:
     def add(self, time: float, dt: float, position: Array, depth: float) -> None:
         """Notes that the indenter was at `position` [m], shape (3,), at `depth` [m], for `dt` seconds up to `time` [s]."""
         self._open.append((time - 0.5 * dt, dt, max(depth, 0.0), *position.tolist()))
-        if len(self._open) >= _SLICE:
-            self._close()
 
     def lost(self, time: float, position: Array) -> float:
         """Force over k_w [m^3] that memory takes from an indentation at `position` [m], shape (3,), at `time` [s]."""
-        self._close()
+        self._slice()
         slices = self._slices[: self._count]
         overlap = self._contact.overlap(np.linalg.norm(slices[:, 2:] - position, axis=1))
         age = np.maximum(time - slices[:, 0], 0.0)
         kernel = (self._g / self._tau) @ np.exp(-age / self._tau[:, None])
         return float(kernel @ (slices[:, 1] * overlap))
 
-    def _close(self) -> None:
+    def _slice(self) -> None:
+        """Gathers what was added since into slices; those without contact leave nothing."""
         if not self._open:
             return
         block = np.array(self._open)
         self._open.clear()
-        total = block.sum(axis=0)
-        time, _, depth, x, y, z = (total / len(block)).tolist()
-        if depth <= 0.0:
-            return
-        if self._count == len(self._slices):
-            self._slices = np.concatenate([self._slices, np.zeros_like(self._slices)])
-        impulse = float(self._contact.force(np.array(depth))) * float(total[1])
-        self._slices[self._count] = (time, impulse, x, y, z)
-        self._count += 1
+        first = np.arange(0, len(block), _SLICE)
+        total = np.add.reduceat(block, first)
+        mean = total / np.diff(first, append=len(block))[:, None]
+        impulse = self._contact.force(mean[:, 2]) * total[:, 1]
+        new = np.column_stack((mean[:, 0], impulse, mean[:, 3:]))[mean[:, 2] > 0.0]
+        end = self._count + len(new)
+        if end > len(self._slices):
+            self._slices = np.concatenate([self._slices, np.zeros((max(end, 1024), 5))])
+        self._slices[self._count : end] = new
+        self._count = end

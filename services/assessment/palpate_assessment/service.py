@@ -108,8 +108,8 @@ class AssessmentService(Service):
         p, n = message.surface_point, message.surface_normal
         return State(
             time=nanoseconds(message.header.stamp) / NS,
-            position=self._R_AW @ np.array((p.x, p.y, p.z)) + self._p_AW,
-            normal=self._R_AW @ np.array((n.x, n.y, n.z)),
+            position=self._R_AW.dot((p.x, p.y, p.z)) + self._p_AW,
+            normal=self._R_AW.dot((n.x, n.y, n.z)),
             depth=float(message.depth),
             force=float(message.normal_force),
             in_contact=bool(message.in_contact),
