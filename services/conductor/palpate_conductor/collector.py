@@ -45,9 +45,8 @@ class Collected:
     @property
     def end_tick(self) -> int | None:
         """The simulated time [ns] at which the run ends, None while planning has not decided it."""
-        if self.exam is None or self.exam.end_tick < 0:
-            return None
-        return int(self.exam.end_tick)
+        exam = self.exam
+        return None if exam is None or exam.end_tick < 0 else int(exam.end_tick)
 
 
 class Collector(Service):

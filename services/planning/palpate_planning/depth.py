@@ -13,7 +13,7 @@ with F_p = F + tau dF/dt the force expected when the command takes effect.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 EXPONENT = 1.45
 """Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
@@ -48,8 +48,7 @@ LIMITED_M = 0.0002
 """Yielding by more than this is reported."""
 
 
-@dataclass(frozen=True, slots=True)
-class Regulation:
+class Regulation(NamedTuple):
     """What the regulator asks for at one step."""
 
     depth: float

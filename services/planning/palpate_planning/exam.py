@@ -13,7 +13,7 @@ from palpate_planning import path
 from palpate_planning.follow import Follower
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.look import look_postures
-from palpate_planning.measure import ContactSense
+from palpate_planning.measure import ContactSense, Reading
 from palpate_planning.motion import NoPathError
 from palpate_planning.palpation import Doing, Palpation, Progress
 from palpate_planning.prepare import ExamPlan, Planner, Seen
@@ -46,6 +46,8 @@ END_AFTER = SECOND
 AT_HOME_RAD = 0.01
 PALPATING = frozenset({Phase.INDENT, Phase.SCAN, Phase.RETRACT})
 """Phases in which the strokes of the plan are carried out."""
+OVER = frozenset({Phase.DONE, Phase.ABORTED})
+"""Phases after which nothing comes."""
 
 
 class Exam:
@@ -55,10 +57,11 @@ class Exam:
         """`lockstep`: heavy planning takes exactly its simulated time; else at least, as long as it takes."""
         self._known = known
         self._lockstep = lockstep
-        path.compile_ahead()
         self._kinematics = Kinematics(known.robot, known.limits)
-        plane = Surface.plane(np.array(known.X_WA))
-        self._sense = ContactSense(self._kinematics, ToolWeight.of(known.robot), plane, known.robot.indenter_radius_m)
+        plane, weight, radius = Surface.plane(np.array(known.X_WA)), ToolWeight.of(known.robot), known.robot.indenter_radius_m
+        path.compile_ahead()
+        ContactSense(self._kinematics, weight, plane, radius).sense(Reading(np.zeros(7), np.zeros(6), np.zeros(7)))  # as well
+        self._sense = ContactSense(self._kinematics, weight, plane, radius)
         self._planner = Planner(known)
         self._looks = look_postures(known)
         self._follower = Follower(self._kinematics, np.array(lbr.HOME))
@@ -127,7 +130,7 @@ class Exam:
     def _enter(self, phase: Phase, t: int, message: str) -> None:
         self.status.phase, self.status.message = phase, message
         self._since = t
-        if phase in (Phase.DONE, Phase.ABORTED):
+        if phase in OVER:
             self.status.end_tick = t + END_AFTER
 
     def _abort(self, now: Observation, why: str) -> None:
@@ -140,7 +143,7 @@ class Exam:
     def _watch(self, now: Observation) -> None:
         """Holds the exam when it is stopped, ends it when a service that it needs is gone or an operator has had enough."""
         phase = self.status.phase
-        if phase in (Phase.DONE, Phase.ABORTED):
+        if phase in OVER:
             return
         if now.stop and phase is not Phase.HELD:
             self._hold(now)

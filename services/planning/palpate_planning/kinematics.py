@@ -12,6 +12,7 @@ from palpate_models.scenario import Limits, Robot
 
 Array = NDArray[np.float64]
 
+_WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 TOLERANCE_M = 1e-4
 """Position error at which inverse kinematics counts as solved."""
 TOLERANCE_RAD = 1e-3
@@ -38,6 +39,8 @@ class Kinematics:
         self.data = self.model.createData()
         self._indenter = self.model.getFrameId("indenter")
         self._sensor = self.model.getFrameId("ft_sensor")
+        self._R_WS: Array = self.data.oMf[self._sensor].rotation
+        """A view of what pinocchio has computed last."""
         self.upper: Array = lbr.POSITION_LIMIT - limits.joint_margin_rad
         """Highest joint positions that planning uses [rad], shape (7,); the lowest are their negatives."""
 
@@ -48,14 +51,16 @@ class Kinematics:
         return X_WI
 
     def poses(self, q: Array) -> tuple[Array, Array]:
-        """X_WI and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3)."""
-        X_WI = self.pose(q)
-        R_WS: Array = pin.updateFramePlacement(self.model, self.data, self._sensor).rotation.copy()
-        return X_WI, R_WS
+        """X_WI, column by column in memory, and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3)."""
+        model, data = self.model, self.data
+        pin.forwardKinematics(model, data, q)
+        X_WI: Array = pin.updateFramePlacement(model, data, self._indenter).homogeneous
+        pin.updateFramePlacement(model, data, self._sensor)
+        return X_WI, self._R_WS.copy()
 
     def jacobian(self, q: Array) -> Array:
         """J with V_WI_W = J qd, rows linear then angular, world axes, of the sphere's centre, shape (6, 7)."""
-        J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
 
     def within_limits(self, q: Array) -> bool:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from math import isnan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from palpate_models.compiled import compiled
 
 from palpate_planning.kinematics import Kinematics
-from palpate_planning.surface import Surface
+from palpate_planning.surface import Surface, foot
 from palpate_planning.timing import PERIOD_S
-from palpate_planning.weight import ToolWeight
+from palpate_planning.weight import ToolWeight, external
 
 Array = NDArray[np.float64]
 
@@ -19,8 +21,7 @@ CONTACT_ON_N = 0.15
 CONTACT_OFF_N = 0.08
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """Sensor values averaged over one planning period, so that force and depth belong together."""
 
     q: Array
@@ -31,8 +32,7 @@ class Reading:
     """Joint velocities [rad/s], shape (7,)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Contact:
+class Contact(NamedTuple):
     """Measured contact."""
 
     X_WI: Array
@@ -56,15 +56,53 @@ class ContactSense:
         self.weight = weight
         self._kinematics, self._radius = kinematics, radius
         self._touching = False
-        self._velocity: Array | None = None
+        self._velocity: Array = np.full(3, np.nan)
+        """Of the sphere's centre at the reading before [m/s], world axes, shape (3,); NaN before the first."""
 
     def sense(self, reading: Reading) -> Contact:
         """The contact at a reading."""
-        X_WI, R_WS = self._kinematics.poses(reading.q)
-        p_W, n_W, distance = self.surface.nearest(X_WI[:3, 3])
-        velocity = (self._kinematics.jacobian(reading.q) @ reading.qd)[:3]
-        acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / PERIOD_S
-        self._velocity = velocity
-        force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ n_W)
+        q, wrench_S, qd = reading
+        kinematics, surface, weight = self._kinematics, self.surface, self.weight
+        X_WI, R_WS = kinematics.poses(q)
+        p_W, n_W, field = np.empty(3), np.empty(3), surface.field
+        distance, force = _press(
+            X_WI, surface.frames, field.axes, field.coefficients, surface.offset,
+            kinematics.jacobian(q), qd, R_WS, wrench_S, weight.bias, weight.weight_W, weight.mass, self._velocity, p_W, n_W,
+        )  # fmt: skip
         self._touching = force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
         return Contact(X_WI, R_WS, p_W, n_W, self._radius - distance, force, self._touching)
+
+
+@compiled
+def _press(
+    X_WI: Array,
+    frames: Array,
+    axes: Array,
+    coefficients: Array,
+    offset: float,
+    J: Array,
+    qd: Array,
+    R_WS: Array,
+    wrench_S: Array,
+    bias_S: Array,
+    weight_W: Array,
+    mass: float,
+    velocity: Array,
+    p_W: Array,
+    n_W: Array,
+) -> tuple[float, float]:
+    """Signed distance [m] of the centre from the surface, as `foot` has it, and normal force [N], as `external` has it.
+
+    `velocity` of the centre a period before [m/s], world axes, shape (3,), NaN for none, becomes that of now; p_W and n_W are
+    filled in.
+    """
+    c_W = np.array((X_WI[0, 3], X_WI[1, 3], X_WI[2, 3]))
+    distance = foot(frames, axes, coefficients, offset, c_W, p_W, n_W)
+    V_WI = J @ qd
+    a_W = np.zeros(3)
+    for i in range(3):
+        if not isnan(velocity[i]):
+            a_W[i] = (V_WI[i] - velocity[i]) / PERIOD_S
+        velocity[i] = V_WI[i]
+    force = external(R_WS, wrench_S, bias_S, weight_W, mass, a_W)
+    return distance, float(force @ n_W)

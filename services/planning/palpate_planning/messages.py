@@ -25,22 +25,24 @@ _Vector3: Any = message_type("geometry_msgs/msg/Vector3")
 _Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
 _Twist: Any = message_type("geometry_msgs/msg/Twist")
 _Wrench: Any = message_type("geometry_msgs/msg/Wrench")
+_NO_MOMENT: Any = _Vector3(0.0, 0.0, 0.0)
 
 
 def pose_message(X_WI: Array) -> Message:
     """`geometry_msgs/Pose` of a homogeneous matrix."""
-    return _Pose(_Point(*X_WI[:3, 3].tolist()), _Quaternion(*quaternion(X_WI[:3, :3].tolist())))
+    (xx, xy, xz, x), (yx, yy, yz, y), (zx, zy, zz, z), _ = X_WI.tolist()
+    return _Pose(_Point(x, y, z), _Quaternion(*quaternion(((xx, xy, xz), (yx, yy, yz), (zx, zy, zz)))))
 
 
 def setpoint_message(t: int, setpoint: Setpoint, valid_for: Message) -> Message:
     """`palpation_msgs/ImpedanceSetpoint` that holds at `t` [ns]."""
-    V = setpoint.V_WI.tolist()
+    vx, vy, vz, wx, wy, wz = setpoint.V_WI.tolist()
     return ImpedanceSetpoint(
         header=header(t, "world"),
         mode=int(setpoint.mode),
         pose=pose_message(setpoint.X_WI),
-        twist=_Twist(_Vector3(*V[:3]), _Vector3(*V[3:])),
-        wrench=_Wrench(_Vector3(*setpoint.F_W.tolist()), _Vector3(0.0, 0.0, 0.0)),
+        twist=_Twist(_Vector3(vx, vy, vz), _Vector3(wx, wy, wz)),
+        wrench=_Wrench(_Vector3(*setpoint.F_W.tolist()), _NO_MOMENT),
         stiffness=setpoint.stiffness,
         damping_ratio=DAMPING_RATIO,
         joint_position=setpoint.q,

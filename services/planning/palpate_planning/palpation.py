@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
 from palpate_planning.legs import HOVER_M, Leg
 from palpate_planning.measure import Contact
 from palpate_planning.onset import OnsetEstimator
-from palpate_planning.poses import centre, pose
+from palpate_planning.poses import centre
 from palpate_planning.setpoint import NORMAL_STIFFNESS, ControlMode, Setpoint
 from palpate_planning.timing import PERIOD_S, Axis
 
@@ -67,8 +67,12 @@ class Doing(Enum):
     DONE = "done"
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
+PRESSING: Final = (Doing.SLIDE, Doing.HOLD, Doing.SETTLE, Doing.DESCEND)
+"""Parts of a stroke in which the tissue is pressed, or is about to be."""
+AT_DEPTH: Final = (Doing.SLIDE, Doing.HOLD, Doing.SETTLE)
+
+
+class Progress(NamedTuple):
     """What a step of the palpation did."""
 
     setpoint: Setpoint
@@ -106,7 +110,7 @@ class Aside:
 
     def stand(self) -> None:
         """Stays where it is."""
-        self._length.velocity = self._length.acceleration = 0.0
+        self._length.stand()
 
 
 class Palpation:
@@ -143,7 +147,7 @@ class Palpation:
             self._k -= 1
             self._enter(Doing.DONE)
             return
-        leg = self._legs[self._k]
+        leg = self._leg = self._legs[self._k]
         speed = self._exam.speed_mps if leg.contact else TRANSFER_MPS
         self._limit = leg.path.speed_limit(speed, self._limits)
         self._free_step = 0.0
@@ -157,9 +161,7 @@ class Palpation:
 
     @property
     def _target(self) -> int:
-        path = self._legs[self._k].path
-        i = int(path.visits.searchsorted(self._s.position + 1e-6, side="right")) - 1
-        return int(path.targets[max(i, 0)])
+        return self._leg.path.target(self._s.position + 1e-6)
 
     @property
     def _height(self) -> float:
@@ -179,7 +181,7 @@ class Palpation:
     @property
     def free_goal(self) -> Array | None:
         """Where the free motion under way ends [rad], shape (7,); None on a path."""
-        free = self._legs[self._k].free
+        free = self._leg.free
         return None if free is None or self.failed or self.doing is Doing.DONE else np.asarray(free.q[-1])
 
     def arrive(self) -> None:
@@ -189,9 +191,9 @@ class Palpation:
     def pause(self) -> None:
         """Lifts off along the normal and waits there; `resume` comes back to where it was."""
         self._paused = True
-        if self.doing in (Doing.DESCEND, Doing.SETTLE, Doing.SLIDE, Doing.HOLD):
+        if self.doing in PRESSING:
             braking = self._s.velocity**2 / 0.3
-            self._resume = min(self._s.position + braking, self._legs[self._k].path.length)
+            self._resume = min(self._s.position + braking, self._leg.path.length)
             self._enter(Doing.LIFT)
 
     def resume(self, contact: Contact) -> None:
@@ -200,15 +202,15 @@ class Palpation:
         Sideways too: what is on the path may be deep in the tissue, and the arm is not to be drawn through it.
         """
         self._paused = False
-        path = self._legs[self._k].path
-        if self._legs[self._k].free is None:
+        path = self._leg.path
+        if self._leg.free is None:
             place = path.at(self._s.position)
             gap = contact.X_WI[:3, 3] - place.p
             aside = float(np.linalg.norm(gap - (gap @ place.n) * place.n))
             if aside > MOVED_M:
                 self.abandon(f"the arm was moved {aside * 1e3:.0f} mm aside while it was held")
             self._depth = Axis(contact.depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05)
-            self._s = Axis(self._s.position, 0.2 if self._legs[self._k].contact else 0.8, 8.0)
+            self._s = Axis(self._s.position, 0.2 if self._leg.contact else 0.8, 8.0)
             self._regulator.reset(contact.depth)
             gap = contact.X_WI[:3, 3] - centre(place.p, place.n, self._radius + self.offset, contact.depth)
             self._aside = Aside(gap) if float(np.linalg.norm(gap)) > UNMOVED_M else None
@@ -217,40 +219,33 @@ class Palpation:
         """One planning period on, given the measured contact; free motions go on by `rate` samples, see `Pace`."""
         self._time += PERIOD_S
         self._rate = rate
-        self._come_back(contact)
-        if contact.force > self._limits.force_soft_stop_n and self.doing in (
-            Doing.DESCEND,
-            Doing.SETTLE,
-            Doing.SLIDE,
-            Doing.HOLD,
-        ):
+        if self._aside is not None:
+            self._come_back(self._aside, contact)
+        if contact.force > self._limits.force_soft_stop_n and self.doing in PRESSING:
             self._soft_stop(contact.force)
-        if self.doing is Doing.DESCEND:
-            self._descend(contact)
-        elif self.doing is Doing.SETTLE:
-            self._settle(contact)
-        elif self.doing is Doing.SLIDE:
+        if self.doing is Doing.SLIDE:
             self._slide()
-        elif self.doing is Doing.HOLD:
-            if self._time >= HOLD_S:
-                self._enter(Doing.LIFT)
         elif self.doing is Doing.LIFT:
             self._lift()
         elif self.doing is Doing.TRANSFER:
             self._transfer()
+        elif self.doing is Doing.DESCEND:
+            self._descend(contact)
+        elif self.doing is Doing.SETTLE:
+            self._settle(contact)
+        elif self.doing is Doing.HOLD and self._time >= HOLD_S:
+            self._enter(Doing.LIFT)
         lifting = self.doing is Doing.LIFT
         self._regulation = self._regulator.update(
             self._depth.position, contact.depth, contact.force, contact.touching and not lifting
         )
         return self._progress(contact)
 
-    def _come_back(self, contact: Contact) -> None:
+    def _come_back(self, aside: Aside, contact: Contact) -> None:
         """An arm that was pushed aside goes back over its path when it is clear of the skin, unless this is given up."""
-        if self._aside is None:
-            return
         if self.failed or self._paused or contact.depth > -CLEAR_M:
-            self._aside.stand()
-        elif self._aside.fade():
+            aside.stand()
+        elif aside.fade():
             self._aside = None
 
     def _slow_down(self, full: float, none: float, floor: float) -> float:
@@ -280,7 +275,7 @@ class Palpation:
     def _shift(self, onset: float) -> None:
         """Counts depth from where force set in; the commanded position stays where it is."""
         self.offset -= onset
-        self._depth.position -= onset
+        self._depth.shift(-onset)
         self._regulator.shift(-onset)
 
     def _deeper(self) -> bool:
@@ -292,11 +287,11 @@ class Palpation:
         near = abs(self._regulation.reference - contact.depth) < SETTLED_M
         self._settled = self._settled + PERIOD_S if near else 0.0
         if self._settled >= SETTLED_S or self._time >= SETTLE_MAX_S:
-            self._enter(Doing.SLIDE if self._legs[self._k].path.length > 0 else Doing.HOLD)
+            self._enter(Doing.SLIDE if self._leg.path.length > 0 else Doing.HOLD)
 
     def _slide(self) -> None:
         self._deeper()
-        path = self._legs[self._k].path
+        path = self._leg.path
         allowed = self._limit.at(self._s.position + self._s.velocity * PERIOD_S)
         if self._s.step(path.length, max(allowed * self._slow_down(1.0, 1.1, 0.3), 1e-3)):
             self._enter(Doing.LIFT)
@@ -319,7 +314,7 @@ class Palpation:
         if self._paused:
             self._s.step(self._s.position + self._s.velocity**2 / 1.2, max(self._s.velocity, 1e-3))
             return
-        free = self._legs[self._k].free
+        free = self._leg.free
         if free is not None:
             self._free_step = min(self._free_step + self._rate, len(free) - 1.0)
             if self._free_step >= len(free) - 1:
@@ -328,7 +323,7 @@ class Palpation:
         if self._aside is not None:
             self._depth.step(min(-HOP_M, self._depth.position), LIFT_MPS)
             return
-        path = self._legs[self._k].path
+        path = self._leg.path
         goal = path.length if self._resume is None else self._resume
         if not self._s.step(goal, max(self._limit.at(self._s.position), 1e-3)):
             return
@@ -340,7 +335,7 @@ class Palpation:
 
     def _soft_stop(self, force: float) -> None:
         """Retreats along the normal and passes over the targets nearby; the third time it gives up."""
-        path = self._legs[self._k].path
+        path = self._leg.path
         self._soft_stops += 1
         why = f"soft stop at {force:.1f} N, limit {self._limits.force_soft_stop_n:g} N"
         here = self._s.position
@@ -355,28 +350,19 @@ class Palpation:
     # --- set-points ---------------------------------------------------------------------------------------------------
 
     def _progress(self, contact: Contact) -> Progress:
-        leg = self._legs[self._k]
+        leg, regulation = self._leg, self._regulation
         if leg.free is not None:
             q, qd = leg.free.at(self._free_step)
             setpoint = Setpoint(ControlMode.JOINT, contact.X_WI, q, qd=self._rate * qd)
             return Progress(setpoint, self.doing, -HOVER_M, False, False, int(leg.path.targets[-1]))
-        place = self._legs[self._k].path.at(self._s.position)
-        rate, regulation = self._s.velocity, self._regulation
+        rate = self._s.velocity
         arm = self._radius + self.offset - regulation.depth
-        linear = (place.dp + place.dn * arm) * rate - place.n * regulation.rate
-        p_W = place.p + place.n * arm  # as `centre` has it
+        setpoint = leg.path.setpoint(self._s.position, rate, arm, regulation.rate, regulation.force)
         if self._aside is not None:
-            p_W, linear = p_W + self._aside.offset, linear + self._aside.velocity
-        setpoint = Setpoint(
-            ControlMode.CARTESIAN,
-            pose(place.R, p_W),
-            place.q,
-            np.concatenate((linear, place.w * rate)),
-            -place.n * regulation.force,
-            place.dq * rate,
-        )
-        at_depth = self.doing in (Doing.SETTLE, Doing.SLIDE, Doing.HOLD)
-        limited = regulation.limited or (at_depth and self._depth.position < self._exam.depth_m - LIMITED_M)
+            setpoint.X_WI[:3, 3] += self._aside.offset
+            setpoint.V_WI[:3] += self._aside.velocity
+        deep_enough = self._depth.position >= self._exam.depth_m - LIMITED_M
+        limited = regulation.limited or (not deep_enough and self.doing in AT_DEPTH)
         fast = rate >= STEADY_FRACTION * self._exam.speed_mps or limited
         steady = contact.touching and (self.doing is Doing.HOLD or (self.doing is Doing.SLIDE and fast))
         return Progress(setpoint, self.doing, regulation.reference, steady, limited, self._target)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_right
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from palpate_models.scenario import Limits
 
 from palpate_planning.curve import Curve, polynomial_at
 from palpate_planning.poses import angular_velocity, frame, least_twist
+from palpate_planning.setpoint import ControlMode, Setpoint
 from palpate_planning.surface import Surface
 from palpate_planning.timing import SpeedLimit
 
@@ -29,8 +31,7 @@ _STEP_M = 1e-4
 """Over which the turn of the orientation is taken."""
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(NamedTuple):
     """Where a path is at one position along it. World frame; derivatives by path length."""
 
     p: Array
@@ -59,18 +60,38 @@ class SurfacePath:
         self.s, self.p, self.n, self.R, self.q = s, p, n, R, q
         self.targets, self.visits = targets, s[visits]
         self.length = float(s[-1])
-        if len(s) > 1:
-            self._curve = Curve(s, np.hstack((p, n, R[:, :, 0], q)))
+        self._order: tuple[list[float], list[int]] = self.visits.tolist(), targets.tolist()
+        still = (np.zeros(3), np.zeros(3), np.zeros(3), q[0].copy(), np.zeros(7))
+        self._start = Place(p[0].copy(), n[0].copy(), R[0].copy(), *still)
+        if self.length:
+            curve = Curve(s, np.hstack((p, n, R[:, :, 0], q)))
+            self._curve = curve.knots, curve.cubics, curve.tangents
 
     def at(self, s: float) -> Place:
         """The place at path length s, clipped to the path."""
         if self.length == 0.0:
-            zero = np.zeros(3)
-            return Place(self.p[0], self.n[0], self.R[0], zero, zero, zero, self.q[0], np.zeros(7))
-        curve = self._curve
+            return self._start
         y, dy, R, w = np.empty(16), np.empty(16), np.empty((3, 3)), np.empty(3)
-        _along(curve.knots, curve.cubics, curve.tangents, min(max(s, 0.0), self.length), y, dy, R, w)
+        _along(*self._curve, min(max(s, 0.0), self.length), y, dy, R, w)
         return Place(y[:3], -R[:, 2], R, dy[:3], dy[3:6], w, y[9:], dy[9:])
+
+    def setpoint(self, s: float, rate: float, arm: float, sinking: float, push: float) -> Setpoint:
+        """The Cartesian set-point at path length s, which grows at `rate` [m/s].
+
+        The sphere's centre is to be `arm` [m] from the surface and to come nearer to it at `sinking` [m/s]; `push` [N] is the
+        feed-forward force into the tissue.
+        """
+        X_WI, V_WI, F_W, q, qd = np.empty((4, 4)), np.empty(6), np.empty(3), np.empty(7), np.empty(7)
+        if self.length == 0.0:
+            _ask(*self._start, rate, arm, sinking, push, X_WI, V_WI, F_W, q, qd)
+        else:
+            _ask_along(*self._curve, min(max(s, 0.0), self.length), rate, arm, sinking, push, X_WI, V_WI, F_W, q, qd)
+        return Setpoint(ControlMode.CARTESIAN, X_WI, q, V_WI, F_W, qd)
+
+    def target(self, s: float) -> int:
+        """Index of the target reached last at path length s, of the first before that."""
+        visits, targets = self._order
+        return targets[max(bisect_right(visits, s) - 1, 0)]
 
     def speed_limit(self, speed: float, limits: Limits) -> SpeedLimit:
         """Speed along the path [m/s]: `speed` [m/s], less in tight curves, where the tool turns or joints would race."""
@@ -96,6 +117,8 @@ def compile_ahead() -> None:
     ends, s, normals = np.arange(2), np.array((0.0, 1.0)), np.tile((0.0, 0.0, 1.0), (2, 1))
     path = SurfacePath(s, np.eye(2, 3), normals, np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 7)), ends, ends)
     path.at(0.5)
+    path.setpoint(0.5, 0.0, 0.0, 0.0, 0.0)
+    SurfacePath(s[:1], path.p[:1], path.n[:1], path.R[:1], path.q[:1], ends[:1], ends[:1]).setpoint(0.0, 0.0, 0.0, 0.0, 0.0)
     Surface.plane(np.eye(4)).nearest(np.zeros(3))
 
 
@@ -110,6 +133,61 @@ def _along(knots: Array, cubics: Array, tangents: Array, s: float, y: Array, dy:
     turn = angular_velocity(R, ahead, _STEP_M)
     for i in range(3):
         w[i] = turn[i]
+
+
+@compiled
+def _ask(
+    p: Array,
+    n: Array,
+    R: Array,
+    dp: Array,
+    dn: Array,
+    w: Array,
+    q: Array,
+    dq: Array,
+    rate: float,
+    arm: float,
+    sinking: float,
+    push: float,
+    X_WI: Array,
+    V_WI: Array,
+    F_W: Array,
+    q_asked: Array,
+    qd: Array,
+) -> None:
+    """`SurfacePath.setpoint` of a `Place`: fills in X_WI (4, 4), V_WI (6,), F_W (3,), posture (7,) and its velocity (7,)."""
+    X_WI[3, :3] = 0.0
+    X_WI[3, 3] = 1.0
+    for i in range(3):
+        X_WI[i, :3] = R[i]
+        X_WI[i, 3] = p[i] + n[i] * arm  # as `centre` has it
+        V_WI[i] = (dp[i] + dn[i] * arm) * rate - n[i] * sinking
+        V_WI[3 + i] = w[i] * rate
+        F_W[i] = -n[i] * push
+    for i in range(7):
+        q_asked[i], qd[i] = q[i], dq[i] * rate
+
+
+@compiled
+def _ask_along(
+    knots: Array,
+    cubics: Array,
+    tangents: Array,
+    s: float,
+    rate: float,
+    arm: float,
+    sinking: float,
+    push: float,
+    X_WI: Array,
+    V_WI: Array,
+    F_W: Array,
+    q: Array,
+    qd: Array,
+) -> None:
+    """`SurfacePath.setpoint` at s of a curve as `_along` takes it: fills in what `_ask` does."""
+    y, dy, R, w = np.empty(16), np.empty(16), np.empty((3, 3)), np.empty(3)
+    _along(knots, cubics, tangents, s, y, dy, R, w)
+    _ask(y[:3], -R[:, 2], R, dy[:3], dy[3:6], w, y[9:], dy[9:], rate, arm, sinking, push, X_WI, V_WI, F_W, q, qd)
 
 
 @compiled

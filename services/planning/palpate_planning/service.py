@@ -37,6 +37,8 @@ NEEDED = ("robot", "assessment", "supervisor")
 """Roles whose loss ends the exam, whatever its phase."""
 NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
 """Roles whose loss ends it until the targets are there."""
+SEEING = frozenset({Phase.HOME, Phase.LOOK})
+"""Phases in which they are not."""
 
 
 class PlanningService(Service):
@@ -58,9 +60,11 @@ class PlanningService(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One planning period: what is measured, what the exam makes of it, what is to be done."""
-        self._read(inbox)
+        status = inbox.latest("robot/status")
+        if status is not None:
+            self._read(status)
         requests = tuple(inbox.new("operator/request"))
-        stop, soft = _stop(inbox, requests)
+        stop, soft = _stop(status, inbox.latest("supervisor/state"), requests)
         outcome = self._exam.step(
             Observation(
                 t=t,
@@ -99,17 +103,14 @@ class PlanningService(Service):
             "surface_offset_m": self._exam.surface_offset,
         }
 
-    def _read(self, inbox: Inbox) -> None:
+    def _read(self, status: Message) -> None:
         """Joint positions and wrench as the robot averages them over a period: force and depth of the same moment."""
-        status = inbox.latest("robot/status")
-        if status is None:
-            return
         force, moment = status.wrench.force, status.wrench.torque
         wrench = (force.x, force.y, force.z, moment.x, moment.y, moment.z)
         if not all(map(isfinite, (*status.position.tolist(), *status.velocity.tolist(), *wrench))):
             self._unreadable += 1  # nothing to go by: the supervisor stops the arm, the last reading stands until then
             return
-        self._reading = Reading(np.array(status.position), np.array(wrench), np.array(status.velocity))
+        self._reading = Reading(status.position.copy(), np.array(wrench), status.velocity.copy())
 
     def _perceived(self, inbox: Inbox) -> Seen | Unseen | None:
         """Perception's newest answer, if one came."""
@@ -140,23 +141,24 @@ class PlanningService(Service):
         )
 
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
-        seeing = self._exam.status.phase in (Phase.HOME, Phase.LOOK)
-        gone = tuple([role for role in (NEEDED_TO_SEE if seeing else NEEDED) if inbox.lost(role)])
+        needed = NEEDED_TO_SEE if self._exam.status.phase in SEEING else NEEDED
+        gone = tuple([role for role in needed if inbox.lost(role)])
         heard = inbox.stamp("supervisor/state")
         if heard is not None and t - heard > SUPERVISOR_AGE:
             gone += (f"the supervisor, silent for {(t - heard) / MS:.0f} ms",)
         return gone
 
 
-def _stop(inbox: Inbox, requests: tuple[Message, ...]) -> tuple[str, bool]:
-    """Why the arm must rest, empty when all is well; and whether planning is to retreat rather than the driver to hold."""
+def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...]) -> tuple[str, bool]:
+    """Why the arm must rest, empty when all is well; and whether planning is to retreat rather than the driver to hold.
+
+    `status` is the robot's newest, `state` the supervisor's.
+    """
     for request in requests:
         if request.request == OperatorRequest.STOP:
             return f"stopped by the operator: {request.reason}", False
-    status = inbox.latest("robot/status")
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
         return f"the driver holds safely: {status.reason}", False
-    state = inbox.latest("supervisor/state")
     if state is None or state.level == SupervisorState.LEVEL_OK:
         return "", False
     soft = state.level == SupervisorState.LEVEL_SOFT_STOP

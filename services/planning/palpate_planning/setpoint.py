@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +33,12 @@ JOINT_STIFFNESS: Final = _fixed([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0
 """Free motion [N m/rad]."""
 POSTURE_STIFFNESS: Final = _fixed([20.0] * 7)
 """Null space in contact [N m/rad]; the controller caps its torque at 5 N m."""
+_STILL: Final = _fixed([0.0] * 6)
+_NO_FORCE: Final = _fixed([0.0] * 3)
+_JOINTS_STILL: Final = _fixed([0.0] * 7)
 
 
-@dataclass(frozen=True, slots=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """What the arm is to do now, and how it goes on: control extrapolates by `V_WI` and `qd`."""
 
     mode: ControlMode
@@ -45,11 +46,11 @@ class Setpoint:
     """Desired pose of the indenter, shape (4, 4)."""
     q: Array
     """JOINT: target; CARTESIAN: posture [rad], shape (7,)."""
-    V_WI: Array = field(default_factory=lambda: np.zeros(6))
+    V_WI: Array = _STILL
     """Linear [m/s] and angular [rad/s] velocity in world axes, shape (6,)."""
-    F_W: Array = field(default_factory=lambda: np.zeros(3))
+    F_W: Array = _NO_FORCE
     """Feed-forward force on the environment [N], world axes, shape (3,)."""
-    qd: Array = field(default_factory=lambda: np.zeros(7))
+    qd: Array = _JOINTS_STILL
     """Velocity of q [rad/s], shape (7,)."""
     limp: bool = False
     """JOINT without stiffness: asks for nothing, keeps the chain of commands alive."""
@@ -63,5 +64,5 @@ class Setpoint:
     def joint_stiffness(self) -> Array:
         """Joint or null-space stiffness [N m/rad], shape (7,)."""
         if self.limp:
-            return np.zeros(7)
+            return _JOINTS_STILL
         return JOINT_STIFFNESS if self.mode is ControlMode.JOINT else POSTURE_STIFFNESS

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 GRID_M = 0.004
 """Spacing of the grid on which the splines stand; finer than the perceived detail."""
+ITERATIONS = 4
+"""At most so many are made to find the foot of a perpendicular."""
 STEEPEST = 10.0
 """Largest slope kept: past this (84 degrees) a height field says nothing."""
 
@@ -31,9 +33,9 @@ class Surface:
         """`field` holds height [m], slope along x and slope along y."""
         self.X_WA = X_WA
         X_AW = inverse(X_WA)
-        self._R_WA, self._p_WA = X_WA[:3, :3].copy(), X_WA[:3, 3].copy()
-        self._R_AW, self._p_AW = X_AW[:3, :3].copy(), X_AW[:3, 3].copy()
-        self._field = field
+        self.frames: Array = np.concatenate([part.ravel() for X in (X_WA, X_AW) for part in (X[:3, :3], X[:3, 3])])
+        """R_WA row by row, p_WA, R_AW and p_AW, shape (24,), as `foot` takes them."""
+        self.field = field
         self.offset = 0.0
         """Shift of the whole surface along its outward normals [m], from the onset of force."""
 
@@ -80,59 +82,45 @@ class Surface:
 
     def at(self, xy_A: Array) -> tuple[Array, Array]:
         """Surface points and outward unit normals over xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""
-        values = self._field.many(xy_A)
+        values = self.field.many(xy_A)
         p_A = np.column_stack((xy_A, values[:, 0]))
         n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
         n_A /= np.linalg.norm(n_A, axis=1, keepdims=True)
         return apply(self.X_WA, p_A + self.offset * n_A), n_A @ self.X_WA[:3, :3].T
 
-    def nearest(self, c_W: Array, iterations: int = 4) -> tuple[Array, Array, float]:
+    def nearest(self, c_W: Array) -> tuple[Array, Array, float]:
         """Foot of the perpendicular from c_W, shape (3,): surface point, outward normal (world), signed distance [m].
 
         Fixed point: slide the foot by the tangential part of what separates it from c. Converges at the rate of distance
         over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
         """
-        field, p_W, n_W = self._field, np.empty(3), np.empty(3)
+        field, p_W, n_W = self.field, np.empty(3), np.empty(3)
         c_W = np.ascontiguousarray(c_W)
-        distance = _nearest(
-            self._R_WA, self._p_WA, self._R_AW, self._p_AW, field.axes, field.coefficients, self.offset, c_W, iterations, p_W, n_W
-        )
-        return p_W, n_W, distance
+        return p_W, n_W, foot(self.frames, field.axes, field.coefficients, self.offset, c_W, p_W, n_W)
 
 
 @compiled
-def _nearest(
-    R_WA: Array,
-    p_WA: Array,
-    R_AW: Array,
-    p_AW: Array,
-    axes: Array,
-    coefficients: Array,
-    offset: float,
-    c_W: Array,
-    iterations: int,
-    p_W: Array,
-    n_W: Array,
-) -> float:
-    """The foot `p_W` [m] and the unit normal `n_W` there, shapes (3,), of a field of heights and slopes; signed distance [m]."""
+def foot(frames: Array, axes: Array, coefficients: Array, offset: float, c_W: Array, p_W: Array, n_W: Array) -> float:
+    """`Surface.nearest` from its parts: p_W [m] and n_W, shape (3,), become point and normal; returns the signed distance [m]."""
+    R_WA, p_WA, R_AW, p_AW = frames[:9].reshape(3, 3), frames[9:12], frames[12:21].reshape(3, 3), frames[21:]
     c = R_AW @ c_W + p_AW
     x, y = c[0], c[1]
-    foot, normal = np.empty(3), np.empty(3)
+    below, normal = np.empty(3), np.empty(3)
     distance = 0.0
-    for k in range(iterations):
+    for k in range(ITERATIONS):
         h, slope_x, slope_y = value_at(axes, coefficients, x, y)
-        foot[0], foot[1], foot[2] = x, y, h
+        below[0], below[1], below[2] = x, y, h
         length = sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
         normal[0], normal[1], normal[2] = -slope_x / length, -slope_y / length, 1.0 / length
-        gap = c - foot
+        gap = c - below
         distance = float(gap @ normal)
         slide = gap - distance * normal
         size = max(abs(slide[0]), abs(slide[1]))
-        if size < 1e-6 or k == iterations - 1:
+        if size < 1e-6 or k == ITERATIONS - 1:
             break
         limit = min(1.0, 0.02 / size)
         x, y = x + limit * slide[0], y + limit * slide[1]
-    p, n = R_WA @ (foot + offset * normal), R_WA @ normal
+    p, n = R_WA @ (below + offset * normal), R_WA @ normal
     for i in range(3):
         p_W[i], n_W[i] = p[i] + p_WA[i], n[i]
     return distance - offset

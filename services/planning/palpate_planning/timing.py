@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import pairwise
+from math import nan, sqrt
 from typing import Final
 
 import numpy as np
@@ -26,32 +28,51 @@ LATE_NS = 30_000_000
 """After so long without a step control has braked the arm to a stand (`MAX_EXTRAPOLATION_NS` there)."""
 RESTART_NS = 300_000_000
 """Time in which a motion that was interrupted so comes up to its speed again [A]."""
+_FINISHED: Final = ruckig.Result.Finished
+_UNDER_WAY: Final = (ruckig.Result.Working, _FINISHED)
 
 
 class Axis:
-    """One degree of freedom that moves to a target with bounded speed, acceleration and jerk; limits may change on the way."""
+    """One degree of freedom that moves to a target with bounded speed, acceleration and jerk; limits may change on the way.
+
+    Its position, velocity and acceleration are to be read; `step`, `shift` and `stand` change them.
+    """
 
     def __init__(self, position: float, acceleration: float, jerk: float) -> None:
         self._otg = ruckig.Ruckig(1, PERIOD_S)
         self._in = ruckig.InputParameter(1)
         self._out = ruckig.OutputParameter(1)
         self._in.max_acceleration, self._in.max_jerk = [acceleration], [jerk]
+        self._in.current_position = [position]
         self.position, self.velocity, self.acceleration = position, 0.0, 0.0
+        self._target = self._speed = nan
 
     def step(self, target: float, speed: float) -> bool:
         """Advances one period towards `target` at no more than `speed`, at rest there; returns whether it has arrived.
 
         Raises RuntimeError if ruckig finds no way, which takes limits that are not positive.
         """
-        self._in.current_position, self._in.current_velocity = [self.position], [self.velocity]
-        self._in.current_acceleration, self._in.max_velocity = [self.acceleration], [speed]
-        self._in.target_position = [target]
-        result = self._otg.update(self._in, self._out)
-        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        given, out = self._in, self._out
+        if target != self._target:
+            given.target_position, self._target = [target], target
+        if speed != self._speed:
+            given.max_velocity, self._speed = [speed], speed
+        result = self._otg.update(given, out)
+        if result not in _UNDER_WAY:
             raise RuntimeError(f"ruckig: {result} from {self.position}, {self.velocity} to {target} at {speed}")
-        self.position, self.velocity = self._out.new_position[0], self._out.new_velocity[0]
-        self.acceleration = self._out.new_acceleration[0]
-        return bool(result == ruckig.Result.Finished)
+        out.pass_to_input(given)
+        self.position, self.velocity, self.acceleration = out.new_position[0], out.new_velocity[0], out.new_acceleration[0]
+        return bool(result == _FINISHED)
+
+    def shift(self, change: float) -> None:
+        """Counts positions from another zero from now on: the present one is `change` more."""
+        self.position += change
+        self._in.current_position = [self.position]
+
+    def stand(self) -> None:
+        """Stands still at once."""
+        self.velocity = self.acceleration = 0.0
+        self._in.current_velocity = self._in.current_acceleration = [0.0]
 
 
 class Pace:
@@ -80,14 +101,20 @@ class SpeedLimit:
 
     def __init__(self, s: Array, speed: Array, acceleration: float) -> None:
         """Speeds [m/s or rad/s] at increasing path positions s, shape (n,)."""
-        reachable = np.array(speed, dtype=float)
-        for k in range(len(s) - 2, -1, -1):
-            reachable[k] = min(reachable[k], np.sqrt(reachable[k + 1] ** 2 + 2 * acceleration * (s[k + 1] - s[k])))
-        self._s, self._speed = s, reachable
+        places, reachable = s.tolist(), speed.tolist()
+        for k in range(len(places) - 2, -1, -1):
+            reachable[k] = min(reachable[k], sqrt(reachable[k + 1] ** 2 + 2 * acceleration * (places[k + 1] - places[k])))
+        self._s: list[float] = places
+        self._speed: list[float] = reachable
 
     def at(self, s: float) -> float:
-        """Speed allowed at s."""
-        return float(np.interp(s, self._s, self._speed))
+        """Speed allowed at s: what `numpy.interp` gives, which takes ten times as long for one number."""
+        places, speed = self._s, self._speed
+        k = bisect_right(places, s)
+        if not 0 < k < len(places):
+            return speed[k - 1] if k else speed[0]
+        slope = (speed[k] - speed[k - 1]) / (places[k] - places[k - 1])
+        return slope * (s - places[k - 1]) + speed[k - 1]
 
 
 @dataclass(frozen=True, slots=True)

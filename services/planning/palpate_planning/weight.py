@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from palpate_models import lbr
+from palpate_models.compiled import compiled
 from palpate_models.scenario import Robot
 
 Array = NDArray[np.float64]
@@ -23,7 +24,8 @@ class ToolWeight:
     def __init__(self, mass: float, gravity: float = GRAVITY) -> None:
         """`mass` [kg] below the sensor."""
         self.mass = mass
-        self._weight_W = np.array((0.0, 0.0, -mass * gravity))
+        self.weight_W: Array = np.array((0.0, 0.0, -mass * gravity))
+        """[N], world axes, shape (3,)."""
         self.bias = np.zeros(3)
         """Force [N] that the sensor reads where there is none, in its axes, shape (3,)."""
         self._sum = np.zeros(3)
@@ -37,7 +39,7 @@ class ToolWeight:
 
     def force(self, R_WS: Array) -> Array:
         """The weight as the sensor sees it [N], in its axes, shape (3,)."""
-        return np.asarray(R_WS.T @ self._weight_W)
+        return np.asarray(R_WS.T @ self.weight_W)
 
     def start_tare(self) -> None:
         """Forgets earlier readings; the bias stays as it is until the first reading."""
@@ -59,5 +61,10 @@ class ToolWeight:
 
         `a_W`: acceleration of the tool [m/s^2], shape (3,): 0.5 m/s^2 of 0.35 kg would pass for a touch.
         """
-        force = R_WS @ (wrench_S[:3] - self.bias - self.force(R_WS))
-        return np.asarray(force if a_W is None else force + self.mass * a_W)
+        return external(R_WS, wrench_S, self.bias, self.weight_W, self.mass, np.zeros(3) if a_W is None else a_W)
+
+
+@compiled
+def external(R_WS: Array, wrench_S: Array, bias_S: Array, weight_W: Array, mass: float, a_W: Array) -> Array:
+    """`ToolWeight.contact` from its parts: force [N] on the tool, world axes, shape (3,)."""
+    return np.asarray(R_WS @ (wrench_S[:3] - bias_S - R_WS.T @ weight_W) + mass * a_W)

@@ -238,4 +238,4 @@ def test_before_the_robot_is_heard_nothing_is_asked_of_it() -> None:
     outcome = world.exam.step(Observation(0, None))
     assert outcome.contact is None
     assert not outcome.setpoint.joint_stiffness.any()
-    assert replace(outcome.setpoint, limp=False).joint_stiffness.all()
+    assert outcome.setpoint._replace(limp=False).joint_stiffness.all()

@@ -171,6 +171,38 @@ def test_axis_moves_to_its_target_at_rest() -> None:
     assert max(speeds) <= 0.05 + 1e-9
 
 
+def test_a_speed_limit_between_its_places_is_numpys_to_the_bit() -> None:
+    rng = np.random.default_rng(5)
+    s, speed = np.unique(np.round(rng.uniform(0.0, 1.0, 40), 3)), rng.uniform(0.01, 0.2, 40)
+    limit = SpeedLimit(s, speed[: len(s)], 1e9)  # so that it need not brake ahead
+    for place in (-0.1, 1.1, *s.tolist(), *rng.uniform(0.0, 1.0, 500).tolist()):
+        assert limit.at(place) == np.interp(place, s, speed[: len(s)])
+    assert [SpeedLimit(s[:1], speed[:1], 0.1).at(place) for place in (-1.0, float(s[0]), 1.0)] == [speed[0]] * 3
+
+
+def test_an_axis_that_counts_from_elsewhere_moves_on_alike() -> None:
+    axis, shifted = Axis(0.0, 0.5, 5.0), Axis(0.0, 0.5, 5.0)
+    for k in range(100):
+        if k == 10:
+            shifted.shift(0.25)
+        assert axis.step(0.1, 0.05) == shifted.step(0.1 if k < 10 else 0.35, 0.05)
+        assert shifted.position == pytest.approx(axis.position + (0.25 if k >= 10 else 0.0), abs=1e-12)
+        assert shifted.velocity == pytest.approx(axis.velocity, abs=1e-9)
+
+
+def test_an_axis_that_stood_still_starts_from_rest() -> None:
+    axis = Axis(0.0, 0.5, 5.0)
+    for _ in range(20):
+        axis.step(0.1, 0.05)
+    assert axis.velocity > 0.02
+    axis.stand()
+    fresh = Axis(axis.position, 0.5, 5.0)
+    assert axis.velocity == axis.acceleration == 0.0
+    for _ in range(30):
+        assert axis.step(0.1, 0.05) == fresh.step(0.1, 0.05)
+        assert (axis.position, axis.velocity, axis.acceleration) == (fresh.position, fresh.velocity, fresh.acceleration)
+
+
 def test_look_postures_leave_the_view_free_and_differ() -> None:
     postures = look_postures(known(Robot()))
     assert len(postures) >= 3

@@ -42,6 +42,9 @@ class Latch:
 
     def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
         """One period at `t` [ns]: what does not hold now, and whether an operator asks for release."""
+        if not (breaches or release):
+            self._recovering.clear()
+            return
         self._recovering &= {breach.cause for breach in breaches}
         fresh = t - self._released < GRACE
         standing = [b for b in breaches if b.cause not in self._recovering and not (fresh and b.cause is Cause.DRIVER)]

@@ -24,10 +24,9 @@ Array = NDArray[np.float64]
 
 NOWHERE = -1.0
 """Depth [m] while no surface is known."""
-MOVES = ("control", "planning")
-"""Roles without which the arm must stand still."""
-LISTENS = ("assessment",)
-"""Roles without which there is no reason to go on pressing."""
+MISSED = (("control", Level.EMERGENCY), ("planning", Level.EMERGENCY), ("assessment", Level.SOFT_STOP))
+"""Roles and what their loss calls for: without the first two the arm must stand still, without assessment there is no reason to
+go on pressing."""
 WATCHED = ("robot/status", "exam/state")
 """Topics whose age is watched: the arm's, and planning's, whose set-points expire as soon."""
 MAX_AGE = 250 * MS
@@ -47,6 +46,7 @@ class SupervisorService(Service):
         self._watch = Watch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
         RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it ahead of any deadline
+        self._sense.sense(np.zeros(7), np.zeros(7), np.zeros(6))  # as well
         self._latch = Latch()
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
@@ -91,14 +91,11 @@ class SupervisorService(Service):
 
     def _presence(self, t: int, inbox: Inbox) -> list[Breach]:
         """Who is gone, and who has said nothing for too long."""
-        found = [
-            Breach(level, Cause.LOST, f"the service of role {role} is gone")
-            for roles, level in ((MOVES, Level.EMERGENCY), (LISTENS, Level.SOFT_STOP))
-            for role in roles
-            if inbox.lost(role)
-        ]
+        found = [Breach(level, Cause.LOST, f"the service of role {role} is gone") for role, level in MISSED if inbox.lost(role)]
         self._began = t if self._began is None else self._began
-        for name in WATCHED if t - self._began > SETTLE else ():
+        if t - self._began <= SETTLE:
+            return found
+        for name in WATCHED:
             heard = inbox.stamp(name)
             if heard is not None and t - heard > MAX_AGE:
                 words = f"nothing on {name} for {(t - heard) / 1e6:.0f} ms, limit {MAX_AGE / 1e6:.0f} ms"
@@ -118,11 +115,13 @@ class SupervisorService(Service):
 
     def _measure(self, status: Any) -> list[Breach]:
         force, moment = status.wrench.force, status.wrench.torque
-        wrench = np.array((force.x, force.y, force.z, moment.x, moment.y, moment.z))
-        q, qd = np.array(status.position), np.array(status.velocity)
-        for name, values in (("position", q), ("velocity", qd), ("wrench", wrench)):
-            if not all(map(isfinite, values.tolist())):
-                return [Breach(Level.EMERGENCY, Cause.INVALID, f"robot/status: {name} = {values}: must be finite")]
+        felt = (force.x, force.y, force.z, moment.x, moment.y, moment.z)
+        wrench = np.array(felt)
+        q, qd = status.position.copy(), status.velocity.copy()
+        if not all(map(isfinite, (*q.tolist(), *qd.tolist(), *felt))):
+            values = {"position": q, "velocity": qd, "wrench": wrench}
+            name = next(name for name in values if not np.isfinite(values[name]).all())
+            return [Breach(Level.EMERGENCY, Cause.INVALID, f"robot/status: {name} = {values[name]}: must be finite")]
         self._tool = tool = self._sense.sense(q, qd, wrench)
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)

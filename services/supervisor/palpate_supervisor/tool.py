@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from palpate_models import lbr
+from palpate_models.compiled import compiled
 from palpate_models.nearest import nearest_vertex
 from palpate_models.scenario import Robot
 
@@ -16,10 +17,10 @@ Array = NDArray[np.float64]
 
 GRAVITY = 9.81
 """[m/s^2]"""
+_WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
-@dataclass(frozen=True, slots=True)
-class Tool:
+class Tool(NamedTuple):
     """The indenter as measured."""
 
     p_W: Array
@@ -38,17 +39,26 @@ class ToolSense:
         self._data = self._model.createData()
         self._indenter = self._model.getFrameId("indenter")
         self._sensor = self._model.getFrameId("ft_sensor")
+        self._p_WI: Array = self._data.oMf[self._indenter].translation
+        self._R_SW: Array = self._data.oMf[self._sensor].rotation.T
+        """Views of what pinocchio has computed last."""
         self._weight_W = np.array((0.0, 0.0, -robot.tool_mass_kg * GRAVITY))
 
     def sense(self, q: Array, qd: Array, wrench_S: Array) -> Tool:
         """From joint positions [rad] and velocities [rad/s], shapes (7,), and the F/T reading, shape (6,)."""
         model, data = self._model, self._data
         pin.forwardKinematics(model, data, q, qd)
-        X_WI = pin.updateFramePlacement(model, data, self._indenter)
-        R_WS = pin.updateFramePlacement(model, data, self._sensor).rotation
-        velocity = pin.getFrameVelocity(model, data, self._indenter, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED).linear
-        external = wrench_S[:3] - R_WS.T @ self._weight_W
-        return Tool(X_WI.translation.copy(), sqrt(velocity.dot(velocity)), sqrt(external.dot(external)))
+        pin.updateFramePlacement(model, data, self._indenter)
+        pin.updateFramePlacement(model, data, self._sensor)
+        velocity = pin.getFrameVelocity(model, data, self._indenter, _WORLD_AXES).linear
+        return Tool(self._p_WI.copy(), sqrt(velocity.dot(velocity)), _force(wrench_S, self._R_SW, self._weight_W))
+
+
+@compiled
+def _force(wrench_S: Array, R_SW: Array, weight_W: Array) -> float:
+    """Magnitude [N] of the force in an F/T reading, shape (6,), less a weight [N] in world axes, shape (3,)."""
+    external = wrench_S[:3] - R_SW @ weight_W
+    return sqrt(external @ external)
 
 
 class RestSurface:

@@ -82,10 +82,9 @@ class Watch:
 
     def judge(self, tool: Tool, depth: float | None, t: int) -> list[Breach]:
         """Breaches of what was measured at `t` [ns]; `depth` [m] below the perceived surface, None while none is known."""
-        found = [*self._force(tool.force, t), *self._speed(tool), *self._workspace(tool.p_W)]
-        if depth is not None:
-            found += self._depth(depth, tool.force)
-        return found
+        p_W, speed, force = tool
+        found = self._force(force, t) + self._speed(speed, force) + self._workspace(p_W)
+        return found if depth is None else found + self._depth(depth, force)
 
     def _force(self, force: float, t: int) -> list[Breach]:
         limits, forces = self._limits, self._forces
@@ -119,14 +118,14 @@ class Watch:
         words = f"depth {depth * 1e3:.1f} mm below the perceived surface"
         return [Breach(level, Cause.DEPTH, f"{words}, limit {limit * 1e3:.1f} mm")] if force > CONTACT_N else []
 
-    def _speed(self, tool: Tool) -> list[Breach]:
+    def _speed(self, speed: float, force: float) -> list[Breach]:
         free = self._limits.speed_mps * SPEED_MARGIN
-        if tool.speed > free:
-            words = f"robot/status: tool moves at {tool.speed:.2f} m/s, limit {free:.2f} m/s"
+        if speed > free:
+            words = f"robot/status: tool moves at {speed:.2f} m/s, limit {free:.2f} m/s"
             return [Breach(Level.EMERGENCY, Cause.SPEED, words)]
         contact = self._limits.contact_speed_mps
-        if tool.force > CONTACT_N and tool.speed > contact:
-            words = f"robot/status: tool moves at {tool.speed:.2f} m/s with {tool.force:.1f} N on it"
+        if force > CONTACT_N and speed > contact:
+            words = f"robot/status: tool moves at {speed:.2f} m/s with {force:.1f} N on it"
             words += f", limit in contact {contact:.2f} m/s"
             return [Breach(Level.EMERGENCY, Cause.SPEED, words)]
         return []
