@@ -100,6 +100,17 @@ def plan_redundancy(
     return _judge(batch, q, refined)
 
 
+def prepare(robot: Robot, force_n: float = PRESSING_FORCE_N) -> None:
+    """Makes what `plan_redundancy` needs whatever the targets are, CasADi's functions and the solver, ahead of it."""
+    arm(robot)
+    _program(_at_origin(robot), KNOTS, force_n)
+
+
+def _at_origin(robot: Robot) -> Robot:
+    """The robot as the solver has it: where it stands is a parameter."""
+    return robot.model_copy(update={"base_xy_m": (0.0, 0.0)})
+
+
 def _seeds(batch: Batch, seed: Array) -> list[Array]:
     """Postures to start inverse kinematics from: the caller's, and elbow-up ones that face the targets' centre."""
     x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
@@ -170,7 +181,7 @@ def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Arra
     knots = _knots(batch, reachable)
     if len(knots) < 2:
         return q, False
-    solver = _program(robot.model_copy(update={"base_xy_m": (0.0, 0.0)}), len(knots), batch.force)
+    solver = _program(_at_origin(robot), len(knots), batch.force)
     s = _path_length(batch.positions)
     spacing = np.diff(s[knots])
     weights = spacing.mean() / spacing

@@ -32,6 +32,8 @@ ELBOW_CLEARANCE_M = 0.15
 """The elbow stays at least this far above the indenter, so that upper arm and forearm keep off abdomen and table."""
 REACH_LENGTH_M = 0.4
 """Length that makes linear and angular rows of the Jacobian comparable: upper arm and forearm of the LBR iiwa 7."""
+_RIDGE = 1e-12
+"""Added to the Gram matrix of the Jacobian [1]: no pivot is zero where the arm is singular."""
 WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.0
 """What counts in a posture, each term of order one [A]."""
 
@@ -77,6 +79,15 @@ def _axis_rotation(ca: Any, axis: tuple[float, float, float], angle: Any) -> Any
     return ca.DM.eye(3) + ca.sin(angle) * K + (1 - ca.cos(angle)) * ca.mtimes(K, K)
 
 
+def _determinant(ca: Any, A: Any) -> Any:
+    """Determinant of a positive semi-definite matrix by A = L D L': `ca.det`, by cofactors, takes twenty times the operations."""
+    pivots, _, _ = ca.ldl(A + _RIDGE * ca.DM.eye(A.shape[0]), False)
+    determinant = 1
+    for pivot in ca.vertsplit(pivots):
+        determinant *= pivot
+    return determinant
+
+
 @lru_cache(maxsize=8)
 def arm(robot: Robot) -> ArmFunctions:
     """The functions of an arm with this robot's tool. Its base fields are not used: base is an argument."""
@@ -108,7 +119,7 @@ def arm(robot: Robot) -> ArmFunctions:
     tool_axis = R[:, 2]
     linear = ca.horzcat(*(ca.cross(axis, p - origin) for axis, origin in zip(axes, origins, strict=True)))
     jacobian = ca.vertcat(linear / REACH_LENGTH_M, ca.horzcat(*axes))
-    gram = ca.det(ca.mtimes(jacobian, jacobian.T))
+    gram = _determinant(ca, ca.mtimes(jacobian, jacobian.T))
     torque = ca.gradient(energy, q) + ca.mtimes(linear.T, tool_axis * force)
     residual = ca.vertcat(p - target, ca.mtimes(frame[:, :2].T, tool_axis))
     elbow = origins[3]

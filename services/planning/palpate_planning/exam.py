@@ -20,7 +20,7 @@ from palpate_planning.prepare import ExamPlan, Planner, Seen
 from palpate_planning.setpoint import ControlMode, Setpoint
 from palpate_planning.status import PHASE_OF, ExamStatus, Observation, Outcome, Phase, Unseen
 from palpate_planning.surface import Surface
-from palpate_planning.thinking import Thought
+from palpate_planning.thinking import WORKER, Thought
 from palpate_planning.timing import JointTrajectory, Pace
 from palpate_planning.weight import ToolWeight
 
@@ -63,6 +63,7 @@ class Exam:
         ContactSense(self._kinematics, weight, plane, radius).sense(Reading(np.zeros(7), np.zeros(6), np.zeros(7)))  # as well
         self._sense = ContactSense(self._kinematics, weight, plane, radius)
         self._planner = Planner(known)
+        WORKER.submit(self._planner.prepare)
         self._looks = look_postures(known)
         self._follower = Follower(self._kinematics, np.array(lbr.HOME))
         self._pace, self._rate = Pace(), 1.0

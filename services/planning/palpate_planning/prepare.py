@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from palpate_models.frames import apply, inverse
-from palpate_models.placement import plan_redundancy
+from palpate_models.placement import plan_redundancy, prepare
 from palpate_models.scenario import ExamInput
 
 from palpate_planning.coverage import strokes
@@ -74,6 +74,10 @@ class Planner:
     def __init__(self, known: ExamInput) -> None:
         self._known = known
         self._kinematics = Kinematics(known.robot, known.limits)
+
+    def prepare(self) -> None:
+        """Makes what needs no surface: an examination is planned in half the time afterwards."""
+        prepare(self._known.robot, self._known.limits.force_working_n)
 
     def motion(self, q0: Array, q1: Array, seen: Seen | None) -> JointTrajectory:
         """Collision-free timed motion from q0 to q1. Raises NoPathError."""
