@@ -10,8 +10,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from time import perf_counter_ns
 
 from palpate_bus import codec
@@ -272,28 +271,45 @@ class Stepper:
         return sent
 
     def step(self, t: int) -> list[Sent]:
-        """Steps the service at `t` [ns] and returns all that it sends, packed, in outbox order. Raises as `parts`."""
-        return list(chain.from_iterable(self.parts(t)))
-
-    def parts(self, t: int) -> Iterator[list[Sent]]:
-        """Steps the service at `t` [ns]; yields what each part of the step sends, packed, in outbox order.
+        """Steps the service at `t` [ns] and returns all that it sends, packed, in outbox order.
 
         Raises LockstepError when the service leaves out a periodic message or sends one off its tick.
         """
-        for buffer in self._all:
-            if buffer.pending or buffer.new:
-                buffer.take(t)
-        blame, service, unchained = self.blame, self.service, self._unchained
+        blame = self.blame
+        begin, decoded, encoded = perf_counter_ns(), blame.decode, blame.encode
+        sent: list[Sent] = []
+        for outbox in self._outboxes(t):
+            stepped = perf_counter_ns()
+            sent += self._pack(outbox, t)
+            blame.encode += perf_counter_ns() - stepped
+        self._unchained.append((t, sent))
+        self._close(t)
+        blame.compute += perf_counter_ns() - begin - (blame.decode - decoded) - (blame.encode - encoded)
+        return sent
+
+    def parts(self, t: int) -> Iterator[list[Sent]]:
+        """As `step`, but yields what each part of the step sends before the next is computed."""
+        blame = self.blame
         begin, decoded = perf_counter_ns(), blame.decode
-        for outbox in (service.step(t, self.inbox),) if self._whole else service.parts(t, self.inbox):
+        for outbox in self._outboxes(t):
             stepped = perf_counter_ns()
             blame.compute += stepped - begin - (blame.decode - decoded)
             sent = self._pack(outbox, t)
-            unchained.append((t, sent))
-            begin = perf_counter_ns()
-            blame.encode += begin - stepped
+            self._unchained.append((t, sent))
+            blame.encode += perf_counter_ns() - stepped
             yield sent
             begin, decoded = perf_counter_ns(), blame.decode
+        self._close(t)
+
+    def _outboxes(self, t: int) -> Iterable[Outbox]:
+        """The service's step at `t` [ns] on what it may see then, in parts where it has any."""
+        for buffer in self._all:
+            if buffer.pending or buffer.new:
+                buffer.take(t)
+        return (self.service.step(t, self.inbox),) if self._whole else self.service.parts(t, self.inbox)
+
+    def _close(self, t: int) -> None:
+        """Checks that all is sent that was due at `t` [ns], and hashes when enough has gathered: by now it is on its way."""
         number = t // self.role.period + 1
         for port in self._steady:
             if port.sequence != number:
@@ -301,10 +317,11 @@ class Stepper:
         for port in self._rarer:
             if not t % port.period and port.sequence != t // port.period + 1:
                 raise self._missing(port, t)
-        if len(unchained) >= self._chain_every:  # after they are on their way
+        if len(self._unchained) >= self._chain_every:
+            begin = perf_counter_ns()
             self._chain()
-            blame.encode += perf_counter_ns() - begin
-        blame.steps += 1
+            self.blame.encode += perf_counter_ns() - begin
+        self.blame.steps += 1
 
     def _missing(self, port: OutputPort, t: int) -> LockstepError:
         return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
