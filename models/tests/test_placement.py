@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+from palpate_models import placement
 from palpate_models.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
-from palpate_models.placement import PostureSequence, plan_redundancy
+from palpate_models.placement import PostureSequence, plan_redundancy, prepare
 from palpate_models.placement_batch import TASK_TOLERANCE
-from palpate_models.placement_symbolic import arm, base_of, surface_frames
+from palpate_models.placement_symbolic import REACH_LENGTH_M, arm, base_of, surface_frames
 from palpate_models.scenario import Robot, Scenario
 
 ROBOT = Robot()
@@ -46,6 +47,25 @@ def test_functions_agree_with_the_urdf(seed: int) -> None:
     press = J[:3].T @ (12.0 * pose.rotation[:, 2])
     torque = pin.computeGeneralizedGravity(model, data, q) + press
     np.testing.assert_allclose(np.array(functions.torque(q, base, 12.0))[:, 0], torque, atol=1e-9)
+    scaled = J / np.array([[REACH_LENGTH_M]] * 3 + [[1.0]] * 3)
+    assert float(functions.dexterity(q, base)) == pytest.approx(float(np.sqrt(np.linalg.det(scaled @ scaled.T))), abs=1e-9)
+
+
+def test_a_stretched_arm_has_no_dexterity_and_a_finite_cost() -> None:
+    functions, base = arm(ROBOT), base_of(ROBOT)
+    cost, gradient = functions.cost(np.zeros(7), base, 15.0)
+    assert float(functions.dexterity(np.zeros(7), base)) < 1e-6
+    assert np.isfinite(float(cost))
+    assert np.isfinite(np.array(gradient)).all()
+
+
+def test_planning_uses_what_was_prepared(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
+    positions, normals, _ = scan
+    robot = Robot(tool_mass_kg=0.41)
+    prepare(robot, 9.0)
+    made = placement._program.cache_info().misses
+    assert plan_redundancy(robot, positions, normals, np.array(HOME), force_n=9.0).refined
+    assert placement._program.cache_info().misses == made
 
 
 def test_task_and_cost_have_their_derivatives() -> None:
