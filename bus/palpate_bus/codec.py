@@ -15,7 +15,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from palpate_bus import cdr
-from palpate_bus.cdr import CodecError
+from palpate_bus.cdr_parts import CodecError
+from palpate_bus.cdr_writer import Codec
 
 __all__ = [
     "CodecError",
@@ -82,7 +83,7 @@ def type_hash(name: str) -> str:
 
 
 @cache
-def _fast(name: str) -> cdr.Codec:
+def _fast(name: str) -> Codec:
     """The generated codec of a type inside others. Raises KeyError if it has a field that only rosbags knows how to encode."""
     return cdr.nested(store, name, _fast)
 

@@ -80,7 +80,7 @@ def _axis_rotation(ca: Any, axis: tuple[float, float, float], angle: Any) -> Any
 
 
 def _determinant(ca: Any, A: Any) -> Any:
-    """Determinant of a positive semi-definite matrix by A = L D L': `ca.det`, by cofactors, takes twenty times the operations."""
+    """Determinant of a positive semi-definite matrix by A = L D L': `ca.det`, by cofactors, takes many times the operations."""
     pivots, _, _ = ca.ldl(A + _RIDGE * ca.DM.eye(A.shape[0]), False)
     determinant = 1
     for pivot in ca.vertsplit(pivots):

@@ -192,21 +192,20 @@ class Driver:
         if self._judged is not None:
             apart = max((command.stamp - self._judged.stamp) / 1e6, 1.0)
         change = TORQUE_RATE * apart
-        if _within(map(add, torques, weights), _TORQUE_LIMIT) and _within(map(sub, torques, before), repeat(change)):
-            self._before = torques
-            return
-        for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, torques, before, weights, strict=True):
-            if torque - torque != 0.0:  # NaN or infinite
-                self._reject(t, Cause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
-                return
-            if not -limit <= torque + weight <= limit:
-                text = f"control commands {joint} {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
-                self._reject(t, Cause.TORQUE_LIMIT, text)
-                return
-            if not -change <= torque - last <= change:
-                text = f"control commands {joint} {torque:.1f} N m after {last:.1f} N m, {apart:.0f} ms apart"
-                self._reject(t, Cause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
-                return
+        if not (_within(map(add, torques, weights), _TORQUE_LIMIT) and _within(map(sub, torques, before), repeat(change))):
+            for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, torques, before, weights, strict=True):
+                if torque - torque != 0.0:  # NaN or infinite
+                    self._reject(t, Cause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
+                    return
+                if not -limit <= torque + weight <= limit:
+                    text = f"control commands {joint} {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
+                    self._reject(t, Cause.TORQUE_LIMIT, text)
+                    return
+                if not -change <= torque - last <= change:
+                    text = f"control commands {joint} {torque:.1f} N m after {last:.1f} N m, {apart:.0f} ms apart"
+                    self._reject(t, Cause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
+                    return
+        self._before = torques
 
     def _reject(self, t: int, cause: Cause, reason: str) -> None:
         self.rejected += 1

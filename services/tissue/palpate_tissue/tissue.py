@@ -74,14 +74,13 @@ class Tissue:
         """u [m] along the inward rest normal, shape (n,)."""
         self.branches: Array = np.zeros((len(stiffness.prony_g), n))
         """y_k = g_k z_k [m]: what has relaxed, a row (n,) for each Prony branch."""
-        self._decay: Array = np.exp(-self._h / np.array(stiffness.prony_tau_s))
-        self._feed: Array = np.array(stiffness.prony_g) * (1 - self._decay)
+        decay: Array = np.exp(-self._h / np.array(stiffness.prony_tau_s))
+        feed: Array = np.array(stiffness.prony_g) * (1 - decay)
         self._prony_g = stiffness.prony_g
-        self._strain = np.zeros(n)
         advance = -self._h * self.mechanics.stiffness
         advance.data /= np.repeat(self.mechanics.damping, np.diff(advance.indptr))
-        self._matrix = (advance.indptr.astype(np.uint32), advance.indices.astype(np.uint32), advance.data)
-        self._field = (*self._matrix, self.branches, self._decay, self._feed, self._strain)
+        matrix = (advance.indptr.astype(np.uint32), advance.indices.astype(np.uint32), advance.data)
+        self._field = (*matrix, self.branches, decay, feed, np.zeros(n))
         self._gain = self.mechanics.damping / self._h
         free = np.flatnonzero(~model.fixed)
         self._free = free
@@ -95,14 +94,8 @@ class Tissue:
         """Whether anything has ever moved; until then the field is left at its exact rest."""
         self.touching = False
         """Whether the sphere holds a vertex after the step."""
-        self._warm_up()
-
-    def _warm_up(self) -> None:
-        """Compiles what steps call, on a field at rest, so that the first contact need not wait for it."""
-        kernel.relax(*self._matrix, self.branches, self._strain, self.displacement)
-        kernel.remember(self.branches, self._decay, self._feed, self.displacement)
-        empty = _Candidates([], np.zeros(3), 0.0, 0.0, np.zeros(0, np.uint32), np.zeros((0, 8)), np.zeros(0))
-        self._press(empty, np.zeros(6))
+        self._nobody = _Candidates([], np.zeros(3), 0.0, 0.0, np.zeros(0, np.uint32), np.zeros((0, 8)), np.zeros(0))
+        self._press(self._nobody, np.zeros(6))  # compiles it: the first contact need not wait
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
@@ -142,10 +135,8 @@ class Tissue:
         """Advances by one period to time `t_s` [s] with no sphere anywhere."""
         for k in range(1, self.substeps + 1):
             self._excursion = self.excursion(t_s - self.dt * (1 - k / self.substeps))
+            self._press(self._nobody, np.zeros(6))
             self._no_contact()
-            if self.disturbed:
-                kernel.relax(*self._matrix, self.branches, self._strain, self.displacement)
-                kernel.remember(self.branches, self._decay, self._feed, self.displacement)
 
     def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
         """One explicit step; `wrench` (6,) gets force [N] and torque [N m] on the sphere, and is left alone out of contact."""
