@@ -60,10 +60,9 @@ class Setpoint:
     """All of them as in `layout`, shape (64,)."""
 
     def __post_init__(self) -> None:
-        numbers = np.zeros(1, layout.NUMBERS)
-        for name in _NAMES:
-            numbers[name] = getattr(self, name)
-        values = numbers.view(np.float64)
+        values: Array = np.concatenate([*map(self.__getattribute__, _NAMES), _STILL], axis=None)
+        if values.size != layout.COUNT:
+            raise ValueError(f"set-point: has {values.size - _STILL.size} numbers: must be {layout.COUNT - _STILL.size}")
         if not ((values >= _LOW) & (values <= _HIGH)).all():  # so it is, too, where one is NaN
             raise ValueError(self._wrong())
         object.__setattr__(self, "values", values)
@@ -98,7 +97,8 @@ RANGES: Final = (
 )
 """What a set-point may ask for: attribute, part of it, the message's field, least and largest value; as in the contract, where it
 says."""
-_NAMES: Final = tuple(name for name in layout.NUMBERS.names or () if name != "qdd")
+_NAMES: Final = tuple(name for name in layout.NUMBERS.names or () if name != "qdd")  # which is the last
+_STILL: Final = np.zeros(layout.COUNT - layout.QDD)
 
 
 def _bounds(column: int, of_rotation: float) -> Array:

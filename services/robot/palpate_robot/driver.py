@@ -7,16 +7,15 @@ damp the joints, without any stiffness: tissue that is pressed pushes the arm aw
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from itertools import repeat
-from operator import add, le, sub
 from typing import Final
 
 import numpy as np
 from palpate_models import lbr
 from palpate_models.frames import Array
+
+from palpate_robot import kernel
 
 HOLD_DAMPING: Final = np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])
 """Joint damping in a hold [N m s/rad] [A]: about 300 N s/m at the tool. Breathing at 8 mm/s against it adds less than 3 N."""
@@ -40,9 +39,6 @@ _LIMITS: Final = tuple(
         strict=True,
     )
 )
-_POSITION_LIMIT: Final = tuple(lbr.POSITION_LIMIT.tolist())
-_VELOCITY_LIMIT: Final = tuple(lbr.VELOCITY_LIMIT.tolist())
-_TORQUE_LIMIT: Final = tuple(lbr.TORQUE_LIMIT.tolist())
 _ZERO: Final = np.zeros(7)
 _ZERO.setflags(write=False)
 
@@ -76,6 +72,7 @@ class Command:
     """Joint torques without gravity [N m], when they were sent [ns], and when they expire [ns]."""
 
     torque: Array
+    """An array of its own memory, that nobody writes to."""
     stamp: int
     expires: int
     problem: str = ""
@@ -98,8 +95,11 @@ class Driver:
         self._since = -1
         self._brake = 0
         self._judged: Command | None = None
-        self._before: list[float] = []
-        """The torques of the command judged last; empty when none was obeyed since the driver was IDLE."""
+        self._before: Array | None = None
+        """The torques of the command judged last; None when none was obeyed since the driver was IDLE."""
+        still = np.zeros(7)  # compiles what a tick calls
+        kernel.within(still, still, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT)
+        kernel.obeyable(still, still, still, lbr.TORQUE_LIMIT, TORQUE_RATE)
 
     @property
     def held(self) -> bool:
@@ -118,7 +118,7 @@ class Driver:
         if self.mode is Mode.SAFE_HOLD:
             self.mode, self.cause, self.reason = Mode.IDLE, Cause.NONE, ""
             self._since = t
-            self._before = []
+            self._before = None
 
     def update(self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool) -> Array:
         """Joint torques at `t` [ns] without gravity [N m]; zero outside ACTIVE, where `damping` is to act instead.
@@ -155,10 +155,9 @@ class Driver:
         return np.asarray(np.minimum(wanted, np.maximum(room, 0.0) / np.maximum(np.abs(v), 1e-9)))
 
     def _check_joints(self, t: int, q: Array, v: Array) -> None:
-        positions, velocities = q.tolist(), v.tolist()
-        if _within(positions, _POSITION_LIMIT) and _within(velocities, _VELOCITY_LIMIT):
+        if kernel.within(q, v, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT):
             return
-        for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, positions, velocities, strict=True):
+        for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, q.tolist(), v.tolist(), strict=True):
             if not -q_max <= q_i <= q_max:
                 self.hold(t, Cause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limit +-{q_max:.4f} rad")
             elif not -v_max <= v_i <= v_max:
@@ -187,13 +186,14 @@ class Driver:
         if command.stamp > t + AHEAD:
             self._reject(t, Cause.INVALID_COMMAND, f"control stamps its command {(command.stamp - t) / 1e6:.0f} ms ahead")
             return
-        torques, weights = command.torque.tolist(), gravity.tolist()
-        before, apart = self._before or torques, 1.0
+        before = command.torque if self._before is None else self._before
+        apart = 1.0
         if self._judged is not None:
             apart = max((command.stamp - self._judged.stamp) / 1e6, 1.0)
         change = TORQUE_RATE * apart
-        if not (_within(map(add, torques, weights), _TORQUE_LIMIT) and _within(map(sub, torques, before), repeat(change))):
-            for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, torques, before, weights, strict=True):
+        if not kernel.obeyable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
+            numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())
+            for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, *numbers, strict=True):
                 if torque - torque != 0.0:  # NaN or infinite
                     self._reject(t, Cause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
                     return
@@ -205,13 +205,8 @@ class Driver:
                     text = f"control commands {joint} {torque:.1f} N m after {last:.1f} N m, {apart:.0f} ms apart"
                     self._reject(t, Cause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
                     return
-        self._before = torques
+        self._before = command.torque
 
     def _reject(self, t: int, cause: Cause, reason: str) -> None:
         self.rejected += 1
         self.hold(t, cause, reason)
-
-
-def _within(values: Iterable[float], limits: Iterable[float]) -> bool:
-    """Whether every value is finite and at most its limit in size."""
-    return all(map(le, map(abs, values), limits))

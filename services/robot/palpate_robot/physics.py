@@ -19,25 +19,7 @@ STICK_RADPS: Final = 1e-3
 FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
 """Links that stand on or turn over the base and so have no collision shapes."""
 
-
-class Orientation(Protocol):
-    """A unit quaternion."""
-
-    def w(self) -> float:
-        """Its real part."""
-        ...
-
-    def x(self) -> float:
-        """Its imaginary parts ..."""
-        ...
-
-    def y(self) -> float:
-        """... in turn ..."""
-        ...
-
-    def z(self) -> float:
-        """... about x, y and z."""
-        ...
+Wrench = tuple[float, float, float, float, float, float]
 
 
 class Physics(Protocol):
@@ -64,20 +46,19 @@ class Physics(Protocol):
         """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""
         ...
 
-    def sensor_wrench(self) -> Array:
-        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m], shape (6,), in its axes."""
+    def sensor_wrench(self) -> Wrench:
+        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m], in its axes."""
         ...
 
-    def tool_pose(self) -> tuple[Array, Orientation]:
-        """Position p_WI [m], shape (3,), and orientation of the indenter in world."""
+    def tool_motion(self) -> Array:
+        """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
+
+        The linear velocity is that of the sphere's centre.
+        """
         ...
 
-    def tool_twist(self) -> tuple[Array, Array]:
-        """Linear velocity [m/s] of the sphere's centre and angular velocity [rad/s], world axes, shapes (3,)."""
-        ...
-
-    def link_pose(self, link: str) -> tuple[Array, Orientation]:
-        """Position [m], shape (3,), and orientation of a link of `lbr.LINK_NAMES` in world."""
+    def link_poses(self) -> Array:
+        """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
         ...
 
     def contacts(self) -> int:

@@ -28,13 +28,11 @@ from palpate_models.scenario import Robot
 from palpate_models.table import boxes
 
 from palpate_robot.clearance import Clearance
-from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY, STICK_RADPS
+from palpate_robot.kinematics import Kinematics
+from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY, STICK_RADPS, Wrench
 
 LEAST_CLEARANCE_RAD: Final = 0.01
 """Closer than this, in angle, DART looks for contacts: far more than a step turns."""
-_WORLD: Final = dart.dynamics.Frame.World()
-_FORCE_FIRST: Final = np.array((3, 4, 5, 0, 1, 2))
-"""Order of a wrench's parts where the engine's has the moment first."""
 LOOK_EVERY: Final = 20
 """Steps between looks at the clearance while there is too little."""
 
@@ -114,6 +112,7 @@ class Plant:
         self._sensor = self._links["ft_sensor"]
         self._indenter = self._links["indenter"]
         stop = lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD
+        self._kinematics = Kinematics(robot)
         self._clearance = Clearance(self._links, capsules, boxes(robot), stop)
         self._free = 0.0  # sum of angles [rad] that the joints may turn before anything can touch
         self._look_in = 0  # steps until that is found anew
@@ -180,8 +179,9 @@ class Plant:
             self._look_in -= 1
             return False
         self._free = self._clearance.angle(self.q)
-        self._look_in = LOOK_EVERY
-        return self._free > LEAST_CLEARANCE_RAD
+        clear = self._free > LEAST_CLEARANCE_RAD
+        self._look_in = 0 if clear else LOOK_EVERY
+        return clear
 
     def gravity_torque(self) -> Array:
         """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""
@@ -195,27 +195,29 @@ class Plant:
         """[J]."""
         return float(self._arm.computeKineticEnergy())
 
-    def sensor_wrench(self) -> Array:
-        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m], shape (6,).
+    def sensor_wrench(self) -> Wrench:
+        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m].
 
         At the sensor's origin, in its axes, averaged over the last step: contact, weight and inertia of the tool.
         It is minus the wrench that the joint above `ft_sensor` transmits (Featherstone's f_i), constraints included.
         """
-        return np.asarray(-self._sensor.getBodyForce()[_FORCE_FIRST])
+        mx, my, mz, fx, fy, fz = self._sensor.getBodyForce().tolist()
+        return -fx, -fy, -fz, -mx, -my, -mz
 
-    def tool_pose(self) -> tuple[Array, Any]:
-        """Position p_WI [m], shape (3,), and orientation (DART quaternion) of the indenter in world."""
-        X_WI = self._indenter.getTransform()  # in world; dartpy takes three times as long over `getWorldTransform`
-        return X_WI.translation(), X_WI.quaternion()
+    def tool_motion(self) -> Array:
+        """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
-    def tool_twist(self) -> tuple[Array, Array]:
-        """Linear velocity [m/s] of the sphere's centre and angular velocity [rad/s], world axes, shapes (3,)."""
-        V_WI = self._indenter.getSpatialVelocity(_WORLD, _WORLD)
-        return V_WI[3:], V_WI[:3]
+        The linear velocity is that of the sphere's centre.
+        """
+        return self._kinematics.tool(self.q, self.v)
+
+    def link_poses(self) -> Array:
+        """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        return self._kinematics.links(self.q)
 
     def link_pose(self, link: str) -> tuple[Array, Any]:
-        """Position [m], shape (3,), and orientation (DART quaternion) of a link of `lbr.LINK_NAMES` in world."""
-        X_WL = self._links[link].getTransform()
+        """Position [m], shape (3,), and orientation (DART quaternion) of a link of `lbr.LINK_NAMES` in world, from the engine."""
+        X_WL = self._links[link].getTransform()  # in world; dartpy takes longer over `getWorldTransform`
         return X_WL.translation(), X_WL.quaternion()
 
     def contacts(self) -> int:

@@ -64,9 +64,8 @@ class RobotService(Service):
         self._driver = Driver(exam.limits.force_emergency_n)
         self._rng = joint_rng
         self._deviation = np.repeat((robot.position_noise_rad, robot.velocity_noise_radps), 7)
-        self._q_noise: Array = np.empty((0, 7))
-        self._v_noise: Array = np.empty((0, 7))
-        self._row = 0
+        self._joint_noise: list[Array] = []
+        """Of measurements to come, the last one first: of a tick's positions [rad], then its velocities [rad/s], shapes (7,)."""
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
         self._command: Command | None = None
@@ -76,7 +75,7 @@ class RobotService(Service):
         self._moment_W = np.zeros(3)
         self._pressed = False
         self._applied: Array = np.zeros(7)  # never written to: messages keep it
-        self._recent: list[Array] = []
+        self._recent: list[Array | list[float]] = []
         """Positions, velocities and F/T reading of each tick since the last status."""
         self._external_force = 0.0
         self._peak_force = 0.0
@@ -95,9 +94,10 @@ class RobotService(Service):
         self._drive(t, inbox)
         stamp = _Time(t // NS, t % NS)
         yield {"joint_states": self._joint_state(stamp)}
-        p_WI, q_WI = self._plant.tool_pose()
-        w, x, y, z = q_WI.w(), q_WI.x(), q_WI.y(), q_WI.z()
-        yield {"sim/tool_state": self._tool_state(stamp, p_WI, _Quaternion(x, y, z, w))}
+        px, py, pz, x, y, z, w, vx, vy, vz, wx, wy, wz = self._plant.tool_motion().tolist()
+        pose = _Pose(_Point(px, py, pz), _Quaternion(x, y, z, w))
+        twist = _Twist(_Vector3(vx, vy, vz), _Vector3(wx, wy, wz))
+        yield {"sim/tool_state": _ToolState(_Header(stamp, "world"), pose, twist, self._robot.indenter_radius_m)}
         up_S = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         outbox: dict[str, Message] = {"ft/wrench": self._wrench(stamp, up_S)}
         if not t % _STATUS_PERIOD:
@@ -145,7 +145,7 @@ class RobotService(Service):
         message = inbox.latest("control/joint_torque")
         if message is not None and message is not self._command_message:
             stamp = nanoseconds(message.header.stamp)
-            self._command = Command(message.torque, stamp, stamp + nanoseconds(message.valid_for), message.problem)
+            self._command = Command(np.array(message.torque), stamp, stamp + nanoseconds(message.valid_for), message.problem)
             self._command_message = message
         return self._command
 
@@ -171,12 +171,10 @@ class RobotService(Service):
             moment[0], moment[1], moment[2] = m.x, m.y, m.z
 
     def _joint_state(self, stamp: Message) -> Message:
-        if self._row == len(self._q_noise):
+        if not self._joint_noise:
             noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, 14))
-            self._q_noise, self._v_noise = noise[:, :7], noise[:, 7:]
-            self._row = 0
-        q, v = self._plant.q + self._q_noise[self._row], self._plant.v + self._v_noise[self._row]
-        self._row += 1
+            self._joint_noise = list(noise.reshape(-1, 7)[::-1])
+        q, v = self._plant.q + self._joint_noise.pop(), self._plant.v + self._joint_noise.pop()
         self._recent += (q, v)
         return _JointState(_Header(stamp, ""), _NAMES, q, v, self._applied)
 
@@ -184,18 +182,12 @@ class RobotService(Service):
         """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
         reading = self._sensor.read(self._plant.sensor_wrench())
         self._recent.append(reading)
-        fx, fy, fz, mx, my, mz = reading.tolist()
+        fx, fy, fz, mx, my, mz = reading
         weight = self._weight
         external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
         self._external_force = external**0.5
         self._peak_force = max(self._peak_force, self._external_force)
         return _WrenchStamped(_Header(stamp, "ft_sensor"), _Wrench(_Vector3(fx, fy, fz), _Vector3(mx, my, mz)))
-
-    def _tool_state(self, stamp: Message, p_WI: Array, rotation: Message) -> Message:
-        linear, angular = self._plant.tool_twist()
-        pose = _Pose(_Point(*p_WI.tolist()), rotation)
-        twist = _Twist(_Vector3(*linear.tolist()), _Vector3(*angular.tolist()))
-        return _ToolState(_Header(stamp, "world"), pose, twist, self._robot.indenter_radius_m)
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
@@ -216,12 +208,10 @@ class RobotService(Service):
         )
 
     def _link_poses(self, stamp: Message) -> Message:
-        transforms = []
-        for link in lbr.LINK_NAMES:
-            p, q = self._plant.link_pose(link)
-            rotation = _Quaternion(q.x(), q.y(), q.z(), q.w())
-            pose = _Transform(_Vector3(*p.tolist()), rotation)
-            transforms.append(_TransformStamped(_Header(stamp, "world"), link, pose))
+        transforms, stamped = [], _Header(stamp, "world")
+        for link, (px, py, pz, x, y, z, w) in zip(lbr.LINK_NAMES, self._plant.link_poses().tolist(), strict=True):
+            pose = _Transform(_Vector3(px, py, pz), _Quaternion(x, y, z, w))
+            transforms.append(_TransformStamped(stamped, link, pose))
         return _TFMessage(transforms)
 
 

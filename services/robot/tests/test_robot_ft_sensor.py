@@ -16,7 +16,7 @@ def _settle(plant: Plant, force: np.ndarray = NOTHING, moment: np.ndarray = NOTH
     """The true wrench at the sensor with the arm held still."""
     for _ in range(3):
         plant.step(plant.gravity_torque(), force, moment, np.full(7, 1e6))
-    return plant.sensor_wrench()
+    return np.array(plant.sensor_wrench())
 
 
 def _centre_of_mass(robot: Robot) -> np.ndarray:
@@ -97,7 +97,7 @@ def test_moving_tool_reads_weight_contact_and_inertia() -> None:
 def test_errors_have_the_scenarios_size() -> None:
     robot = Robot(ft_noise_n=0.1, ft_noise_nm=0.01, ft_bias_n=2.0, ft_bias_nm=0.2)
     sensor = FtSensor(robot, np.random.default_rng(0))
-    readings = np.array([sensor.read(np.zeros(6)) for _ in range(5000)])
+    readings = np.array([sensor.read([0.0] * 6) for _ in range(5000)])
     np.testing.assert_allclose(readings.std(axis=0), [0.1] * 3 + [0.01] * 3, rtol=0.05)
     np.testing.assert_allclose(readings.mean(axis=0), sensor.bias, atol=0.01)
     assert np.all(np.abs(sensor.bias) <= [2.0] * 3 + [0.2] * 3)
@@ -108,7 +108,7 @@ def test_errors_have_the_scenarios_size() -> None:
 
 def test_ideal_sensor_reads_the_truth() -> None:
     robot = Robot(ft_noise_n=0.0, ft_noise_nm=0.0, ft_bias_n=0.0, ft_bias_nm=0.0)
-    wrench = np.arange(6.0)
+    wrench = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     np.testing.assert_array_equal(FtSensor(robot, np.random.default_rng(0)).read(wrench), wrench)
 
 

@@ -8,6 +8,7 @@ from palpate_models.scenario import Robot
 from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, GRAVITY, STICK_RADPS
 from palpate_robot.plant import Plant
+from scipy.spatial.transform import Rotation
 
 NOTHING = np.zeros(3)
 NO_DAMPING = np.zeros(7)
@@ -40,19 +41,35 @@ def test_forward_kinematics_agrees_with_pinocchio(link: str) -> None:
         np.testing.assert_allclose(rotation.to_rotation_matrix(), X_WL.rotation, atol=1e-9)
 
 
-def test_tool_twist_agrees_with_pinocchio() -> None:
-    plant = Plant(FREE)
-    model, data = _model(FREE)
+def test_tool_motion_agrees_with_pinocchio() -> None:
+    robot = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
+    plant = Plant(robot)
+    model, data = _model(robot)
     rng = np.random.default_rng(2)
     frame = model.getFrameId("indenter")
-    for q in _postures(10):
+    for q in rng.uniform(-2, 2, (200, 7)):  # each part of the quaternion is the largest of some
         v = rng.uniform(-1, 1, 7)
         plant.reset(q, v)
         pin.forwardKinematics(model, data, q, v)
+        pin.updateFramePlacements(model, data)
         twist = pin.getFrameVelocity(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
-        linear, angular = plant.tool_twist()
-        np.testing.assert_allclose(linear, twist.linear, atol=1e-9)
-        np.testing.assert_allclose(angular, twist.angular, atol=1e-9)
+        motion = plant.tool_motion()
+        np.testing.assert_allclose(motion[:3], data.oMf[frame].translation, atol=1e-12)
+        np.testing.assert_allclose(Rotation.from_quat(motion[3:7]).as_matrix(), data.oMf[frame].rotation, atol=1e-12)
+        np.testing.assert_allclose(motion[7:10], twist.linear, atol=1e-12)
+        np.testing.assert_allclose(motion[10:], twist.angular, atol=1e-12)
+
+
+def test_link_poses_are_the_engines() -> None:
+    plant = Plant(FREE)
+    rng = np.random.default_rng(5)
+    for q in rng.uniform(-2, 2, (50, 7)):
+        plant.reset(q)
+        engine = [plant.link_pose(link) for link in lbr.LINK_NAMES]
+        poses = plant.link_poses()
+        np.testing.assert_allclose(poses[:, :3], [p for p, _ in engine], atol=1e-12)
+        np.testing.assert_allclose(poses[:, 3:], [(r.x(), r.y(), r.z(), r.w()) for _, r in engine], atol=1e-12)
+        np.testing.assert_array_equal(plant.tool_motion()[:7], poses[-1])
 
 
 def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
@@ -182,9 +199,9 @@ def test_hold_stops_a_moving_tool_within_a_millimetre() -> None:
     J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
     plant = Plant(robot)
     plant.reset(q, np.linalg.pinv(J) @ [0.0, 0.0, -0.03, 0.0, 0.0, 0.0])
-    start, _ = plant.tool_pose()
+    start = plant.tool_motion()
     for _ in range(300):
         plant.step(plant.gravity_torque(), NOTHING, NOTHING, HOLD_DAMPING)
-    end, _ = plant.tool_pose()
+    end = plant.tool_motion()
     assert 0 < start[2] - end[2] < 1e-3
     assert np.abs(plant.v).max() < 1e-3

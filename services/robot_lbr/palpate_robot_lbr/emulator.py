@@ -124,23 +124,21 @@ class Emulator:
 
     def wrench(self, now: int) -> Any:
         """What the F/T sensor's driver publishes."""
-        fx, fy, fz, mx, my, mz = self._ft.read(self._plant.sensor_wrench()).tolist()
+        fx, fy, fz, mx, my, mz = self._ft.read(self._plant.sensor_wrench())
         return WrenchStamped(header(now, "ft_sensor"), Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)))
 
     def tool(self, now: int) -> Any:
         """palpation_msgs/ToolState, exact."""
-        p, q = self._plant.tool_pose()
-        linear, angular = self._plant.tool_twist()
-        pose = Pose(Point(*p.tolist()), Quaternion(q.x(), q.y(), q.z(), q.w()))
-        return ToolState(header(now, "world"), pose, Twist(Vector3(*linear.tolist()), Vector3(*angular.tolist())), self._radius)
+        motion = self._plant.tool_motion().tolist()
+        pose = Pose(Point(*motion[:3]), Quaternion(*motion[3:7]))
+        return ToolState(header(now, "world"), pose, Twist(Vector3(*motion[7:10]), Vector3(*motion[10:])), self._radius)
 
     def links(self, now: int) -> Any:
         """tf2_msgs/TFMessage of all links in world, exact."""
         found = []
-        for link in lbr.LINK_NAMES:
-            p, q = self._plant.link_pose(link)
-            pose = Transform(Vector3(*p.tolist()), Quaternion(q.x(), q.y(), q.z(), q.w()))
-            found.append(TransformStamped(header(now, "world"), link, pose))
+        for link, pose in zip(lbr.LINK_NAMES, self._plant.link_poses().tolist(), strict=True):
+            transform = Transform(Vector3(*pose[:3]), Quaternion(*pose[3:]))
+            found.append(TransformStamped(header(now, "world"), link, transform))
         return TFMessage(found)
 
 

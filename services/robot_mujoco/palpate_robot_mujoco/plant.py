@@ -12,38 +12,15 @@ not used: its solver weighs it with M instead of M + h D, as DART's does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
-from palpate_robot.physics import DT, GRAVITY, STICK_RADPS
+from palpate_robot.physics import DT, GRAVITY, STICK_RADPS, Wrench
 
 from palpate_robot_mujoco.model import SUBSTEPS, build
-
-
-class Quaternion(NamedTuple):
-    """A unit quaternion, read as `palpate_robot.physics.Orientation` wants it."""
-
-    wxyz: tuple[float, float, float, float]
-
-    def w(self) -> float:
-        """Its real part."""
-        return self.wxyz[0]
-
-    def x(self) -> float:
-        """First imaginary part."""
-        return self.wxyz[1]
-
-    def y(self) -> float:
-        """Second imaginary part."""
-        return self.wxyz[2]
-
-    def z(self) -> float:
-        """Third imaginary part."""
-        return self.wxyz[3]
 
 
 class Plant:
@@ -59,9 +36,8 @@ class Plant:
         self._force_W = data.xfrc_applied[self._model.body("indenter").id, :3]
         self._moment_W = data.xfrc_applied[self._model.body("indenter").id, 3:]
         self._sensed, self._xpos, self._xquat = data.sensordata, data.xpos, data.xquat
-        self._bodies = {link: self._model.body(link).id for link in lbr.LINK_NAMES}
-        self._base = self._bodies[lbr.LINK_NAMES[0]]
-        self._indenter = self._bodies["indenter"]
+        self._bodies = [self._model.body(link).id for link in lbr.LINK_NAMES]
+        self._base, self._indenter = self._bodies[0], self._bodies[-1]
         self._weight = GRAVITY * float(self._model.body_subtreemass[self._base])
         self._viscous = robot.joint_damping_nms
         self._coulomb = robot.joint_friction_nm
@@ -124,27 +100,29 @@ class Plant:
         mujoco.mj_mulM(self._model, self._data, product, self.v)
         return float(self.v @ product / 2)
 
-    def sensor_wrench(self) -> Array:
-        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m], shape (6,).
+    def sensor_wrench(self) -> Wrench:
+        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m].
 
         At the sensor's origin, in its axes, in the last half millisecond: contact, weight and inertia of the tool. MuJoCo's
         force and torque sensors read the wrench of the parent on the child.
         """
-        return np.asarray(-self._sensed)
+        fx, fy, fz, mx, my, mz = self._sensed.tolist()
+        return -fx, -fy, -fz, -mx, -my, -mz
 
-    def tool_pose(self) -> tuple[Array, Quaternion]:
-        """Position p_WI [m], shape (3,), and orientation of the indenter in world."""
-        return self.link_pose("indenter")
+    def tool_motion(self) -> Array:
+        """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
-    def tool_twist(self) -> tuple[Array, Array]:
-        """Linear velocity [m/s] of the sphere's centre and angular velocity [rad/s], world axes, shapes (3,)."""
-        mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, self._indenter, self._twist, 0)
-        return self._twist[3:].copy(), self._twist[:3].copy()
+        The linear velocity is that of the sphere's centre.
+        """
+        body, twist = self._indenter, self._twist
+        mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
+        quaternion = self._xquat[body]  # w first
+        return np.concatenate((self._xpos[body], quaternion[1:], quaternion[:1], twist[3:], twist[:3]))
 
-    def link_pose(self, link: str) -> tuple[Array, Quaternion]:
-        """Position [m], shape (3,), and orientation of a link of `lbr.LINK_NAMES` in world."""
-        body = self._bodies[link]
-        return self._xpos[body].copy(), Quaternion(tuple(self._xquat[body].tolist()))
+    def link_poses(self) -> Array:
+        """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        quaternions = self._xquat[self._bodies]  # w first
+        return np.column_stack((self._xpos[self._bodies], quaternions[:, 1:], quaternions[:, :1]))
 
     def contacts(self) -> int:
         """Number of contact points with table or base in the last step."""

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate_tissue import kernel
 from palpate_tissue.soft_body import SoftBody
-from palpate_tissue.surface import Surface
+from palpate_tissue.surface import Surface, placed
 from palpate_tissue.tissue import Tissue
 
 Array = NDArray[np.float64]
@@ -149,9 +149,9 @@ class TissueService(Service):
 
     def _surface_message(self, t: int) -> Message:
         vertices_A = self._tissue.deformed_vertices
-        normals_A = self._surface.normals(self._tissue.inward)
-        vertices_W = vertices_A @ self._R_AW + self._p_WA
-        return _SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_A @ self._R_AW), self._triangles)
+        vertices_W = placed(vertices_A, self._R_WA, self._p_WA)
+        normals_W = self._surface.normals(self._tissue.inward, self._R_WA)
+        return _SurfaceMesh(header(t, "world"), vertices_W, normals_W, self._triangles)
 
     def _truth(self, t: int, tool: Message | None, force_W: Sequence[float]) -> Message:
         if tool is None:

@@ -13,6 +13,8 @@ from palpate_models.phantom import PhantomModel
 from scipy import sparse
 
 Array = NDArray[np.float64]
+Index = NDArray[np.uint32]
+Single = NDArray[np.float32]
 
 _FAR_M = 0.15
 """Further away than this, the nearest vertex stands for the nearest point."""
@@ -43,8 +45,10 @@ class Surface:
         self._faces = _incident_faces(model)
         # Maps an offset from the first corner to its barycentric coordinates, shape (m, 2, 3).
         self._gradient = _gradient(model, np.linalg.pinv(sides.transpose(0, 2, 1)).astype(np.float64))
+        self.normals(np.zeros(len(model.vertices)), np.eye(3))  # compiles what it calls, and so do the next two
+        placed(model.vertices, np.eye(3), np.zeros(3))
         self._fields = np.column_stack((model.breathing, model.stiffness))
-        self.nearest(model.vertices[0].copy())  # compiles what it calls
+        self.nearest(model.vertices[0].copy())
 
     def nearest(self, p: Array, excursion: float = 0.0) -> RestPoint:
         """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m]."""
@@ -57,17 +61,16 @@ class Surface:
         )
         return RestPoint(found[0:3], found[3:6], float(found[6]), float(found[7]))
 
-    def normals(self, inward: Array) -> Array:
-        """Unit vertex normals (n, 3) of the surface whose vertices have moved inward by (n,) [m] along their normals.
+    def normals(self, inward: Array, R: Array) -> Single:
+        """Unit vertex normals, in axes that `R` (3, 3) takes them to, one after the other, shape (3 n,).
 
-        n + grad u, normalised: exact for a plane, and otherwise to first order in u times curvature.
+        Of the surface whose vertices have moved `inward` by (n,) [m] along their normals: n + grad u, normalised. Exact for a
+        plane, and otherwise to first order in u times curvature.
         """
-        normals = self._model.normals + (self._gradient @ inward).reshape(-1, 3)
-        normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
-        return np.asarray(normals)
+        return tilted(inward, self._model.normals, *self._gradient, R)
 
 
-def _incident_faces(model: PhantomModel) -> list[NDArray[np.uint32]]:
+def _incident_faces(model: PhantomModel) -> list[Index]:
     """The triangles at each vertex."""
     corner = model.triangles.ravel()
     order = np.argsort(corner, kind="stable")
@@ -75,8 +78,11 @@ def _incident_faces(model: PhantomModel) -> list[NDArray[np.uint32]]:
     return np.split((order // 3).astype(np.uint32), first)
 
 
-def _gradient(model: PhantomModel, flat: Array) -> sparse.csr_array:
-    """Surface gradient [1/m] of a field at the vertices, area-weighted from the triangles, shape (3 n, n)."""
+def _gradient(model: PhantomModel, flat: Array) -> tuple[Index, Index, Array]:
+    """Surface gradient [1/m] of a field at the vertices, area-weighted from the triangles: rows of vertices in CSR form.
+
+    Where each begins, (n + 1,), the vertices it takes the field at, (k,), and their three slopes, (k, 3).
+    """
     m, n = len(model.triangles), len(model.vertices)
     sides = model.vertices[model.triangles[:, 1:]] - model.vertices[model.triangles[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
@@ -84,14 +90,44 @@ def _gradient(model: PhantomModel, flat: Array) -> sparse.csr_array:
     slopes = np.concatenate((-flat.sum(axis=1, keepdims=True), flat), axis=1)  # of the three hat functions, (m, 3, 3)
     share = area[:, None] / total[model.triangles]  # (m, 3): a face's weight at each of its corners
     values = share[:, :, None, None] * slopes[:, None, :, :]  # (m, at corner, of corner, axis)
-    rows = 3 * model.triangles[:, :, None, None] + np.arange(3)
-    columns = np.broadcast_to(model.triangles[:, None, :, None], (m, 3, 3, 3))
-    rows = np.broadcast_to(rows, (m, 3, 3, 3))
-    return sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * n, n))
+    rows = np.broadcast_to(model.triangles[:, :, None], (m, 3, 3)).ravel()
+    columns = np.broadcast_to(model.triangles[:, None, :], (m, 3, 3)).ravel()
+    axes = [sparse.csr_array((values[..., axis].ravel(), (rows, columns)), shape=(n, n)) for axis in range(3)]
+    slope = np.column_stack([part.data for part in axes])
+    return axes[0].indptr.astype(np.uint32), axes[0].indices.astype(np.uint32), slope
 
 
 @compiled
-def nearest_on_faces(p: Array, faces: NDArray[np.uint32], triangles: NDArray[np.uint32], vertices: Array, weights: Array) -> int:
+def tilted(inward: Array, normals: Array, indptr: Index, indices: Index, slope: Array, R: Array) -> Single:
+    """The unit normals of a deformed surface, turned by `R`; see `Surface.normals` and `_gradient`."""
+    out = np.empty(normals.size, np.float32)
+    for i in range(inward.shape[0]):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        for j in range(indptr[i], indptr[i + 1]):
+            u = inward[indices[j]]
+            x += slope[j, 0] * u
+            y += slope[j, 1] * u
+            z += slope[j, 2] * u
+        length = sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        for k in range(3):
+            out[3 * i + k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z
+    return out
+
+
+@compiled
+def placed(vertices: Array, R: Array, p: Array) -> Single:
+    """Points (n, 3) in other axes and from another origin, R x + p, one after the other, shape (3 n,)."""
+    out = np.empty(vertices.size, np.float32)
+    for i in range(vertices.shape[0]):
+        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        for k in range(3):
+            out[3 * i + k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + p[k]
+    return out
+
+
+@compiled
+def nearest_on_faces(p: Array, faces: Index, triangles: Index, vertices: Array, weights: Array) -> int:
     """The face, among some, that is nearest to `p` (3,); `weights` (3,) get the barycentric coordinates of its nearest point."""
     best = -1
     least = np.inf
@@ -130,8 +166,8 @@ def rest_point(
     vertex: int,
     near: bool,
     excursion: float,
-    faces: NDArray[np.uint32],
-    triangles: NDArray[np.uint32],
+    faces: Index,
+    triangles: Index,
     vertices: Array,
     normals: Array,
     fields: Array,

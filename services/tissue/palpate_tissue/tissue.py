@@ -24,7 +24,7 @@ from palpate_tissue.mechanics import assemble
 
 Array = NDArray[np.float64]
 
-_SKIN_M = 0.0025
+_SKIN_M = 0.005
 """Contact candidates are gathered anew when the sphere has moved this far."""
 _REACH_M = 0.030
 """Least depth of the sphere's centre below the rest surface at which its candidates are still complete."""
