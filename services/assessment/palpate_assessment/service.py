@@ -33,9 +33,9 @@ PITCH = 0.005
 MARGIN = 0.020
 """The map's grid goes this far beyond the examined region [m]: what the footprint reaches."""
 GROWING_PITCH = 0.008
-GROWING_SAMPLES = 300
+GROWING_SAMPLES = 200
 """A growing map takes every n-th sample, so that it stays cheap."""
-GROWING_EVERY = 4 * NS
+GROWING_EVERY = 6 * NS
 GROWING_FIRST = 40
 """Samples before the first growing map."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})

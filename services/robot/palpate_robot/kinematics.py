@@ -1,4 +1,4 @@
-"""Where links and tool are and how fast the tool moves: forward kinematics on the tables of `lbr`, compiled.
+"""Where links and tool are, how fast the tool moves and what they weigh: kinematics on the tables of `lbr`, compiled.
 
 A physics engine knows all this, too, but asking one through its Python binding takes ten times as long.
 """
@@ -12,6 +12,8 @@ from palpate_models import lbr
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
+
+from palpate_robot.physics import GRAVITY
 
 
 @compiled
@@ -59,16 +61,29 @@ def _pose(frame: Array, z: float, out: Array) -> None:
 
 
 @compiled
-def _motion(q: Array, v: Array, chain: Array, tool: float, frames: Array) -> Array:
-    """See `Kinematics.tool`; the tool is `tool` [m] along the last link's z axis."""
+def _state(q: Array, v: Array, chain: Array, tool: float, masses: Array, frames: Array) -> Array:
+    """See `Kinematics.state`; the tool is `tool` [m] along the last link's z axis.
+
+    `masses` (7, 4) has the mass behind each joint up to the next [kg] and its centre in that link [m].
+    """
     _frames(q, chain, frames)
-    out = np.empty(13)
-    _pose(frames[q.shape[0]], tool, out)
-    out[7:] = 0.0
-    for i in range(q.shape[0]):
+    n = q.shape[0]
+    out = np.empty(13 + n)
+    _pose(frames[n], tool, out)
+    out[7:13] = 0.0
+    mass = mx = my = 0.0  # of all that is behind the joint: mass, and mass times centre
+    for i in range(n - 1, -1, -1):
         X = frames[i + 1]
+        m, x, y, z = masses[i, 0], masses[i, 1], masses[i, 2], masses[i, 3]
+        mass += m
+        mx += m * (X[0, 0] * x + X[0, 1] * y + X[0, 2] * z + X[0, 3])
+        my += m * (X[1, 0] * x + X[1, 1] * y + X[1, 2] * z + X[1, 3])
+        x, y, z = chain[i, 3], chain[i, 4], chain[i, 5]
+        ax, ay = X[0, 0] * x + X[0, 1] * y + X[0, 2] * z, X[1, 0] * x + X[1, 1] * y + X[1, 2] * z
+        out[13 + i] = GRAVITY * (ax * (my - mass * X[1, 3]) - ay * (mx - mass * X[0, 3]))
         rx, ry, rz = out[0] - X[0, 3], out[1] - X[1, 3], out[2] - X[2, 3]
         x, y, z = chain[i, 3] * v[i], chain[i, 4] * v[i], chain[i, 5] * v[i]
+        # What this joint's speed gives the tool.
         wx = X[0, 0] * x + X[0, 1] * y + X[0, 2] * z
         wy = X[1, 0] * x + X[1, 1] * y + X[1, 2] * z
         wz = X[2, 0] * x + X[2, 1] * y + X[2, 2] * z
@@ -99,23 +114,30 @@ class Kinematics:
 
     def __init__(self, robot: Robot) -> None:
         """For an arm on its base, with its tool. Compiles."""
+        links = list(lbr.inertias(robot).values())[1:]  # the first does not move
+        mass, centre = np.array([link.mass for link in links]), np.array([link.com for link in links])
+        self._mounts: Array = np.cumsum((lbr.LINK_7_TO_FLANGE_M, lbr.FLANGE_TO_FT_M, lbr.FT_TO_INDENTER_M))
+        centre[7:, 2] += self._mounts
+        moment = mass[:, None] * centre
+        mass[6], moment[6] = mass[6:].sum(), moment[6:].sum(axis=0)
+        self._masses: Array = np.column_stack((mass[:7], moment[:7] / mass[:7, None]))
         c, s = np.cos(robot.base_yaw_rad), np.sin(robot.base_yaw_rad)
         x, y = robot.base_xy_m
         self._frames: Array = np.zeros((8, 3, 4))
         self._frames[0] = (c, -s, 0.0, x), (s, c, 0.0, y), (0.0, 0.0, 1.0, robot.base_height_m)
         self._chain: Array = np.column_stack((lbr.JOINT_ORIGIN, lbr.JOINT_AXIS))
-        self._mounts: Array = np.cumsum((lbr.LINK_7_TO_FLANGE_M, lbr.FLANGE_TO_FT_M, lbr.FT_TO_INDENTER_M))
         self._tool_m = float(self._mounts[-1])
-        self.tool(np.zeros(7), np.zeros(7))
+        self.state(np.zeros(7), np.zeros(7))
         self.links(np.zeros(7))
 
-    def tool(self, q: Array, v: Array) -> Array:
-        """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
+    def state(self, q: Array, v: Array) -> Array:
+        """Motion of the indenter in world, and the joint torques that carry arm and tool, shape (20,).
 
-        The linear velocity is that of the sphere's centre.
+        Position p_WI [m], orientation x, y, z, w, velocity of the sphere's centre [m/s], angular velocity [rad/s]; then the
+        torques [N m].
         """
-        motion: Array = _motion(q, v, self._chain, self._tool_m, self._frames)
-        return motion
+        state: Array = _state(q, v, self._chain, self._tool_m, self._masses, self._frames)
+        return state
 
     def links(self, q: Array) -> Array:
         """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""

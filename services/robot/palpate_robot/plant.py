@@ -118,7 +118,7 @@ class Plant:
         self._look_in = 0  # steps until that is found anew
         self._viscous = robot.joint_damping_nms
         self._coulomb = robot.joint_friction_nm
-        self._origin = np.zeros(3)
+        self._known: Array | None = None
         self.q: Array
         """Joint positions [rad], a fresh array at every step."""
         self.v: Array
@@ -140,9 +140,10 @@ class Plant:
         """Puts the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
         self._arm.setPositions(np.asarray(q, dtype=float))
         self._arm.setVelocities(np.zeros(7) if v is None else np.asarray(v, dtype=float))
+        self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
+        self._known = None
         self._arm.setForces(self.gravity_torque())
         self._arm.computeForwardDynamics()  # so that the sensor reads the tool's weight before the first step
-        self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
         self._free, self._look_in = 0.0, 0
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
@@ -153,10 +154,11 @@ class Plant:
         """
         viscous, coulomb = self._viscous, self._coulomb
         for set_damping, v, extra in zip(self._set_damping, self.v.tolist(), damping.tolist(), strict=True):
-            set_damping(viscous + extra + coulomb / max(v, -v, STICK_RADPS))
+            speed = abs(v)
+            set_damping(viscous + extra + coulomb / (speed if speed > STICK_RADPS else STICK_RADPS))
         self._arm.setForces(torque)
         if force_W is not None:
-            self._indenter.addExtForce(force_W, self._origin, False, True)
+            self._indenter.addExtForce(force_W)  # at its origin, in world axes
             self._indenter.addExtTorque(moment_W, False)
         if self._is_clear():
             arm = self._arm
@@ -169,6 +171,7 @@ class Plant:
         else:
             self._world.step()  # clears torques and external forces, too
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
+        self._known = None
 
     def _is_clear(self) -> bool:
         """Whether nothing can touch during the coming step."""
@@ -185,7 +188,13 @@ class Plant:
 
     def gravity_torque(self) -> Array:
         """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""
-        return np.asarray(self._arm.getGravityForces())
+        return self._state()[13:]
+
+    def _state(self) -> Array:
+        """What `Kinematics.state` says here."""
+        if self._known is None:
+            self._known = self._kinematics.state(self.q, self.v)
+        return self._known
 
     def accelerations(self) -> Array:
         """Joint accelerations of the last step [rad/s^2], shape (7,)."""
@@ -209,7 +218,7 @@ class Plant:
 
         The linear velocity is that of the sphere's centre.
         """
-        return self._kinematics.tool(self.q, self.v)
+        return self._state()[:13]
 
     def link_poses(self) -> Array:
         """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""

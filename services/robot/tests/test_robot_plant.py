@@ -60,8 +60,9 @@ def test_tool_motion_agrees_with_pinocchio() -> None:
         np.testing.assert_allclose(motion[10:], twist.angular, atol=1e-12)
 
 
-def test_link_poses_are_the_engines() -> None:
+def test_poses_and_weight_are_the_engines() -> None:
     plant = Plant(FREE)
+    model, data = _model(FREE)
     rng = np.random.default_rng(5)
     for q in rng.uniform(-2, 2, (50, 7)):
         plant.reset(q)
@@ -70,6 +71,8 @@ def test_link_poses_are_the_engines() -> None:
         np.testing.assert_allclose(poses[:, :3], [p for p, _ in engine], atol=1e-12)
         np.testing.assert_allclose(poses[:, 3:], [(r.x(), r.y(), r.z(), r.w()) for _, r in engine], atol=1e-12)
         np.testing.assert_array_equal(plant.tool_motion()[:7], poses[-1])
+        np.testing.assert_allclose(plant.gravity_torque(), pin.computeGeneralizedGravity(model, data, q), atol=1e-11)
+        np.testing.assert_allclose(plant.gravity_torque(), plant._arm.getGravityForces(), atol=1e-11)
 
 
 def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
