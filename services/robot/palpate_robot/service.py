@@ -75,8 +75,9 @@ class RobotService(Service):
         self._moment_W = np.zeros(3)
         self._pressed = False
         self._applied: Array = np.zeros(7)  # never written to: messages keep it
-        self._recent: list[Array | list[float]] = []
-        """Positions, velocities and F/T reading of each tick since the last status."""
+        self._recent: list[Array] = []
+        self._readings: list[list[float]] = []
+        """Positions and velocities, and F/T reading, of each tick since the last status."""
         self._external_force = 0.0
         self._peak_force = 0.0
 
@@ -181,7 +182,7 @@ class RobotService(Service):
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
         reading = self._sensor.read(self._plant.sensor_wrench())
-        self._recent.append(reading)
+        self._readings.append(reading)
         fx, fy, fz, mx, my, mz = reading
         weight = self._weight
         external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
@@ -191,17 +192,18 @@ class RobotService(Service):
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
-        ticks = len(self._recent) // 3
+        ticks = len(self._readings)
         mean = np.add.reduce(np.concatenate(self._recent).reshape(ticks, -1)) / ticks
+        fx, fy, fz, mx, my, mz = (np.add.reduce(self._readings) / ticks).tolist()
         self._recent.clear()
-        fx, fy, fz, mx, my, mz = mean[14:].tolist()
+        self._readings.clear()
         return _RobotStatus(
             _Header(stamp, ""),
             int(driver.mode),
             int(driver.cause),
             driver.reason,
             mean[:7],
-            mean[7:14],
+            mean[7:],
             _Wrench(_Vector3(fx, fy, fz), _Vector3(mx, my, mz)),
             self._applied,
             driver.rejected,

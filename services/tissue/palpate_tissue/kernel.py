@@ -14,7 +14,7 @@ from palpate_models.compiled import compiled
 from palpate_tissue.friction import rub
 
 Array = NDArray[np.float64]
-Index = NDArray[np.uint32]
+Index = NDArray[np.uint16] | NDArray[np.uint32]
 """Unsigned: a signed index may be negative to numba, and looking each time doubles the cost of the field's step."""
 _USUAL = 7
 """Entries of most rows of the field's matrix: a vertex and its six neighbours."""

@@ -79,7 +79,10 @@ class Tissue:
         self._prony_g = stiffness.prony_g
         advance = -self._h * self.mechanics.stiffness
         advance.data /= np.repeat(self.mechanics.damping, np.diff(advance.indptr))
-        matrix = (advance.indptr.astype(np.uint32), advance.indices.astype(np.uint32), advance.data)
+        columns: kernel.Index = advance.indices.astype(np.uint32)
+        if n <= np.iinfo(np.uint16).max:  # all of the field goes through the cache at each step: the less the better
+            columns = columns.astype(np.uint16)
+        matrix = (advance.indptr.astype(np.uint32), columns, advance.data)
         self._field = (*matrix, self.branches, decay, feed, np.zeros(n))
         self._gain = self.mechanics.damping / self._h
         free = np.flatnonzero(~model.fixed)

@@ -11,6 +11,7 @@ import pytest
 from palpate_models import phantom as phantoms
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Breathing, Lesion, Phantom, Stiffness
+from palpate_tissue import kernel
 from palpate_tissue.mechanics import MOST_SUBSTEPS, StabilityError, assemble
 from palpate_tissue.tissue import Tissue
 
@@ -311,3 +312,19 @@ def test_a_position_that_is_not_finite_is_refused():
     tissue = Tissue(flat_phantom(0.03), Stiffness())
     with pytest.raises(ValueError, match="not finite"):
         tissue.step(0, np.array((0.0, np.nan, 0.0)), STILL, 0.015)
+
+
+def test_fields_of_small_and_large_meshes_move_alike():
+    """Vertices of a small mesh are numbered in 16 bits."""
+    tissue = Tissue(build_phantom(Phantom(), 0))
+    indptr, indices, rate, branches, _, _, strain = tissue._field
+    assert indices.dtype == np.uint16
+    rng = np.random.default_rng(3)
+    start = rng.normal(0.0, 1e-3, len(tissue.displacement))
+    moved = []
+    for dtype in (np.uint16, np.uint32):
+        u = start.copy()
+        kernel.relax(indptr, indices.astype(dtype), rate, branches, strain, u)
+        moved.append(u)
+    np.testing.assert_array_equal(*moved)
+    assert (moved[0] != start).any()
