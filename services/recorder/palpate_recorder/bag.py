@@ -80,8 +80,10 @@ class _File:
 
     def take(self, stamp: int) -> None:
         self.messages += 1
-        self.first = stamp if self.first is None else min(self.first, stamp)
-        self.last = max(self.last, stamp)
+        if self.first is None or stamp < self.first:
+            self.first = stamp
+        if stamp > self.last:  # noqa: PLR1730 - `max` would cost as much as all the rest
+            self.last = stamp
 
     @property
     def extent(self) -> dict[str, Any]:
