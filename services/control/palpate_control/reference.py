@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntEnum
 from math import exp, sqrt
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -60,7 +61,7 @@ class Setpoint:
     """All of them as in `layout`, shape (64,)."""
 
     def __post_init__(self) -> None:
-        values: Array = np.concatenate([*map(self.__getattribute__, _NAMES), _STILL], axis=None)
+        values: Array = np.concatenate((*_PARTS(self), _STILL), axis=None)
         if values.size != layout.COUNT:
             raise ValueError(f"set-point: has {values.size - _STILL.size} numbers: must be {layout.COUNT - _STILL.size}")
         if not ((values >= _LOW) & (values <= _HIGH)).all():  # so it is, too, where one is NaN
@@ -97,7 +98,7 @@ RANGES: Final = (
 )
 """What a set-point may ask for: attribute, part of it, the message's field, least and largest value; as in the contract, where it
 says."""
-_NAMES: Final = tuple(name for name in layout.NUMBERS.names or () if name != "qdd")  # which is the last
+_PARTS: Final = attrgetter(*(name for name in layout.NUMBERS.names or () if name != "qdd"))  # which is the last
 _STILL: Final = np.zeros(layout.COUNT - layout.QDD)
 
 

@@ -30,6 +30,11 @@ def at(stamp: int, p: float = 0.0, v: float = 0.0, mode: Mode = Mode.CARTESIAN, 
     return Setpoint(**(fields | changes))  # type: ignore[arg-type]
 
 
+def test_a_setpoint_has_all_its_numbers() -> None:
+    with pytest.raises(ValueError, match="has 56 numbers: must be 57"):
+        at(0, q=np.zeros(6))
+
+
 def test_asks_for_a_setpoint_first() -> None:
     with pytest.raises(ValueError, match="no set-point"):
         Extrapolator().at(0)

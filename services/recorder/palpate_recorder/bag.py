@@ -80,10 +80,8 @@ class _File:
 
     def take(self, stamp: int) -> None:
         self.messages += 1
-        if self.first is None or stamp < self.first:
-            self.first = stamp
-        if stamp > self.last:  # noqa: PLR1730 - `max` would cost as much as all the rest
-            self.last = stamp
+        self.first = stamp if self.first is None else min(self.first, stamp)
+        self.last = max(self.last, stamp)
 
     @property
     def extent(self) -> dict[str, Any]:

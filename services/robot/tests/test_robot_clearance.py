@@ -43,6 +43,27 @@ def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -
     assert free > 100, "the test shall see steps without a search"
 
 
+def test_nothing_is_looked_for_while_nothing_is_near(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm that swings far from everything uses its clearance up again and again, and finds new room at each look."""
+    plant = Plant(Robot(), lbr.HOME)
+    looks: list[float] = []
+    angle = plant._clearance.angle
+
+    def look(q: np.ndarray) -> float:
+        looks.append(angle(q))
+        return looks[-1]
+
+    monkeypatch.setattr(plant._clearance, "angle", look)
+    searched = 0
+    for k in range(2500):
+        torque = plant.gravity_torque() + 4 * np.sin(0.003 * k + np.arange(7.0))
+        plant.step(torque, None, NOTHING, np.full(7, 3.0))
+        searched += plant._free <= LEAST_CLEARANCE_RAD
+    assert len(looks) > 2
+    assert min(looks) > LEAST_CLEARANCE_RAD
+    assert searched == 0
+
+
 def test_the_clearance_ends_at_a_joint_stop() -> None:
     plant = Plant(Robot())
     q = np.array(lbr.HOME)
