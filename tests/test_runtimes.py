@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -155,10 +156,12 @@ def test_an_interrupted_run_ends_every_service_and_says_when() -> None:
             raise KeyboardInterrupt
 
     done: list[bool] = []
-    outcome = run_toys(interrupt, {"TOY_END_S": "30"})
+    outcome = run_toys(interrupt, {"TOY_END_S": "300"})
     assert outcome.interrupted
     assert outcome.failure is not None
-    assert outcome.failure.startswith("interrupted at tick 0.")
+    said = re.fullmatch(r"interrupted at tick (\d+\.\d{3}) s", outcome.failure)
+    assert said is not None, outcome.failure
+    assert 0 < float(said[1]) < 300, "how far it is by then depends on the machine"
     assert outcome.run_hash is None
     assert done
 
