@@ -4,7 +4,7 @@
 |---|---|---|
 | `PALPATE_CAMERA_ROUTER` | `tcp/127.0.0.1:7447` | zenoh endpoint of the ROS side, its rmw_zenohd |
 | `PALPATE_CAMERA_DOMAIN` | 0 | its ROS domain |
-| `PALPATE_CAMERA_IMAGE` | `camera/depth/image_rect_raw` | rectified depth, 16UC1 [mm] or 32FC1 [m] |
+| `PALPATE_CAMERA_IMAGE` | `camera/depth/image_rect_raw` | depth, 16UC1 [mm] or 32FC1 [m]; rectified if so called (`rect`) |
 | `PALPATE_CAMERA_INFO` | `camera/depth/camera_info` | its intrinsics |
 | `PALPATE_CAMERA_FRAME` | `camera_depth_optical_frame` | its optical frame |
 | `PALPATE_CAMERA_WORLD` | `world` | the ROS frame that is our world: floor under the robot, z up, x to the table |
@@ -38,6 +38,9 @@ POSE_WAIT_S = 20.0
 class CameraPort(ABC):
     """The ROS side, as the bridge sees it."""
 
+    rectified: bool = False
+    """Whether its images are rectified: then `camera_info`'s P holds for them, else its K and distortion."""
+
     @abstractmethod
     def images(self) -> list[Any]:
         """sensor_msgs/Image since last time, oldest first."""
@@ -61,6 +64,7 @@ class ZenohCamera(CameraPort):
         self._node = RosNode("palpate_camera_ros", domain, BusOptions(router=router))
         image = (environ.get("PALPATE_CAMERA_IMAGE") or "camera/depth/image_rect_raw").strip("/")
         info = (environ.get("PALPATE_CAMERA_INFO") or "camera/depth/camera_info").strip("/")
+        self.rectified = "rect" in image.rpartition("/")[2]  # image_proc's names: image_rect, image_rect_raw
         self._images = self._node.subscription(image, "sensor_msgs/msg/Image")
         self._infos = self._node.subscription(info, "sensor_msgs/msg/CameraInfo")
         self._tf = self._node.subscription("tf_static", "tf2_msgs/msg/TFMessage", latched=True)
@@ -112,7 +116,7 @@ class RosCameraService(Service):
         try:
             _agree(images[-1], info, self._frame)
             image = _image(t, images[-1])
-            intrinsics = _intrinsics(t, info)
+            intrinsics = _intrinsics(t, info, rectified=self._port.rectified)
         except CameraError as error:
             self._facts["frames_rejected"] += 1
             self._problem = str(error)
@@ -163,14 +167,19 @@ def _image(t: int, image: Any) -> Any:
     return Image(header(t, FRAME), image.height, image.width, "32FC1", 0, 4 * image.width, data)
 
 
-def _intrinsics(t: int, info: Any) -> Any:
-    if np.any(np.abs(np.asarray(info.d)) > 1e-9):
-        raise CameraError(f"camera_info: d = {list(info.d)}: want a rectified image, without distortion")
-    K = np.asarray(info.k, dtype=float)
-    if K[0] <= 0 or K[4] <= 0:
-        raise CameraError(f"camera_info: k = {K.tolist()}: the focal lengths must be positive")
-    P, R = np.asarray(info.p, dtype=float), np.eye(3).ravel()
-    return CameraInfo(header(t, FRAME), info.height, info.width, "plumb_bob", np.zeros(5), K, R, P, 0, 0, info.roi)
+def _intrinsics(t: int, info: Any, *, rectified: bool) -> Any:
+    """Intrinsics of the image as it is, without distortion: of a rectified one P's, where it is set (sensor_msgs/CameraInfo)."""
+    P = np.asarray(info.p, dtype=float).reshape(3, 4)
+    K, name = (P[:, :3], "p") if rectified and P.any() else (np.asarray(info.k, dtype=float).reshape(3, 3), "k")
+    if name == "k" and np.any(np.abs(np.asarray(info.d)) > 1e-9):
+        raise CameraError(
+            f"camera_info: d = {list(info.d)}: want an image without distortion, or a rectified one: `rect` in its name, and p"
+        )
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise CameraError(f"camera_info: {name} = {K.ravel().tolist()}: the focal lengths must be positive")
+    P = np.hstack((K, np.zeros((3, 1))))
+    size = (info.height, info.width)
+    return CameraInfo(header(t, FRAME), *size, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P.ravel(), 0, 0, info.roi)
 
 
 def create(scenario: Scenario) -> RosCameraService:

@@ -133,6 +133,36 @@ def test_a_distorted_image_is_refused_and_said_so() -> None:
     assert "rectified" in str(service.finish()["problem"])
 
 
+def intrinsics(rectified: bool, info: Any) -> Any:
+    """What the bridge says of an image that came with these; None where it refuses."""
+    port = Port()
+    port.rectified, port.intrinsics = rectified, info
+    service = RosCameraService(port)
+    inbox = asked(1)
+    service.step(0, inbox)
+    port.waiting = [ros_image()]
+    return service.step(100_000_000, inbox).get("camera/depth/camera_info")
+
+
+def test_a_rectified_image_has_the_intrinsics_of_p_and_no_distortion() -> None:
+    """image_proc sends the raw image's camera_info with the rectified one: K and d are of the raw image, P is of this one."""
+    info = ros_info(d=0.1)
+    info.p = np.array([550.0, 0, 1.5, -22.0, 0, 560.0, 1.0, 0, 0, 0, 1, 0])
+    said = intrinsics(True, info)
+    assert said.k.reshape(3, 3).tolist() == [[550.0, 0, 1.5], [0, 560.0, 1.0], [0, 0, 1]]
+    assert said.p.reshape(3, 4)[:, :3].tolist() == said.k.reshape(3, 3).tolist()
+    assert not said.p.reshape(3, 4)[:, 3].any()
+    assert not said.d.any()
+    assert intrinsics(False, info) is None
+
+
+def test_without_p_or_without_rectification_k_counts() -> None:
+    unset, raw = ros_info(), ros_info()
+    unset.p = np.zeros(12)
+    raw.p = np.array([550.0, 0, 1.5, 0, 0, 560.0, 1.0, 0, 0, 0, 1, 0])
+    assert intrinsics(True, unset).k[0] == intrinsics(False, raw).k[0] == 600.0
+
+
 def test_an_image_that_camera_info_is_not_of_is_refused_and_said_so() -> None:
     port = Port()
     port.intrinsics.width, port.intrinsics.height = 6, 4
@@ -166,7 +196,9 @@ def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     tf.publish(TFMessage(TREE))  # long before anybody listens
     images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
     infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
-    service = RosCameraService(ZenohCamera({"PALPATE_CAMERA_ROUTER": endpoint}))
+    camera = ZenohCamera({"PALPATE_CAMERA_ROUTER": endpoint})
+    assert camera.rectified
+    service = RosCameraService(camera)
     inbox = asked(1)
     service.step(0, inbox)
     out: Any = {}
