@@ -15,6 +15,7 @@ from palpate_bus.strategies import messages
 
 RULES = contract()
 TOPICS = pytest.mark.parametrize("topic", RULES.topics.values(), ids=lambda topic: topic.name)
+ROOT = Path(__file__).parents[2]
 PINNED = Path(__file__).with_name("type_hashes.yaml")
 FRAMES = {"world", "abdomen", "ft_sensor", "camera_depth_optical_frame"}
 
@@ -150,6 +151,18 @@ def test_edges_fit_the_kind_of_topic(topic: Topic) -> None:
 
 def test_every_topic_is_read_and_recorded() -> None:
     assert all("recorder" in topic.readers for topic in RULES.topics.values())
+
+
+def test_nobody_waits_for_what_it_does_not_use() -> None:
+    """Looked for by name in the sources of whatever plays the role: such an edge would hold the run up for nothing."""
+    unused = []
+    for role in RULES.roles:
+        players = (ROOT / "services").glob(f"{role}*/palpate_*/**/*.py")
+        sources = "".join(path.read_text(encoding="utf-8") for path in players)
+        unused += [
+            f"{role}: {t.name}" for t, edge in RULES.inputs(role) if edge is not Edge.OBSERVE and f'"{t.name}"' not in sources
+        ]
+    assert unused == []
 
 
 def test_no_cycle_of_same_tick_edges() -> None:
