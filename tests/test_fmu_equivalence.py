@@ -20,8 +20,9 @@ from palpate_bus.service import Service
 from palpate_bus.stamps import NS
 from palpate_conductor.__main__ import FIXED
 from palpate_conductor.collector import Collector
+from palpate_conductor.composed_run import load_services
 from palpate_conductor.processes import compose_file
-from palpate_conductor.run import WORKERS, load_services
+from palpate_conductor.run import WORKERS
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance

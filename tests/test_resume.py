@@ -11,7 +11,8 @@ from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus
 from palpate_bus.service import Inbox, Outbox
 from palpate_bus.stamps import NS, header
 from palpate_conductor.collector import Collected, Collector
-from palpate_conductor.run import WORKERS, load_services
+from palpate_conductor.composed_run import load_services
+from palpate_conductor.run import WORKERS
 from palpate_models.load import load_scenario
 
 HELD_FOR = NS

@@ -19,7 +19,7 @@ from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, Superv
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.stamps import NS, header, nanoseconds
 from palpate_conductor.collector import Collector
-from palpate_conductor.run import load_services
+from palpate_conductor.composed_run import load_services
 from palpate_models.load import load_scenario
 
 MS = 1_000_000

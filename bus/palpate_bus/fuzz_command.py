@@ -6,11 +6,10 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
+from palpate_bus.command_line import EXIT_FAILED, refuse
 from palpate_bus.fuzz import campaign, choose, guided
-
-EXIT_BAD_INPUT = 2
-EXIT_FOUND = 3
 
 
 def fuzz(
@@ -24,18 +23,17 @@ def fuzz(
     try:
         chosen = choose(names or [])
     except ValueError as error:
-        console.print(f"[bold red]palpate fuzz:[/] {error}", highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
+        refuse(error)
     if coverage:
         bad = [target.name for target in chosen if guided(target, inputs, seed)]
         console.print(f"{len(chosen)} targets, finds in: {', '.join(bad) or 'none'}", highlight=False)
-        raise typer.Exit(EXIT_FOUND if bad else 0)
+        raise typer.Exit(EXIT_FAILED if bad else 0)
     done = campaign(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
     for find in done.finds:
-        console.print(f"[red]{find.target}[/] {find.error}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
+        console.print(f"[red]{find.target}[/] {escape(str(find.error))}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
     rate = sum(done.inputs.values()) / done.seconds
     print(f"{sum(done.inputs.values())} inputs, {len(chosen)} targets, seed {seed}: {len(done.finds)} finds, {rate:.0f} inputs/s")
-    raise typer.Exit(EXIT_FOUND if done.finds else 0)
+    raise typer.Exit(EXIT_FAILED if done.finds else 0)
 
 
 def main() -> None:

@@ -9,13 +9,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from palpate_bus.command_line import refuse
 from palpate_bus.keys import CA_KEY, DAYS, KeysError, certificates, init, members
 
 app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
 
 Folder = Annotated[Path, typer.Argument(help="Folder of the keys.")]
 DEFAULT = Path("keys")
-EXIT_BAD_INPUT = 2
 
 
 @app.command("init")
@@ -29,13 +29,11 @@ def make(
     console = Console(stderr=True)
     for known in name or ():
         if known not in members():
-            console.print(f"[bold red]palpate keys:[/] --name {known}: members are {', '.join(members())}", highlight=False)
-            raise typer.Exit(EXIT_BAD_INPUT)
+            refuse(f"--name {known}: members are {', '.join(members())}")
     try:
         made = init(folder, name or (), host or (), days)
     except (KeysError, OSError, ValueError) as error:
-        console.print(f"[bold red]palpate keys:[/] {error}", highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
+        refuse(error)
     console.print(
         f"{len(made)} new in {folder}: {', '.join(c.name for c in made)}" if made else f"{folder}: all hold", highlight=False
     )
@@ -50,8 +48,7 @@ def show(folder: Folder = DEFAULT) -> None:
     try:
         found = certificates(folder)
     except KeysError as error:
-        Console(stderr=True).print(f"[bold red]palpate keys:[/] {error}", highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
+        refuse(error)
     table = Table("name", "holds until", "SHA-256", box=None)
     for certificate in found:
         until = f"{certificate.until:%Y-%m-%d}" + (" [red]expired[/]" if certificate.expired else "")

@@ -11,9 +11,10 @@ from contextlib import AbstractContextManager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from time import sleep
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
+from palpate_bus.command_line import refuse
 from palpate_bus.operator_keys import HINT, OperatorKeys
 from palpate_bus.runs import Run, live, matching
 from palpate_bus.zenoh_config import BusConfigError
@@ -27,7 +28,6 @@ from palpate_dashboard.picture import NoPicture, take
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import MEMORY_LIMIT, Live, address
 
-EXIT_BAD_INPUT = 2
 DEFAULT_PORT = 9876
 PICTURE_PX = (1500, 940)
 
@@ -72,14 +72,9 @@ def dashboard(
         else:
             _view(_recording(Path(source), console), port, native, show, console)
     except (NothingToShow, NoPicture, BusConfigError, ScenarioError, OSError, ValueError) as error:
-        _fail(console, str(error))
+        refuse(error)
     except KeyboardInterrupt:
         raise typer.Exit from None
-
-
-def _fail(console: Console, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {message}", highlight=False, soft_wrap=True)
-    raise typer.Exit(EXIT_BAD_INPUT)
 
 
 def _the_run(chosen: str | None) -> Run:

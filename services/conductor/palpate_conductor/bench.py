@@ -20,9 +20,11 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate_conductor.case_display import CaseDisplay
+from palpate_conductor.composed_run import run_composed
 from palpate_conductor.files import write_text
 from palpate_conductor.platforms import fingerprint
-from palpate_conductor.run import OBSERVERS, RunResult, run_composed, run_distributed
+from palpate_conductor.result import RunResult
+from palpate_conductor.run import OBSERVERS, run_distributed
 
 
 def _figures(result: RunResult) -> dict[str, Any]:

@@ -26,7 +26,8 @@ from palpate_conductor.evidence import peak_force
 from palpate_conductor.forks import Forks
 from palpate_conductor.outcome import Patience, RunFailed
 from palpate_conductor.processes import LocalProcesses, compose_file, read_processes
-from palpate_conductor.run import WORKERS, Progress, RunResult, conduct, write_scenario_files
+from palpate_conductor.result import Progress, RunResult
+from palpate_conductor.run import WORKERS, conduct, write_scenario_files
 
 SETTINGS: Final = (
     "exam.region_m=[0.03, 0.03]",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from palpate_bus.command_line import EXIT_FAILED, output_file, refuse
 from rich.console import Console
 from rich.markup import escape
 
@@ -17,8 +18,6 @@ from palpate_conductor.case_display import CaseDisplay
 from palpate_conductor.files import write_text
 from palpate_conductor.marked import doc_option, write_part
 
-EXIT_BAD_INPUT = 2
-EXIT_FAILED = 3
 WIDE = 200
 
 Listed = Annotated[list[str] | None, typer.Option("--only", help="Keep these roles and topics; may be repeated.")]
@@ -28,9 +27,7 @@ def faults(
     mode: Annotated[list[str] | None, typer.Option(help="lockstep, wallclock; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"Out of {', '.join(KINDS)}; all by default.")] = None,
     only: Listed = None,
-    out: Annotated[Path, typer.Option(help="File for the findings; those already there are kept, and not run again.")] = Path(
-        "faults.json"
-    ),
+    out: Annotated[Path, output_file("File for the findings; those that it holds are not run again.")] = Path("faults.json"),
     doc: Annotated[Path | None, doc_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
@@ -41,13 +38,11 @@ def faults(
     for name, given, known in (("--mode", wanted_modes, ("lockstep", "wallclock")), ("--kind", wanted_kinds, KINDS)):
         for value in given:
             if value not in known:
-                console.print(f"[bold red]palpate:[/] {name} {value}: allowed are {', '.join(known)}")
-                raise typer.Exit(EXIT_BAD_INPUT)
+                refuse(f"{name} {value}: allowed are {', '.join(known)}")
     found = _load(out)
     todo = list(cases(wanted_modes, wanted_kinds, only or ()))
     if not todo:
-        console.print(f"[bold red]palpate:[/] nothing to do: {', '.join(only or ())} is no role or topic of these kinds")
-        raise typer.Exit(EXIT_BAD_INPUT)
+        refuse(f"nothing to do: {', '.join(only or ())} is no role or topic of these kinds")
     if not again:
         done = {(f.kind, f.where, f.mode) for f in found}
         todo = [case for case in todo if (case.kind, case.where, "wall clock" if case.wallclock else "lockstep") not in done]
@@ -71,6 +66,9 @@ def faults(
 def _load(path: Path) -> list[Finding]:
     if not path.exists():
         return []
-    rows = json.loads(path.read_text(encoding="utf-8"))
-    found = [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        found = [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
+    except (ValueError, TypeError, AttributeError) as error:
+        refuse(f"--out {path}: holds no findings of this command: {error}")
     return [finding for finding in found if finding.injected_s is not None]  # those that never began are tried again

@@ -1,36 +1,27 @@
-"""The commands of `palpate` that start, conduct and measure runs; other packages add theirs (see `commands`)."""
+"""The commands of `palpate` that start and conduct runs, and say of what; the others stand by themselves (see `commands`)."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from contextlib import nullcontext
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
+from palpate_bus.command_line import fail, refuse
 from palpate_bus.contract import contract
-from palpate_bus.guard import serve as serve_secure
 from palpate_bus.keys import KeysError
-from palpate_bus.router import DEFAULT_ENDPOINT, serve
 from palpate_bus.zenoh_config import BusConfigError, close_session, open_session
 from palpate_models.load import ScenarioError, exam_input, load_scenario, scenario_names
-from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.scenario import Scenario
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
-from palpate_conductor.bench import GROUPS
-from palpate_conductor.bench import bench as run_bench
-from palpate_conductor.case_display import CaseDisplay
-from palpate_conductor.evaluate import DEFAULT_CASES
-from palpate_conductor.evaluate import evaluate as run_evaluation
-from palpate_conductor.evaluate import table as evaluation_table
-from palpate_conductor.files import write_text
+from palpate_conductor.composed_run import run_composed
 from palpate_conductor.implementations import NONE, chosen_services
+from palpate_conductor.inputs import Settings, usable
 from palpate_conductor.join import Absent, JoinError
 from palpate_conductor.outcome import RunFailed
 from palpate_conductor.own import OwnServiceError, own_services
@@ -38,19 +29,15 @@ from palpate_conductor.page import write_page
 from palpate_conductor.processes import ProcessListError
 from palpate_conductor.progress import RunDisplay
 from palpate_conductor.report import print_findings, write_results
-from palpate_conductor.run import OBSERVERS, RunResult, run_composed, run_distributed, workers, write_scenario_files
+from palpate_conductor.result import RunResult
+from palpate_conductor.run import OBSERVERS, run_distributed, workers, write_scenario_files
 from palpate_conductor.run import conduct as run_conduct
 from palpate_conductor.secure import SecureBus
 from palpate_conductor.tree import FrameTree
 
-EXIT_BAD_INPUT = 2
-EXIT_FAILED = 3
-SECURE_ENDPOINT = "tls/[::]:7447"
 NEEDS_WALLCLOCK = "tissue.implementation = 'none' is for hardware, which does not wait: run with --wallclock"
 WIDE = 160
 """Columns of the wide tables, where the terminal has fewer or there is none."""
-
-Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")]
 
 app = typer.Typer(
     name="palpate",
@@ -59,11 +46,6 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_show_locals=False,
 )
-
-
-def _fail(console: Console, status: int, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {escape(message)}", highlight=False, soft_wrap=True)
-    raise typer.Exit(status)
 
 
 RUN_EXAMPLES = """
@@ -83,14 +65,6 @@ RUN_EXAMPLES = """
 
   palpate run my.yaml --composed                all services in one process, for sweeps and debugging
 """
-
-
-def _usable(name: str, settings: Sequence[str], seed: int | None) -> Scenario:
-    """A scenario whose phantom can be made. Raises ScenarioError or MeshError."""
-    scenario = load_scenario(name, settings, seed)
-    if scenario.tissue.implementation != NONE:
-        build_phantom(scenario.phantom, scenario.seed)
-    return scenario
 
 
 @app.command(epilog=RUN_EXAMPLES)
@@ -115,9 +89,7 @@ def run(
     keys: Annotated[
         Path | None, typer.Option(help="With --secure: folder of `palpate keys init`; else keys of this run.")
     ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
-    ] = None,
+    settings: Settings = None,
     services: Annotated[
         list[str] | None,
         typer.Option("--service", metavar="ROLE=FILE.py", help="A service of your own in place of ours; may be repeated."),
@@ -132,23 +104,23 @@ def run(
     """
     console = Console(stderr=True)
     quiet = quiet or as_json
+    chosen = usable(scenario, settings, seed)
     try:
-        chosen = _usable(scenario, settings or (), seed)
         chosen_services(chosen)
         own = own_services(services or ())
         absent = Absent(tuple(without or ()), wait, partial(console.print, highlight=False, soft_wrap=True))
-    except (ScenarioError, MeshError, OwnServiceError, JoinError) as error:
-        _fail(console, EXIT_BAD_INPUT, str(error))
+    except (ScenarioError, OwnServiceError, JoinError) as error:
+        refuse(error)
     if composed and (realtime or wallclock):
-        _fail(console, EXIT_BAD_INPUT, "--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
+        refuse("--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
     if chosen.tissue.implementation == NONE and not wallclock:
-        _fail(console, EXIT_BAD_INPUT, NEEDS_WALLCLOCK)
+        refuse(NEEDS_WALLCLOCK)
     if without and (composed or set(without) & own.keys()):
-        _fail(console, EXIT_BAD_INPUT, "--without ROLE leaves out a process: it goes without --composed and --service ROLE=...")
+        refuse("--without ROLE leaves out a process: it goes without --composed and --service ROLE=...")
     if handover and not wallclock:
-        _fail(console, EXIT_BAD_INPUT, "--handover is for --wallclock: in lockstep every message of a service is awaited")
+        refuse("--handover is for --wallclock: in lockstep every message of a service is awaited")
     if (composed and secure) or (keys and not secure):
-        _fail(console, EXIT_BAD_INPUT, "--secure is for processes, so it goes without --composed; --keys goes with --secure")
+        refuse("--secure is for processes, so it goes without --composed; --keys goes with --secure")
     folder = out or Path("out") / f"{chosen.name}-{datetime.now():%Y%m%d-%H%M%S}"
     observers = OBSERVERS if record else ()
     if not quiet:
@@ -167,9 +139,9 @@ def run(
                         chosen, folder.resolve(), display.tell, observers, pace, wallclock, None, bus, own, handover, absent
                     )
     except (ProcessListError, OwnServiceError, JoinError, BusConfigError, KeysError, OSError) as error:
-        _fail(console, EXIT_BAD_INPUT, str(error))
+        refuse(error)
     except RunFailed as error:
-        _fail(console, EXIT_FAILED, str(error))
+        fail(error)
     _conclude(console, folder, chosen, result, quiet, as_json)
 
 
@@ -187,7 +159,7 @@ def _conclude(
     if not quiet:
         console.print(f"to read: {page}", highlight=False, soft_wrap=True)
     if result.failure:
-        _fail(console, EXIT_FAILED, f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+        fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
 
 
 @app.command()
@@ -195,17 +167,10 @@ def prepare(
     scenario: Annotated[str, typer.Argument(help="Name of a scenario or a YAML file.")] = "rlq_guarding",
     out: Annotated[Path, typer.Option(help="Folder for the scenario files.")] = Path("out"),
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
-    ] = None,
+    settings: Settings = None,
 ) -> None:
     """Write scenario.yaml (for tissue and scoring) and exam.yaml (for everybody else): the first step of a run in containers."""
-    console = Console(stderr=True)
-    try:
-        chosen = _usable(scenario, settings or (), seed)
-    except (ScenarioError, MeshError) as error:
-        _fail(console, EXIT_BAD_INPUT, str(error))
-    write_scenario_files(chosen, out)
+    write_scenario_files(usable(scenario, settings, seed), out)
 
 
 @app.command()
@@ -221,14 +186,14 @@ def conduct(
     watching = tuple(name for name in observers.split(",") if name)
     for name in watching:
         if name not in OBSERVERS:
-            _fail(console, EXIT_BAD_INPUT, f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
+            refuse(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
     try:
         chosen = load_scenario(str(out / "scenario.yaml"))
         if chosen.tissue.implementation == NONE and not wallclock:
-            _fail(console, EXIT_BAD_INPUT, NEEDS_WALLCLOCK)
+            refuse(NEEDS_WALLCLOCK)
         session = open_session()
     except (ScenarioError, BusConfigError) as error:
-        _fail(console, EXIT_BAD_INPUT, str(error))
+        refuse(error)
     roles = (*workers(chosen), *watching)
     with RunDisplay(console, quiet) as display:
         pace, tree = 1.0 if realtime else None, FrameTree(exam_input(chosen))
@@ -268,57 +233,3 @@ def topics() -> None:
             readers,
         )
     Console(width=max(WIDE, Console().width)).print(table)
-
-
-@app.command()
-def bench(
-    scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "rlq_guarding",
-    out: Annotated[Path, typer.Option(help="File for the figures.")] = Path("bench.json"),
-    only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only.")] = False,
-) -> None:
-    """Measure the parts, the bus among them, and whole runs; print tables and write bench.json."""
-    for group in only or ():
-        if group not in GROUPS:
-            raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
-    run_bench(scenario, out, Console(width=max(WIDE, Console().width)), only or GROUPS, quiet)
-
-
-@app.command()
-def evaluate(
-    names: Annotated[list[str] | None, typer.Argument(help="Scenarios; `elsewhere` draws a lesion from each seed.")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Seeds 0 to N-1.")] = 5,
-    workers: Annotated[int, typer.Option(min=1, help="Examinations at a time.")] = 2,
-    out: Annotated[Path, typer.Option(help="File for the reports.")] = Path("evaluation.json"),
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the table only.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the reports as JSON, and nothing else.")] = False,
-) -> None:
-    """Examine many abdomens and print how well what is there was found; write the reports."""
-    console = Console(stderr=True)
-    with CaseDisplay(console, quiet or as_json) as display:
-        reports = run_evaluation(names or DEFAULT_CASES, range(seeds), workers, display.tell)
-    write_text(out, json.dumps(reports))
-    if as_json:
-        print(json.dumps(reports))
-    else:
-        Console(width=max(WIDE, Console().width)).print(evaluation_table(reports))
-    if any(report["failure"] for report in reports):
-        raise typer.Exit(EXIT_FAILED)
-
-
-@app.command()
-def router(
-    listen: Annotated[list[str] | None, typer.Argument(help="Endpoints to listen on, e.g. tcp/0.0.0.0:7447.")] = None,
-    keys: Annotated[
-        Path | None, typer.Option(help="The router's folder of certificates: a secure router, at one tls/ endpoint.")
-    ] = None,
-) -> None:
-    """Run a zenoh router for services in containers or on several machines, until a signal."""
-    console = Console(stderr=True)
-    try:
-        if keys is not None:
-            serve_secure(keys, (listen or [SECURE_ENDPOINT])[0], ready=console.print)
-            return
-        serve(listen or (DEFAULT_ENDPOINT,), ready=console.print)
-    except BusConfigError as error:
-        _fail(console, EXIT_BAD_INPUT, str(error))

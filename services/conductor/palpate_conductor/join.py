@@ -12,10 +12,11 @@ from typing import Annotated, NoReturn
 
 import typer
 from palpate_bus import runs
+from palpate_bus.command_line import refuse
 from palpate_bus.contract import contract
 
 from palpate_conductor.implementations import DEFAULT, ImplementationError, installed_command
-from palpate_conductor.place import Implementation, OwnService, PlaceError, RunName, become, live_run, refuse
+from palpate_conductor.place import Implementation, OwnService, PlaceError, RunName, become, live_run
 
 FILE = "join.json"
 """In the results folder: command and environment of each process that is left to its user."""

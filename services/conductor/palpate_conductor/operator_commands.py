@@ -7,14 +7,13 @@ from typing import Annotated
 
 import typer
 import zenoh
+from palpate_bus.command_line import EXIT_FAILED, refuse, say
 from palpate_bus.desk import NotAnswered, ask
 from palpate_bus.joining import NoBus, find, find_all
 from palpate_bus.zenoh_config import BusConfigError, session
 from rich.console import Console
 from rich.markup import escape
 
-EXIT_BAD_INPUT = 2
-EXIT_FAILED = 3
 MEET_S = 1.0
 """How long a run may take to be met on the bus."""
 
@@ -64,8 +63,7 @@ def _say(word: str, reason: str, name: str | None, *, everyone: bool = False, ms
     try:
         buses = find_all(chosen=name) if everyone else [find(chosen=name)]
     except (NoBus, BusConfigError, OSError) as error:
-        console.print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
+        refuse(error)
     failed = False
     for bus in buses:
         try:
@@ -73,7 +71,7 @@ def _say(word: str, reason: str, name: str | None, *, everyone: bool = False, ms
                 answer, after_ms = _met(joined, bus.domain, word, reason, ms)
         except (NotAnswered, BusConfigError) as error:
             failed = True
-            console.print(f"[bold red]palpate:[/] {escape(f'{bus.title}: {error}')}", highlight=False, soft_wrap=True)
+            say(f"{bus.title}: {error}")
         else:
             words = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
             console.print(escape(words), highlight=False, soft_wrap=True)

@@ -10,10 +10,6 @@ from typing import Annotated, NoReturn
 
 import typer
 from palpate_bus import runs
-from rich.console import Console
-from rich.markup import escape
-
-EXIT_BAD_INPUT = 2
 
 Implementation = Annotated[str, typer.Option(help="An installed implementation, as in `--set <role>.implementation`.")]
 OwnService = Annotated[Path | None, typer.Option(metavar="FILE.py", help="A service of one's own instead.")]
@@ -31,12 +27,6 @@ def live_run(name: str | None) -> runs.Run:
         there = ", ".join(run.name for run in runs.live()) or "none"
         raise PlaceError(f"no run{f' {name}' if name else ''} is on; on this machine: {there}")
     return found[-1]
-
-
-def refuse(error: Exception) -> NoReturn:
-    """Prints what is wrong and ends the command with the status of bad input."""
-    Console(stderr=True).print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-    raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
 def become(words: Sequence[str], environment: Mapping[str, str]) -> NoReturn:

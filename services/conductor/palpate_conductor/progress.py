@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
 
-from palpate_conductor.run import Progress as RunProgress
+from palpate_conductor.result import Progress as RunProgress
 
 PHASES = {
     getattr(ExamState, f"PHASE_{name}"): name.lower()

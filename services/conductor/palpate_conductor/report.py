@@ -29,7 +29,7 @@ from palpate_conductor.evidence import (
 from palpate_conductor.figures import draw_map
 from palpate_conductor.files import write_text
 from palpate_conductor.platforms import fingerprint
-from palpate_conductor.run import RunResult
+from palpate_conductor.result import RunResult
 
 Point = tuple[float, ...]
 

@@ -8,16 +8,15 @@ import subprocess
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
+from palpate_bus.command_line import refuse
 from rich.console import Console
-from rich.markup import escape
 
 from palpate_conductor.archive import EvidenceError
 from palpate_conductor.page import write_page
 
-EXIT_BAD_INPUT = 2
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PRINT_TIMEOUT_S = 120
 
@@ -46,11 +45,6 @@ def write_pdf(page: Path) -> Path:
     return target
 
 
-def _fail(console: Console, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {escape(message)}", highlight=False, soft_wrap=True)
-    raise typer.Exit(EXIT_BAD_INPUT)
-
-
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of a run.")],
     pdf: Annotated[bool, typer.Option("--pdf", help="Also report.pdf, printed by a Chromium browser.")] = False,
@@ -64,7 +58,7 @@ def report(
             page = write_page(folder)
             paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
     except (EvidenceError, PrintError, OSError) as error:
-        _fail(console, str(error))
+        refuse(error)
     if as_json:
         print(json.dumps({kind: str(path) for kind, path in paths.items()}))
     elif not quiet:

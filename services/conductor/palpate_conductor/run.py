@@ -1,35 +1,27 @@
-"""One run from scenario to results folder, distributed or composed."""
+"""One run of processes on the bus: its scenario files, its start, its end."""
 
 from __future__ import annotations
 
-import gc
-import os
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import zenoh
-from palpate_bus.composed import Composed, ServiceFailed
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState
-from palpate_bus.recording import RawRecorder
-from palpate_bus.service import Service
 from palpate_bus.stamps import NS
 from palpate_bus.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, domain_from_env, open_session
 from palpate_models.load import dump_scenario, exam_input, redacted
 from palpate_models.scenario import Scenario
 
-from palpate_conductor.collector import Collected, Collector
+from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.implementations import NONE, chosen_environment, chosen_processes, chosen_services
+from palpate_conductor.implementations import NONE, chosen_environment, chosen_processes
 from palpate_conductor.join import Absent
 from palpate_conductor.outcome import Patience, RunFailed
-from palpate_conductor.own import in_place, load
+from palpate_conductor.own import in_place
 from palpate_conductor.processes import LocalProcesses, compose_file, override_files, read_processes
+from palpate_conductor.result import Progress, RunResult, Tell, given_up
 from palpate_conductor.secure import SecureBus
 from palpate_conductor.takeover import keep_places
 from palpate_conductor.tree import FrameTree
@@ -39,45 +31,6 @@ OBSERVERS = ("dashboard", "recorder")
 KNOWS_PHANTOM = frozenset({"tissue"})
 SIM_LIMIT = 3600 * NS
 """A run that nobody has ended by then [ns] is ended."""
-
-
-@dataclass
-class RunResult:
-    """What a run left, in memory."""
-
-    runtime: str
-    collected: Collected
-    run_hash: str | None
-    digests: dict[str, str]
-    """SHA-256 over the messages of each hashed topic: where two runs differ, this says in which topic."""
-    sim_time_s: float
-    wall_time_s: float
-    start_time_s: float
-    """From the command to the first tick."""
-    blame: dict[str, Any]
-    counters: dict[str, Any]
-    failure: str | None
-    """Service and cause, or why planning gave the examination up; None when it completed."""
-    lost: dict[str, int]
-    interrupted: bool = False
-    """Whether it was ended by Ctrl-C or SIGTERM; what it had measured until then is here all the same."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a user wants to see while a run is on."""
-
-    t: int
-    """Simulated time [ns]."""
-    real_time_factor: float
-    collected: Collected
-    trouble: tuple[str, ...] = ()
-    """What went wrong so far: who was lost, when and how."""
-    request: Callable[[int, str], None] | None = None
-    """Passes on an operator's request, with its reason; None where there is nobody to pass it to."""
-
-
-Tell = Callable[[Progress], None]
 
 
 def workers(scenario: Scenario) -> tuple[str, ...]:
@@ -190,7 +143,7 @@ def conduct(
 
     try:
         outcome = conductor.run(died, report)
-        failure = outcome.failure or _given_up(collector.collected)
+        failure = outcome.failure or given_up(collector.collected)
     except RunFailed as error:
         outcome = conductor.outcome
         failure = str(error)
@@ -210,96 +163,4 @@ def conduct(
         failure=failure,
         lost=outcome.lost,
         interrupted=outcome.interrupted,
-    )
-
-
-def _given_up(collected: Collected) -> str | None:
-    """Why planning ended the examination early; None when it did not."""
-    exam = collected.exam
-    return str(exam.message) if exam is not None and exam.phase == ExamState.PHASE_ABORTED else None
-
-
-def load_services(scenario: Scenario, roles: tuple[str, ...], own: Mapping[str, Path] | None = None) -> list[Service]:
-    """The services of `roles` in this process, from the files of `own` and the entry points `palpate.services`.
-
-    Raises OwnServiceError for a file without a service, RunFailed naming a role that no installed package provides.
-    """
-    found = {point.name: point for point in entry_points(group="palpate.services")}
-    found.update(chosen_services(scenario))
-    exam = redacted(scenario)
-    services = []
-    for role in roles:
-        path = (own or {}).get(role)
-        if path is None and role not in found:
-            raise RunFailed(f"no installed package provides the service {role!r} (entry point palpate.services)")
-        create: Callable[[Scenario], Service] = found[role].load() if path is None else load(role, path)
-        services.append(create(scenario if role in KNOWS_PHANTOM else exam))
-    return services
-
-
-def run_composed(
-    scenario: Scenario,
-    out: Path,
-    tell: Tell,
-    observers: tuple[str, ...] = OBSERVERS,
-    own: Mapping[str, Path] | None = None,
-) -> RunResult:
-    """Runs all services in this process; `own` gives the file that plays a role in place of an installed service."""
-    begin = perf_counter()
-    write_scenario_files(scenario, out)
-    os.environ["PALPATE_OUT"] = str(out)
-    os.environ.update(chosen_environment(scenario))
-    collector = Collector(tree=FrameTree(exam_input(scenario)))
-    observing = load_services(scenario, observers, own)
-    recorders = [service for service in observing if isinstance(service, RawRecorder)]
-    viewers = [service for service in observing if service not in recorders]
-    run = Composed(
-        [*load_services(scenario, WORKERS, own), *viewers, collector], taps=[recorder.record for recorder in recorders]
-    )
-    start = perf_counter()
-    failure = None
-    last = 0
-    told = start
-
-    def end() -> int | None:
-        nonlocal told
-        now = perf_counter()
-        if now - told > 0.1:
-            told = now
-            tell(Progress(run.t, run.t / NS / (now - start), collector.collected, tuple(run.trouble)))
-        return collector.collected.end_tick
-
-    lost: dict[str, int] = {}
-    interrupted = False
-    gc.freeze()  # full collections in mid-run need not go through all that was loaded
-    try:
-        last = run.run(end, SIM_LIMIT)
-    except KeyboardInterrupt:
-        interrupted = True
-        failure, last = f"interrupted at tick {run.t / NS:.3f} s", run.t
-    except ServiceFailed as error:
-        failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.why}"
-        lost = {error.role: error.t}
-        last = error.t
-    finally:
-        gc.unfreeze()
-    wall = perf_counter() - start
-    facts = run.finish()
-    for recorder in recorders:
-        if isinstance(recorder, Service):
-            with suppress(Exception) if recorder.role in run.lost else nullcontext():
-                facts[recorder.role] = recorder.finish()
-    return RunResult(
-        runtime="composed",
-        collected=collector.collected,
-        run_hash=None if failure else run.run_hash(),
-        digests=run.digests(),
-        sim_time_s=last / NS,
-        wall_time_s=wall,
-        start_time_s=start - begin,
-        blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
-        counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
-        failure=failure or _given_up(collector.collected),
-        lost={**run.lost, **lost},
-        interrupted=interrupted,
     )

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from palpate_bus.command_line import fail, output_folder, refuse
 from rich.console import Console
-from rich.markup import escape
 
+from palpate_conductor.inputs import usable
 from palpate_conductor.marked import doc_option, write_part
 from palpate_conductor.processes import ProcessListError, compose_file
 from palpate_conductor.swaps import measure, read_swaps, table
@@ -20,12 +21,13 @@ def swaps(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field in every run; may be repeated.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the runs.")] = Path("out/swaps"),
+    out: Annotated[Path, output_folder("Folder for the runs.")] = Path("out/swaps"),
     keep: Annotated[bool, typer.Option("--keep", help="Do not run again what is in the folder.")] = False,
     doc: Annotated[Path | None, doc_option("swaps")] = None,
 ) -> None:
     """Measure what each swap of `swap/` changes in the findings; print the table. A minute or two a swap."""
     console = Console(stderr=True)
+    usable(scenario, settings)
     try:
         known = read_swaps(compose_file().parent / "swap")
         unknown = [name for name in only or () if name not in known]
@@ -33,9 +35,10 @@ def swaps(
             raise ProcessListError(f"--only {', '.join(unknown)}: there are {', '.join(known)}")
         chosen = [known[name] for name in only or known]
         reports = measure(scenario, settings or (), chosen, out, keep, lambda name: console.print(f"examining: {name}"))
-    except (ProcessListError, RuntimeError) as error:
-        console.print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-        raise typer.Exit(2 if isinstance(error, ProcessListError) else 3) from error
+    except ProcessListError as error:
+        refuse(error)
+    except RuntimeError as error:
+        fail(error)
     text = table(chosen, reports)
     typer.echo(text)
     if doc is not None:

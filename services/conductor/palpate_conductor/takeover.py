@@ -9,11 +9,12 @@ from typing import Annotated, NoReturn
 
 import typer
 from palpate_bus import runs
+from palpate_bus.command_line import refuse
 from palpate_bus.zenoh_config import BusOptions
 
 from palpate_conductor.handover import ROLES
 from palpate_conductor.implementations import DEFAULT, ImplementationError, installed_command
-from palpate_conductor.place import OwnService, PlaceError, RunName, become, live_run, refuse
+from palpate_conductor.place import OwnService, PlaceError, RunName, become, live_run
 from palpate_conductor.processes import ProcessListError, ServiceProcess, compose_file, read_processes
 
 FILE = "places.json"

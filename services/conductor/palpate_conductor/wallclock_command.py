@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from palpate_bus.command_line import fail, output_folder
 from rich.console import Console
-from rich.markup import escape
 
 from palpate_conductor.archive import read_figures
+from palpate_conductor.inputs import Settings, usable
 from palpate_conductor.marked import doc_option, write_part
 
 FAST = ("robot", "tissue", "control")
@@ -99,10 +100,8 @@ def comparison(reports: Mapping[str, dict[str, Any]]) -> str:
 def wallclock(
     scenario: Annotated[str, typer.Argument(help="The examination.")] = "rlq_guarding",
     rate: Annotated[list[int] | None, typer.Option(help="Of the controller [Hz]; may be repeated. 200, 500 and 1000.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the runs; by default they are thrown away.")] = None,
+    settings: Settings = None,
+    out: Annotated[Path | None, output_folder("Folder for the runs; by default they are thrown away.")] = None,
     doc: Annotated[Path | None, doc_option("wallclock")] = None,
 ) -> None:
     """Measure an examination in real time: age of states and commands, late ticks, and its findings beside lockstep's."""
@@ -110,6 +109,7 @@ def wallclock(
     rates = rate or [200, 500, 1000]
     if wrong := [value for value in rates if value < 1 or 1000 % value]:
         raise typer.BadParameter(f"--rate {wrong[0]}: a period must be a whole number of milliseconds")
+    usable(scenario, settings)
     real, found = {}, {}
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory(prefix="palpate-wallclock-") as scratch:
@@ -123,8 +123,7 @@ def wallclock(
                 console.print(f"{value} Hz, in lockstep")
                 found[f"lockstep, {value} Hz"] = _run(scenario, settings or [], folder / f"lockstep_{value}", value, "--composed")
         except RuntimeError as error:
-            console.print(f"[bold red]palpate:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-            raise typer.Exit(3) from error
+            fail(error)
     machine = real[rates[0]]["platform"]
     text = f"{machine['cpu']}, {machine['cores']} cores, load before the first run {load:.1f}\n\n"
     text += "\n".join((latencies(real), ticks(real), comparison(found)))

@@ -18,7 +18,7 @@ from palpate_bus.messages import (
 )
 from palpate_bus.stamps import header
 from palpate_conductor.collector import Collected
-from palpate_conductor.run import RunResult
+from palpate_conductor.result import RunResult
 
 _Point: Any = message_type("geometry_msgs/msg/Point")
 _Vector3: Any = message_type("geometry_msgs/msg/Vector3")

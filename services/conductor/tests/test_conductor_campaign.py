@@ -10,7 +10,7 @@ from conductor_messages import collected, result
 from palpate_bus.messages import ExamState
 from palpate_conductor.campaign import COMPLETE, WENT_ON, Case, CaseOver, Finding, _conclude, _Watch
 from palpate_conductor.campaign_tables import markdown
-from palpate_conductor.run import Progress
+from palpate_conductor.result import Progress
 
 
 def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:

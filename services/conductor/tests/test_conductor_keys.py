@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from palpate_bus.messages import OperatorRequest
 from palpate_conductor.collector import Collected
 from palpate_conductor.progress import RunDisplay
-from palpate_conductor.run import Progress
+from palpate_conductor.result import Progress
 from rich.console import Console
 
 collected, asked = Collected(), []

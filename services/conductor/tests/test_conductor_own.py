@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from palpate_conductor.composed_run import load_services
 from palpate_conductor.own import OwnServiceError, in_place, load, own_services
 from palpate_conductor.processes import ServiceProcess
-from palpate_conductor.run import load_services
 from palpate_models.load import load_scenario
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "threshold_assessment.py"

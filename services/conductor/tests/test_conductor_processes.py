@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from palpate_conductor.cli import EXIT_BAD_INPUT, app
+from palpate_bus.command_line import EXIT_BAD_INPUT
+from palpate_conductor.cli import app
 from palpate_conductor.implementations import chosen_processes
 from palpate_conductor.processes import ProcessListError, compose_file, how, override_files, read_processes
 from palpate_conductor.run import OBSERVERS, WORKERS, workers

@@ -6,9 +6,10 @@ import json
 import logging
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
+from palpate_bus.command_line import fail, refuse
 from palpate_bus.contract import contract
 from palpate_bus.stamps import NS
 from palpate_bus.zenoh_config import BusConfigError
@@ -21,14 +22,6 @@ from palpate_replay.golden import Case, make_reference, prepare, replay_service
 from palpate_replay.play import Player, PlayError
 from palpate_replay.recording import RecordingError, open_recording
 from palpate_replay.services import ChoiceError
-
-EXIT_BAD_INPUT = 2
-EXIT_DIFFERS = 3
-
-
-def _fail(status: int, message: str) -> NoReturn:
-    Console(stderr=True).print(f"[bold red]palpate replay:[/] {message}", highlight=False, soft_wrap=True)
-    raise typer.Exit(status)
 
 
 def replay(
@@ -84,13 +77,13 @@ def replay(
             return
         results = replay_service(case, parse_tolerance(tolerance or []))
     except (RecordingError, ChoiceError, ScenarioError, PlayError, BusConfigError, OSError) as error:
-        _fail(EXIT_BAD_INPUT, str(error))
+        refuse(error)
     if as_json:
         print(json.dumps({name: as_dict(result) for name, result in results.items()}, indent=2))
     else:
         _print(case, results)
     if not all(result.agrees for result in results.values()):
-        _fail(EXIT_DIFFERS, f"{case.role} no longer sends what {file} holds; where that is meant, renew it with --update-refs")
+        fail(f"{case.role} no longer sends what {file} holds; where that is meant, renew it with --update-refs")
 
 
 def parse_tolerance(words: list[str]) -> Tolerance:

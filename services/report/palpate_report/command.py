@@ -5,23 +5,17 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
+from palpate_bus.command_line import fail, output_file, output_folder, refuse
 from palpate_conductor.archive import EvidenceError, completed
+from palpate_conductor.inputs import Settings, usable
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from palpate_report import reproduction
-from palpate_report.runs import CASES, GRAPH, POINTS, SNAKE, RunError, perform, record_graph
-
-EXIT_BAD_INPUT = 2
-EXIT_FAILED = 3
-
-
-def _fail(console: Console, status: int, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {message}", highlight=False, soft_wrap=True)
-    raise typer.Exit(status)
+from palpate_report.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, RunError, perform, record_graph
 
 
 class _Steps:
@@ -56,13 +50,11 @@ class _Steps:
 
 
 def reproduce(
-    out: Annotated[Path, typer.Option(help="Folder of the runs; finished ones are used again.")] = Path("out/reproduction"),
-    docs: Annotated[Path | None, typer.Option(help="The page; by default reproduction.md in the folder of the runs.")] = None,
+    out: Annotated[Path, output_folder("Folder of the runs; finished ones are used again.")] = Path("out/reproduction"),
+    docs: Annotated[Path | None, output_file("The page; by default reproduction.md in the folder of the runs.")] = None,
     every: Annotated[bool, typer.Option("--all", help="Also raster continuous and snake point, to see what each gains.")] = False,
     again: Annotated[bool, typer.Option("--again", help="Run what is finished again.")] = False,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field in all runs; may be repeated.")
-    ] = None,
+    settings: Settings = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the page's path only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
@@ -73,6 +65,7 @@ def reproduce(
     chosen = tuple(settings or ())
     page = docs or out / "reproduction.md"
     images = page.parent / "images" / "reproduction"
+    usable(SCENARIO, chosen)
     steps = _Steps(console, quiet, len(cases) + 5)
     try:
         with steps.bar if not quiet else nullcontext():
@@ -85,9 +78,9 @@ def reproduce(
                 record_graph(out / "bus")
             facts = reproduction.write(out, cases, page, images, chosen, steps.tell)
     except (RunError, EvidenceError) as error:
-        _fail(console, EXIT_FAILED, str(error))
+        fail(error)
     except OSError as error:
-        _fail(console, EXIT_BAD_INPUT, str(error))
+        refuse(error)
     if as_json:
         print(json.dumps(facts))
         return

@@ -8,7 +8,7 @@ from lbr_bench import driver_on_emulator
 from palpate_bus.composed import Composed
 from palpate_bus.stamps import nanoseconds
 from palpate_conductor.collector import Collector
-from palpate_conductor.run import load_services
+from palpate_conductor.composed_run import load_services
 from palpate_models.load import load_scenario, redacted
 
 OTHERS = ("tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")

@@ -9,14 +9,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import typer
+from palpate_bus.command_line import refuse
 from palpate_bus.joining import NoBus
 from palpate_bus.zenoh_config import BusConfigError
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 EXIT_TROUBLE = 1
-EXIT_BAD_INPUT = 2
 WIDE = 140
 
 
@@ -50,8 +49,7 @@ def command() -> Iterator[None]:
     try:
         yield
     except (NoBus, BusConfigError) as error:
-        Console(stderr=True, highlight=False).print(f"[bold red]palpate:[/] {escape(str(error))}", soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
+        refuse(error)
     except KeyboardInterrupt:
         sys.stdout.flush()
         raise typer.Exit(0) from None

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from palpate_bus.command_line import output_file, output_folder, refuse
 from rich.console import Console
 
 from palpate_validation.check import Section
 from palpate_validation.report import failures, table, write, write_page
 
-EXIT_BAD_INPUT = 2
 EXIT_MISSED = 3
 SECTIONS = {
     "hertz": "hertz",
@@ -39,18 +39,17 @@ def run_section(name: str) -> Section:
 
 @app.callback()
 def validate(
-    out: Annotated[Path, typer.Option(help="Folder for validate.json and the plots.")] = Path("out/validation"),
+    out: Annotated[Path, output_folder("Folder for validate.json and the plots.")] = Path("out/validation"),
     only: Annotated[
         list[str] | None, typer.Option("--only", metavar="SECTION", help=f"One of: {', '.join(SECTIONS)}. May be repeated.")
     ] = None,
-    docs: Annotated[Path | None, typer.Option(help="Also write this Markdown page, PNGs next to it.")] = None,
+    docs: Annotated[Path | None, output_file("Also write this Markdown page, PNGs next to it.")] = None,
 ) -> None:
     """Measure the physics against Hertz, DART, MuJoCo and theory. Leaves with status 3 if a bound is missed."""
     console = Console(stderr=True)
     unknown = [name for name in only or () if name not in SECTIONS]
     if unknown:
-        console.print(f"[bold red]palpate:[/] --only {unknown[0]}: sections are {', '.join(SECTIONS)}", highlight=False)
-        raise typer.Exit(EXIT_BAD_INPUT)
+        refuse(f"--only {unknown[0]}: sections are {', '.join(SECTIONS)}")
     sections = []
     for name in [name for name in SECTIONS if not only or name in only]:
         with console.status(f"measuring: {name}"):
@@ -60,8 +59,7 @@ def validate(
         if docs is not None:
             write_page(sections, docs, docs.parent / "images" / "validation")
     except OSError as error:
-        console.print(f"[bold red]palpate:[/] {error}", highlight=False)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
+        refuse(error)
     shown = Console()
     Console(width=max(150, shown.width)).print(table(sections))
     console.print(f"plots and figures in {out}", highlight=False)

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from palpate_bus.command_line import EXIT_BAD_INPUT
 from palpate_bus.stamps import NS
 from palpate_validation import stability
 from palpate_validation.check import Check, Section
@@ -146,4 +147,4 @@ def test_the_command(tmp_path, monkeypatch) -> None:
     result = runner.invoke(cli.app, ["--only", "hertz", "--out", str(tmp_path)])
     assert result.exit_code == cli.EXIT_MISSED
     assert "FAIL" in result.output
-    assert runner.invoke(cli.app, ["--only", "nonsense"]).exit_code == cli.EXIT_BAD_INPUT
+    assert runner.invoke(cli.app, ["--only", "nonsense"]).exit_code == EXIT_BAD_INPUT
