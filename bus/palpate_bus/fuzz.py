@@ -10,12 +10,15 @@ A find is printed with its input in hexadecimal and the exception; it belongs in
 from __future__ import annotations
 
 import random
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from importlib.metadata import entry_points
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter, thread_time
 
 from palpate_bus.fuzz_targets import Target, targets
@@ -129,18 +132,23 @@ def all_targets() -> list[Target]:
     return found
 
 
-def guided(target: Target, inputs: int, seed: int) -> int:
-    """Fuzzes one target in a process of its own with atheris; returns its exit status, 0 for no find."""
-    command = [
-        sys.executable,
-        "-m",
-        "palpate_bus.fuzz_guided",
-        target.name,
-        f"-runs={inputs}",
-        f"-seed={seed + 1}",
-        "-max_len=4096",
-    ]
-    return subprocess.run(command, check=False).returncode
+def guided(target: Target, inputs: int, seed: int) -> Find | None:
+    """Fuzzes one target in a process of its own with atheris, from its valid inputs on; returns its first find, if any."""
+    with TemporaryDirectory(prefix="palpate-fuzz-") as scratch:
+        corpus, broken = Path(scratch, "corpus"), Path(scratch, "broken")
+        corpus.mkdir()
+        broken.mkdir()
+        for number, data in enumerate(target.seeds(random.Random(f"{seed} {target.name}"))):
+            (corpus / str(number)).write_bytes(data)
+        options = [f"-runs={inputs}", f"-seed={seed + 1}", "-max_len=4096", f"-artifact_prefix={broken}/", str(corpus)]
+        command = [sys.executable, "-m", "palpate_bus.fuzz_guided", target.name, *options]
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        if not done.returncode:
+            return None
+        data = b"".join(path.read_bytes() for path in sorted(broken.iterdir())[:1])
+        said = done.stderr + done.stdout
+        error = re.search(r"^ *=== Uncaught Python exception: ===\n(.*)$", said, re.MULTILINE)
+        return Find(target.name, data, error[1] if error else said.strip()[-500:])
 
 
 def choose(patterns: Sequence[str]) -> list[Target]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from time import perf_counter
 from typing import Annotated
 
 import typer
@@ -9,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from palpate_bus.command_line import EXIT_FAILED, refuse
-from palpate_bus.fuzz import campaign, choose, guided
+from palpate_bus.fuzz import Campaign, campaign, choose, guided
 
 
 def fuzz(
@@ -24,13 +26,21 @@ def fuzz(
         chosen = choose(names or [])
     except ValueError as error:
         refuse(error)
+    if coverage and find_spec("atheris") is None:
+        refuse("--coverage wants atheris, which is not installed: pip install atheris")
+    done = Campaign(seed)
     if coverage:
-        bad = [target.name for target in chosen if guided(target, inputs, seed)]
-        console.print(f"{len(chosen)} targets, finds in: {', '.join(bad) or 'none'}", highlight=False)
-        raise typer.Exit(EXIT_FAILED if bad else 0)
-    done = campaign(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
+        begin = perf_counter()
+        for target in chosen:
+            found = guided(target, inputs, seed)
+            done.finds += [] if found is None else [found]
+            done.inputs[target.name] = inputs
+            console.print(f"{target.name}: {'nothing' if found is None else 'a find'}", highlight=False)
+        done.seconds = perf_counter() - begin
+    else:
+        done = campaign(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
     for find in done.finds:
-        console.print(f"[red]{find.target}[/] {escape(str(find.error))}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
+        console.print(f"[red]{find.target}[/] {escape(find.error)}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
     rate = sum(done.inputs.values()) / done.seconds
     print(f"{sum(done.inputs.values())} inputs, {len(chosen)} targets, seed {seed}: {len(done.finds)} finds, {rate:.0f} inputs/s")
     raise typer.Exit(EXIT_FAILED if done.finds else 0)
