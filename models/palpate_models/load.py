@@ -14,9 +14,29 @@ from pydantic import ValidationError
 from palpate_models.frames import matrix, pose_of
 from palpate_models.scenario import ExamInput, Phantom, Registration, Scenario
 
+_MERGE = "tag:yaml.org,2002:merge"
+
 
 class ScenarioError(ValueError):
     """A scenario that cannot be used. The message names file, field, value and what is allowed."""
+
+
+class _TwiceError(ValueError):
+    """A field that a mapping has twice."""
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML in which a field stands once; PyYAML would take the last of two and say nothing."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping. Raises _TwiceError naming line and field."""
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
+                if key.value in seen:
+                    raise _TwiceError(f"line {key.start_mark.line + 1}: field {key.value} stands twice; want it once")
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -65,7 +85,9 @@ def _index(items: list[Any], word: str, setting: str) -> int:
 def _parse(text: str, name: str) -> Any:
     """YAML as Python values. PyYAML raises ValueError for a date such as 2001-13-45, and RecursionError for deep nesting."""
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _Loader)
+    except _TwiceError as error:
+        raise ScenarioError(f"{name}: {error}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ScenarioError(f"{name}: not YAML: {error}") from error
 

@@ -44,8 +44,11 @@ def read_report(folder: Path) -> Report:
         return Report.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise EvidenceError(f"{path} is not there: give the results folder of a run") from error
-    except (OSError, ValidationError) as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error
+    except ValidationError as error:
+        wrong = (f"{'.'.join(map(str, item['loc'])) or 'the file'}: {item['msg']}" for item in error.errors())
+        raise EvidenceError(f"{path} is no report of this version: {'; '.join(wrong)}") from error
 
 
 def write_page(folder: Path) -> Path:

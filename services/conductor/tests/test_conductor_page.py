@@ -108,6 +108,9 @@ def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:
 def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(archive.EvidenceError, match=r"report\.json is not there: give the results folder"):
         write_page(tmp_path)
+    (tmp_path / "report.json").write_text('{"seed": 1}', encoding="utf-8")
+    with pytest.raises(archive.EvidenceError, match=r"report\.json is no report of this version: .*scenario: Field required"):
+        write_page(tmp_path)
     (tmp_path / archive.FILE).write_bytes(b"not an archive")
     with pytest.raises(archive.EvidenceError, match=r"evidence\.npz cannot be read"):
         archive.read_evidence(tmp_path)

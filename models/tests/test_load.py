@@ -1,0 +1,62 @@
+"""Scenarios from files: what is wrong is named by file, field, value and what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from palpate_models.load import ScenarioError, dump_scenario, load_scenario, scenario_names
+
+
+def scenario(folder: Path, text: str) -> str:
+    """The path of a scenario file with this text."""
+    path = folder / "mine.yaml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
+    loaded = load_scenario(name)
+    assert load_scenario(scenario(tmp_path, dump_scenario(loaded))) == loaded
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("exam: {depth_m: deep}", r"mine\.yaml: exam\.depth_m = 'deep': .*number"),
+        ("exam: {depht_m: 0.01}", r"mine\.yaml: exam\.depht_m = 0\.01: Extra inputs"),
+        ("exam: {pattern: zigzag}", r"exam\.pattern = 'zigzag': .*'snake' or 'raster'"),
+        ("phantom: {lesions: [{contrast: 4}]}", r"phantom\.lesions\.0\.centre_m"),
+        ("- exam", r"want a mapping of fields, not list"),
+        ("exam: {", r"not YAML"),
+    ],
+)
+def test_what_cannot_be_is_named(text: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        load_scenario(scenario(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("exam:\n  depth_m: 0.01\n  depth_m: 0.02\n", r"mine\.yaml: line 3: field depth_m stands twice"),
+        ("seed: 1\nexam: {}\nseed: 2\n", r"mine\.yaml: line 3: field seed stands twice"),
+        ("exam: {depth_m: 0.01, speed_mps: 0.02, depth_m: 0.01}", r"line 1: field depth_m stands twice"),
+    ],
+)
+def test_a_field_that_stands_twice_is_not_guessed(text: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        load_scenario(scenario(tmp_path, text))
+
+
+def test_a_merged_section_may_be_overridden(tmp_path: Path) -> None:
+    text = "robot: &base {base_height_m: 0.5}\nexam: {<<: {depth_m: 0.008, speed_mps: 0.02}, depth_m: 0.009}"
+    loaded = load_scenario(scenario(tmp_path, text))
+    assert (loaded.exam.depth_m, loaded.exam.speed_mps) == (0.009, 0.02)
+
+
+def test_a_setting_is_read_like_a_file() -> None:
+    assert load_scenario("healthy", ["exam.depth_m=8e-3"]).exam.depth_m == 0.008
+    with pytest.raises(ScenarioError, match=r"--set exam=.*: line 1: field depth_m stands twice"):
+        load_scenario("healthy", ["exam={depth_m: 0.01, depth_m: 0.02}"])
