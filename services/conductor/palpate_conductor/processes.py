@@ -109,7 +109,8 @@ def how(code: int, log: Path) -> str:
     lines: list[str] = []
     with suppress(OSError):
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    said = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+    hint = "" if code else ": does it call palpate_bus.run.main?"
+    said = next((line.strip() for line in reversed(lines) if line.strip()), f"it said nothing{hint}")
     return f"left with status {code}: {said}"
 
 

@@ -115,6 +115,7 @@ def test_how_a_process_ended_is_said_in_its_own_words(tmp_path: Path) -> None:
     assert how(-9, log) == "killed by signal 9"
     log.write_text("")
     assert how(1, log) == "left with status 1: it said nothing"
+    assert how(0, log).endswith("does it call palpate_bus.run.main?")
 
 
 @pytest.mark.parametrize(
