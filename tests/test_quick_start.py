@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -11,6 +12,10 @@ from pathlib import Path
 
 import pytest
 from examination import palpate_run
+from palpate_bus import codec
+from palpate_bus.conformance import violations
+from palpate_bus.contract import MS, contract
+from palpate_bus.lockstep import Stepper
 from palpate_conductor.own import own_services
 from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
@@ -50,6 +55,18 @@ def test_the_mesh_is_an_abdomen(tmp_path: Path) -> None:
     scenario = load_scenario("healthy", ["phantom.kind=mesh", f"phantom.mesh={target}"])
     phantom = build_phantom(scenario.phantom, scenario.seed)
     assert phantom.vertices[:, 2].max() == pytest.approx(0.0, abs=2e-3)
+
+
+def test_the_ten_lines_of_the_services_page_are_a_service(tmp_path: Path) -> None:
+    """Stepped as the runtime does, which holds it to its topics and ticks; what it sends keeps the contract."""
+    page = (ROOT / "services" / "README.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "limp.py").write_text(lines, encoding="utf-8")
+    stepper = Stepper(runpy.run_path(str(tmp_path / "limp.py"), run_name="limp")["Limp"](), contract())
+    assert stepper.start() == []
+    for t in (0, MS):
+        ((port, payload, _),) = stepper.step(t)
+        assert violations(port.topic, codec.decode(payload, port.topic.type), t) == []
 
 
 @pytest.mark.slow
