@@ -10,12 +10,15 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from examination import palpate_run
 from palpate_bus import codec
 from palpate_bus.conformance import violations
 from palpate_bus.contract import MS, contract
 from palpate_bus.lockstep import Stepper
+from palpate_bus.messages import JointState
+from palpate_bus.stamps import header
 from palpate_conductor.own import own_services
 from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
@@ -57,14 +60,16 @@ def test_the_mesh_is_an_abdomen(tmp_path: Path) -> None:
     assert phantom.vertices[:, 2].max() == pytest.approx(0.0, abs=2e-3)
 
 
-def test_the_ten_lines_of_the_services_page_are_a_service(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("page", "name"), [("services", "Limp"), ("bus", "Damper")])
+def test_the_service_that_a_page_shows_is_one(page: str, name: str, tmp_path: Path) -> None:
     """Stepped as the runtime does, which holds it to its topics and ticks; what it sends keeps the contract."""
-    page = (ROOT / "services" / "README.md").read_text(encoding="utf-8")
-    (lines,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "limp.py").write_text(lines, encoding="utf-8")
-    stepper = Stepper(runpy.run_path(str(tmp_path / "limp.py"), run_name="limp")["Limp"](), contract())
+    (lines,) = re.findall(r"```python\n(.*?)```", (ROOT / page / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "mine.py").write_text(lines, encoding="utf-8")
+    stepper = Stepper(runpy.run_path(str(tmp_path / "mine.py"), run_name="mine")[name](), contract())
     assert stepper.start() == []
-    for t in (0, MS):
+    for k, t in enumerate((0, MS), 1):
+        joints = JointState(header(t), [f"A{i}" for i in range(1, 8)], np.zeros(7), np.full(7, 0.1), np.zeros(7))
+        stepper.buffers["joint_states"].accept(k, codec.encode(joints, "sensor_msgs/msg/JointState"))
         ((port, payload, _),) = stepper.step(t)
         assert violations(port.topic, codec.decode(payload, port.topic.type), t) == []
 
