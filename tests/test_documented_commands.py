@@ -1,0 +1,47 @@
+"""Every `palpate` command line of the pages is one that the program understands: the command is there, and so are its options."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from palpate_conductor.commands import app_for
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = (".", "bus", "dashboards", "docs", "fmus", "fmus/*", "models", "services", "services/*", "swap")
+
+
+def lines() -> list[tuple[str, str]]:
+    """Page and words of each indented command line, without what is said about it."""
+    pages = sorted({page for folder in FOLDERS for page in ROOT.glob(f"{folder}/*.md")})
+    pattern = re.compile(r"^ {4}(?:\w+=\S+ )*palpate (\S.*)$", re.MULTILINE)
+    found = {(page, line) for page in pages for line in pattern.findall(page.read_text(encoding="utf-8"))}
+    return sorted((str(page.relative_to(ROOT)), re.split(r" {2,}| #", line)[0].strip()) for page, line in found)
+
+
+def understand(words: list[str]) -> None:
+    """Parses and runs nothing. Raises click's UsageError for what is not known."""
+    command: Any = typer.main.get_command(app_for(words[0]))
+    while getattr(command, "commands", None):
+        assert words, "a command is missing"
+        assert words[0] in command.commands, f"no command {words[0]!r} among {', '.join(command.commands)}"
+        command = command.commands[words.pop(0)]
+    context = command.context_class(command)
+    command.make_parser(context).parse_args(words)
+
+
+@pytest.mark.parametrize(("page", "line"), lines(), ids=lambda text: text)
+def test_a_documented_command_is_understood(page: str, line: str) -> None:
+    understand(shlex.split(line))
+
+
+def test_there_are_some_and_a_wrong_one_is_not_understood() -> None:
+    assert len(lines()) > 60
+    with pytest.raises(Exception, match="--nosuch"):
+        understand(["run", "--nosuch"])
+    with pytest.raises(AssertionError, match="no command"):
+        understand(["topic", "nosuch"])
