@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 
 from palpate_bus import codec
@@ -38,8 +38,9 @@ _VISIBILITY = {
 
 def page(rules: Contract) -> str:
     """The page of topics, in Markdown."""
-    parts = [_HEAD, _dataflow(rules), _delays(rules), _secrets(rules), _qos(rules.qos.values()), _roles(rules.roles.values())]
-    parts += [_producer(rules, role) for role in rules.roles.values() if rules.outputs(role.name)]
+    senders = {role.name: role for role in rules.roles.values() if rules.outputs(role.name)}
+    parts = [_HEAD, _dataflow(rules), _delays(rules), _secrets(rules), _qos(rules.qos.values())]
+    parts += [_roles(rules.roles.values(), senders), *(_producer(rules, role) for role in senders.values())]
     parts.append(_internal(rules))
     return "\n".join(parts)
 
@@ -114,11 +115,13 @@ def _qos(classes: Iterable[Qos]) -> str:
     return text + _table(("class", "zenoh", "keeps", "because"), rows)
 
 
-def _roles(roles: Iterable[Role]) -> str:
+def _roles(roles: Iterable[Role], senders: Container[str]) -> str:
+    """The roles; those that send have a section of their own."""
     rows = []
     for role in roles:
         kind = "observer: never slows the run" if role.observer else "critical: its loss ends the run" if role.critical else ""
-        rows.append((f"[{role.name}](#{role.name})", f"{role.period_ms} ms", role.doc, kind))
+        name = f"[{role.name}](#{role.name})" if role.name in senders else role.name
+        rows.append((name, f"{role.period_ms} ms", role.doc, kind))
     return "## Roles\n\n" + _table(("role", "steps every", "what it is", ""), rows)
 
 

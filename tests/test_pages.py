@@ -1,4 +1,4 @@
-"""Every `palpate` command line of the pages is one that the program understands: the command is there, and so are its options."""
+"""The pages: each `palpate` command line is one that the program understands, and links within the project lead somewhere."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = (".", "bus", "dashboards", "docs", "fmus", "fmus/*", "models", "services", "services/*", "swap")
 
 
+PAGES = sorted({page for folder in FOLDERS for page in ROOT.glob(f"{folder}/*.md")})
+
+
 def lines() -> list[tuple[str, str]]:
     """Page and words of each indented command line, without what is said about it."""
-    pages = sorted({page for folder in FOLDERS for page in ROOT.glob(f"{folder}/*.md")})
     pattern = re.compile(r"^ {4}(?:\w+=\S+ )*palpate (\S.*)$", re.MULTILINE)
-    found = {(page, line) for page in pages for line in pattern.findall(page.read_text(encoding="utf-8"))}
+    found = {(page, line) for page in PAGES for line in pattern.findall(page.read_text(encoding="utf-8"))}
     return sorted((str(page.relative_to(ROOT)), re.split(r" {2,}| #", line)[0].strip()) for page, line in found)
 
 
@@ -45,3 +47,22 @@ def test_there_are_some_and_a_wrong_one_is_not_understood() -> None:
         understand(["run", "--nosuch"])
     with pytest.raises(AssertionError, match="no command"):
         understand(["topic", "nosuch"])
+
+
+def anchors(page: Path) -> set[str]:
+    """The headings of a page as links name them."""
+    heads = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    lost = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            lost.append(link)
+    assert lost == []
