@@ -1,7 +1,7 @@
 """A monitor on a bus: listens to every topic of the contract under any type, to who is there, and to what services report.
 
     with session(run.options()) as bus:
-        monitor = LiveMonitor(bus, contract(), run.domain)
+        monitor = LiveMonitor(bus, contract(), run.domain, wallclock=run.runtime == "wallclock")
         while True:
             for violation in monitor.poll():
                 print(violation)
