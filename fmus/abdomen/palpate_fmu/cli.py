@@ -11,6 +11,7 @@ from palpate_models.load import ScenarioError, load_scenario
 from palpate_models.phantom import MeshError
 from palpate_models.scenario import Phantom, Scenario
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -30,7 +31,7 @@ app = typer.Typer(name="fmu", help="The abdomen as an FMU; FMUs of any kind look
 
 
 def _fail(console: Console, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {message}", highlight=False, soft_wrap=True)
+    console.print(f"[bold red]palpate:[/] {escape(message)}", highlight=False, soft_wrap=True)
     raise typer.Exit(EXIT_BAD_INPUT)
 
 
