@@ -151,6 +151,20 @@ def guided(target: Target, inputs: int, seed: int) -> Find | None:
         return Find(target.name, data, error[1] if error else said.strip()[-500:])
 
 
+def guided_campaign(chosen: Sequence[Target], inputs: int, seed: int, tell: Callable[[str], None]) -> Campaign:
+    """Up to `inputs` for each target; one ends with its first find."""
+    done = Campaign(seed)
+    begin = perf_counter()
+    for target in chosen:
+        find = guided(target, inputs, seed)
+        if find is not None:
+            done.finds.append(find)
+        done.inputs[target.name] = inputs
+        tell(f"{target.name}: up to {inputs} inputs, {'nothing' if find is None else 'a find'}")
+    done.seconds = perf_counter() - begin
+    return done
+
+
 def choose(patterns: Sequence[str]) -> list[Target]:
     """The targets whose names match one of the patterns; all without any. Raises ValueError naming a pattern without a match."""
     known = all_targets()

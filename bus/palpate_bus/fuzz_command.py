@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
-from time import perf_counter
 from typing import Annotated
 
 import typer
@@ -11,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from palpate_bus.command_line import EXIT_FAILED, refuse
-from palpate_bus.fuzz import Campaign, campaign, choose, guided
+from palpate_bus.fuzz import campaign, choose, guided_campaign
 
 
 def fuzz(
@@ -28,17 +27,8 @@ def fuzz(
         refuse(error)
     if coverage and find_spec("atheris") is None:
         refuse("--coverage wants atheris, which is not installed: pip install atheris")
-    done = Campaign(seed)
-    if coverage:
-        begin = perf_counter()
-        for target in chosen:
-            found = guided(target, inputs, seed)
-            done.finds += [] if found is None else [found]
-            done.inputs[target.name] = inputs
-            console.print(f"{target.name}: {'nothing' if found is None else 'a find'}", highlight=False)
-        done.seconds = perf_counter() - begin
-    else:
-        done = campaign(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
+    conduct = guided_campaign if coverage else campaign
+    done = conduct(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
     for find in done.finds:
         console.print(f"[red]{find.target}[/] {escape(find.error)}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
     rate = sum(done.inputs.values()) / done.seconds
