@@ -1,13 +1,12 @@
-# `make run` and `make test` do all the set-up they need: Python 3.11 with venv is enough. PYTHON=... says which, if not the quickest.
+# `make run` and `make test` do all the set-up they need: Python 3.11 to 3.13 with venv is enough. PYTHON=... says which.
 VENV := .venv
 BIN := $(VENV)/bin
-PACKAGES := bus models fmus/abdomen $(patsubst %/pyproject.toml,%,$(wildcard services/*/pyproject.toml)) dashboards
-MYPY_TARGETS := $(wildcard bus/palpate_* models/palpate_* fmus/abdomen/palpate_* services/*/palpate_* dashboards/palpate_*)
+PYTHON ?= python3
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export PYTHONHASHSEED := 0
 
-.PHONY: run test test-slow test-docker test-browser test-all lint format bench docs install clean
+.PHONY: run test test-slow test-docker test-browser lint format bench docs install clean
 
 run: install  ## the default examination, as processes on this machine
 	$(BIN)/palpate run $(ARGS)
@@ -32,7 +31,7 @@ bench: install  ## figures with ratios, as a table and as bench.json
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	for target in $(MYPY_TARGETS); do $(BIN)/mypy $$target || exit 1; done
+	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: install
@@ -40,16 +39,13 @@ format: install
 	$(BIN)/ruff format .
 
 docs: install  ## docs/topics.md, from the contract
-	$(BIN)/python -m palpate_bus.doc
+	$(BIN)/python -m palpate_bus.contract.doc
 
 install: $(VENV)/.installed
 
-# All local packages in one command, so that none of their names is ever looked up in a public registry.
-$(VENV)/.installed: constraints.txt requirements-dev.txt $(addsuffix /pyproject.toml,$(PACKAGES))
-	test -x $(BIN)/python || { python=$${PYTHON:-$$(tools/quickest-python)} && echo "Python: $$python" \
-	&& "$$python" -c 'import sys; sys.exit(0 if sys.version_info[:2] == (3, 11) else "Palpate needs Python 3.11; set PYTHON=...")' \
-	&& "$$python" -m venv $(VENV); }
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-dev.txt $(addprefix -e ./,$(PACKAGES))
+$(VENV)/.installed: pyproject.toml constraints.txt requirements-dev.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-dev.txt -e .[all]
 	touch $@
 
 clean:

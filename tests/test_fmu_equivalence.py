@@ -13,23 +13,24 @@ from typing import Any
 import numpy as np
 import pytest
 from examination import palpate_run
-from palpate_bus.codec import decode
-from palpate_bus.composed import Composed
+
+from palpate.__main__ import FIXED
+from palpate.run.composed import load_services
+from palpate.run.distributed import WORKERS
+from palpate.run.processes import compose_file
 from palpate_bus.contract import Topic, contract
+from palpate_bus.messages.codec import decode
+from palpate_bus.messages.stamps import NS
+from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Service
-from palpate_bus.stamps import NS
-from palpate_conductor.__main__ import FIXED
 from palpate_conductor.collector import Collector
-from palpate_conductor.composed_run import load_services
-from palpate_conductor.processes import compose_file
-from palpate_conductor.run import WORKERS
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
-from palpate_fmu_host.service import create as create_fmu
 from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
+from palpate_tissue.backends.fmu.service import create as create_fmu
 from palpate_tissue.service import create as create_native
 from palpate_tissue.surface import Surface
 from palpate_tissue.tissue import Tissue
@@ -199,7 +200,7 @@ def test_one_line_of_the_compose_file_puts_it_on_the_bus(tmp_path: Path, monkeyp
     text = compose_file().read_text(encoding="utf-8")
     assert text.count("palpate_tissue") == 1
     swapped = tmp_path / "docker-compose.yml"
-    swapped.write_text(text.replace("palpate_tissue", "palpate_fmu_host"), encoding="utf-8")
+    swapped.write_text(text.replace("palpate_tissue", "palpate_tissue.backends.fmu"), encoding="utf-8")
     monkeypatch.setenv("PALPATE_COMPOSE", str(swapped))
     finished = palpate_run("rlq_guarding", tmp_path / "out", "--no-record", "--seed", "3", settings=SETTINGS)
     assert finished.status == 0, finished.output

@@ -12,10 +12,11 @@ from typing import Any
 import psutil
 import pytest
 from examination import SHORT, command
-from palpate_bus.codec import decode
+from rosbags.highlevel import AnyReader
+
 from palpate_bus.contract import contract
 from palpate_bus.messages import RobotStatus
-from rosbags.highlevel import AnyReader
+from palpate_bus.messages.codec import decode
 
 pytestmark = pytest.mark.slow
 KILL_AFTER_PHASE = "scan"

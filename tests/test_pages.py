@@ -9,13 +9,11 @@ from typing import Any
 
 import pytest
 import typer
-from palpate_conductor.commands import app_for
+
+from palpate.commands import app_for
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = (".", "bus", "dashboards", "docs", "fmus", "fmus/*", "models", "services", "services/*", "swap")
-
-
-PAGES = sorted({page for folder in FOLDERS for page in ROOT.glob(f"{folder}/*.md")})
+PAGES = sorted(page for page in ROOT.rglob("*.md") if not {".venv", "out", "node_modules"} & set(page.relative_to(ROOT).parts))
 
 
 def lines() -> list[tuple[str, str]]:

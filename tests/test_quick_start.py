@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from examination import palpate_run
-from palpate_bus import codec
-from palpate_bus.conformance import violations
+
+from palpate.run.own import own_services
 from palpate_bus.contract import MS, contract
-from palpate_bus.lockstep import Stepper
-from palpate_bus.messages import JointState
-from palpate_bus.stamps import header
-from palpate_conductor.own import own_services
+from palpate_bus.contract.conformance import violations
+from palpate_bus.messages import JointState, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.lockstep import Stepper
 from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
 

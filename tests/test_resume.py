@@ -6,13 +6,14 @@ from typing import Any
 
 import pytest
 from examination import SHORT
-from palpate_bus.composed import Composed
+
+from palpate.run.composed import load_services
+from palpate.run.distributed import WORKERS
 from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus
+from palpate_bus.messages.stamps import NS, header
+from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox
-from palpate_bus.stamps import NS, header
 from palpate_conductor.collector import Collected, Collector
-from palpate_conductor.composed_run import load_services
-from palpate_conductor.run import WORKERS
 from palpate_models.load import load_scenario
 
 HELD_FOR = NS

@@ -16,16 +16,17 @@ from typing import Any
 
 import pytest
 import zenoh
-from palpate_bus import codec
-from palpate_bus.composed import Composed
+from rerun.chunk import RrdReader
+
 from palpate_bus.contract import MS, Topic, contract
-from palpate_bus.liveliness import NodeTokens
-from palpate_bus.messages import DiagnosticStatus
+from palpate_bus.messages import DiagnosticStatus, codec
+from palpate_bus.messages.stamps import NS
+from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS
-from palpate_bus.transport import Subscription
-from palpate_bus.wire import topic_key
-from palpate_bus.zenoh_config import close_session, mesh, open_session
+from palpate_bus.wire.liveliness import NodeTokens
+from palpate_bus.wire.rmw import topic_key
+from palpate_bus.wire.transport import Subscription
+from palpate_bus.wire.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.outcome import Outcome, Patience, RunFailed
@@ -33,7 +34,6 @@ from palpate_dashboard.replay import draw
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.scenario import Scenario
-from rerun.chunk import RrdReader
 
 TOYS = Path(__file__).parents[1] / "bus" / "tests" / "toy_services.py"
 sys.path.insert(0, str(TOYS.parent))

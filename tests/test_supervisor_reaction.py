@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus.composed import Composed
+
+from palpate.run.composed import load_services
 from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, header, nanoseconds
 from palpate_conductor.collector import Collector
-from palpate_conductor.composed_run import load_services
 from palpate_models.load import load_scenario
 
 MS = 1_000_000

@@ -22,14 +22,14 @@ from typing import Any
 import zenoh
 
 from palpate_bus.contract import MS, Contract, Role, contract
-from palpate_bus.distributed import LockstepNode, RunAborted
-from palpate_bus.member import Member
-from palpate_bus.observer import ObserverNode
-from palpate_bus.priority import in_the_background
-from palpate_bus.recording import RawRecorder, RecorderNode
+from palpate_bus.runtime.distributed import LockstepNode, RunAborted
+from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.observer import ObserverNode
+from palpate_bus.runtime.priority import in_the_background
+from palpate_bus.runtime.recording import RawRecorder, RecorderNode
+from palpate_bus.runtime.wallclock import WallClockNode
 from palpate_bus.service import Service
-from palpate_bus.wallclock import WallClockNode
-from palpate_bus.zenoh_config import BusConfigError, close_session, domain_from_env, open_session
+from palpate_bus.wire.zenoh_config import BusConfigError, close_session, domain_from_env, open_session
 
 EXIT_FAILED = 3
 RUNTIMES: dict[str, type[LockstepNode] | type[WallClockNode]] = {"lockstep": LockstepNode, "wallclock": WallClockNode}

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, Protocol
 
-from palpate_bus.codec import Message
+from palpate_bus.messages.codec import Message
 
 Outbox = Mapping[str, "Message | list[Message]"]
 """Messages by topic: one, or a list for an event topic. Their arrays must not be changed after the step."""

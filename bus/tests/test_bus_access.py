@@ -9,14 +9,15 @@ from queue import Empty, SimpleQueue
 
 import pytest
 import zenoh
-from palpate_bus.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, watched
+
 from palpate_bus.contract import contract
-from palpate_bus.denials import STRANGER, DenialReader
-from palpate_bus.guard import Guard, denials
-from palpate_bus.keys import KeysError, certificates, init, members, read
-from palpate_bus.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
-from palpate_bus.wire import message_key, topic_key
-from palpate_bus.zenoh_config import BusConfigError, BusOptions, close_session, open_session, zenoh_config
+from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, watched
+from palpate_bus.security.denials import STRANGER, DenialReader
+from palpate_bus.security.guard import Guard, denials
+from palpate_bus.security.keys import KeysError, certificates, init, members, read
+from palpate_bus.wire.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
+from palpate_bus.wire.rmw import message_key, topic_key
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, open_session, zenoh_config
 
 RULES = contract()
 CONTROL = message_key("palpate/control", "palpation_msgs/msg/RunControl", 0)

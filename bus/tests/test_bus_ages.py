@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from palpate_bus.ages import BIN_NS, Ages
+
+from palpate_bus.runtime.ages import BIN_NS, Ages
 
 
 def test_quantiles_are_those_of_the_values_to_within_a_bin() -> None:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from palpate_bus import codec
+
 from palpate_bus.contract import contract
-from palpate_bus.messages import Advance, JointTorqueCommand
-from palpate_bus.stamps import duration_message, header
-from palpate_bus.strategies import messages
+from palpate_bus.messages import Advance, JointTorqueCommand, codec
+from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.testing.strategies import messages
 
 TYPES = sorted(
     {row.type for row in contract().topics.values()}

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus import codec, faults
+
 from palpate_bus.contract import contract
-from palpate_bus.faults import Fault, FaultError, FaultySender, faulty
-from palpate_bus.messages import JointTorqueCommand
-from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_bus.messages import JointTorqueCommand, codec
+from palpate_bus.messages.stamps import duration_message, header, nanoseconds
+from palpate_bus.runtime import faults
+from palpate_bus.runtime.faults import Fault, FaultError, FaultySender, faulty
 
 TOPIC = contract().topics["control/joint_torque"]
 

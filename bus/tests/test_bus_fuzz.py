@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
-from palpate_bus import codec
-from palpate_bus.command_line import EXIT_BAD_INPUT
-from palpate_bus.fuzz import Find, all_targets, attempt, campaign, choose, guided, mutate
-from palpate_bus.fuzz_command import fuzz
-from palpate_bus.fuzz_targets import Broken, Target
-from palpate_bus.messages import RecordChunk
-from palpate_bus.spool import CHUNK_TYPE, unpack_chunk
-from palpate_models.load import ScenarioError, load_scenario
 from typer.testing import CliRunner
+
+from palpate.command_line import EXIT_BAD_INPUT
+from palpate.fuzz.bus_targets import Broken, Target
+from palpate.fuzz.command import fuzz
+from palpate.fuzz.fuzz import Find, all_targets, attempt, campaign, choose, guided, mutate
+from palpate_bus.messages import RecordChunk, codec
+from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_models.load import ScenarioError, load_scenario
 
 
 @pytest.mark.parametrize("target", all_targets(), ids=lambda target: target.name)
@@ -42,7 +42,7 @@ def test_a_broken_target_is_found() -> None:
 
 
 def test_without_atheris_a_guided_campaign_is_no_find(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate_bus.fuzz_command.find_spec", lambda _: None)
+    monkeypatch.setattr("palpate.fuzz.command.find_spec", lambda _: None)
     app = typer.Typer()
     app.command()(fuzz)
     called = CliRunner().invoke(app, ["attachment", "--coverage"])

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from palpate_bus.contract import contract
-from palpate_bus.liveliness import (
+from palpate_bus.wire.liveliness import (
     Endpoint,
     Entity,
     GraphWatch,
@@ -20,8 +21,8 @@ from palpate_bus.liveliness import (
     parse_token,
     qos_token,
 )
-from palpate_bus.wire import WireError
-from palpate_bus.zenoh_config import mesh, session
+from palpate_bus.wire.rmw import WireError
+from palpate_bus.wire.zenoh_config import mesh, session
 
 # From rmw_zenoh's docs/design.md.
 LISTENER = "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"

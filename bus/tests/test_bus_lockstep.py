@@ -5,9 +5,10 @@ import random
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from palpate_bus.contract import MS, Edge, contract
-from palpate_bus.lockstep import InputBuffer, LockstepError, Stepper, run_hash
 from toy_services import TOYS, Control, Robot
+
+from palpate_bus.contract import MS, Edge, contract
+from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Stepper, run_hash
 
 TOPICS = contract().topics
 

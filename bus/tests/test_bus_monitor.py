@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from palpate_bus import codec
-from palpate_bus.checker import Checker, Kind
-from palpate_bus.conformance import violations
+
 from palpate_bus.contract import MS, contract
-from palpate_bus.diagnostics import RECENT_S, diagnostics
-from palpate_bus.health import Violation
-from palpate_bus.liveliness import Endpoint, Entity, qos_token
-from palpate_bus.liveliness import Kind as EntityKind
-from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueCommand, Vector3, Wrench, WrenchStamped
-from palpate_bus.monitor import Monitor
-from palpate_bus.stamps import duration_message, header
-from palpate_bus.strategies import messages
+from palpate_bus.contract.checker import Checker, Kind
+from palpate_bus.contract.conformance import violations
+from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueCommand, Vector3, Wrench, WrenchStamped, codec
+from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.monitor.diagnostics import RECENT_S, diagnostics
+from palpate_bus.monitor.health import Violation
+from palpate_bus.monitor.monitor import Monitor
+from palpate_bus.testing.strategies import messages
+from palpate_bus.wire.liveliness import Endpoint, Entity, qos_token
+from palpate_bus.wire.liveliness import Kind as EntityKind
 
 RULES = contract()
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]

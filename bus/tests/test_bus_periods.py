@@ -3,9 +3,10 @@
 from importlib import resources
 
 import pytest
+
 from palpate_bus.contract import parse, with_periods
 
-TEXT = resources.files("palpate_bus").joinpath("contract.yaml").read_text(encoding="utf-8")
+TEXT = resources.files("palpate_bus.contract").joinpath("contract.yaml").read_text(encoding="utf-8")
 
 
 def test_a_slower_role_sends_at_each_of_its_steps_and_nothing_else_changes() -> None:

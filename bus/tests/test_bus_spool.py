@@ -3,8 +3,9 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from palpate_bus.codec import CodecError
-from palpate_bus.spool import CHUNK_PERIOD, Recorded, Spool, unpack_chunk
+
+from palpate_bus.messages.codec import CodecError
+from palpate_bus.runtime.spool import CHUNK_PERIOD, Recorded, Spool, unpack_chunk
 
 TOPICS = ("joint_states", "ft/wrench")
 messages = st.lists(

@@ -6,8 +6,9 @@ import pytest
 import zenoh.ext as ze
 from hypothesis import given
 from hypothesis import strategies as st
-from palpate_bus import wire
+
 from palpate_bus.contract import contract
+from palpate_bus.wire import rmw as wire
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 

@@ -10,7 +10,8 @@ from queue import Empty, SimpleQueue
 
 import pytest
 import zenoh
-from palpate_bus.zenoh_config import BusConfigError, BusOptions, close_session, mesh, open_session, session, zenoh_config
+
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, mesh, open_session, session, zenoh_config
 
 
 def heard(publisher: zenoh.Session, subscriber: zenoh.Session, payload: bytes = b"x", key: str = "test/key") -> bytes | None:
@@ -118,7 +119,7 @@ def test_peers_meet_through_a_router_and_outlive_it(tmp_path: Path) -> None:
 
 def test_router_command_routes_until_it_is_told_to_end(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/router.sock"
-    router = subprocess.Popen([sys.executable, "-m", "palpate_bus.router", endpoint], stdout=subprocess.PIPE, text=True)
+    router = subprocess.Popen([sys.executable, "-m", "palpate_bus.wire.router", endpoint], stdout=subprocess.PIPE, text=True)
     try:
         assert router.stdout is not None
         assert endpoint in router.stdout.readline()
@@ -133,7 +134,7 @@ def test_router_command_routes_until_it_is_told_to_end(tmp_path: Path) -> None:
 
 def test_router_command_refuses_what_it_cannot_listen_on() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "palpate_bus.router", "7447"], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-m", "palpate_bus.wire.router", "7447"], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 2
     assert "7447" in done.stderr
@@ -143,7 +144,7 @@ def test_a_process_that_merely_ends_closes_its_session(tmp_path: Path) -> None:
     """Left to itself, zenoh hangs for ten seconds at interpreter exit and then prints a panic."""
     options = mesh(["a", "b"], tmp_path)
     program = (
-        "import zenoh; from queue import SimpleQueue; from palpate_bus.zenoh_config import open_session\n"
+        "import zenoh; from queue import SimpleQueue; from palpate_bus.wire.zenoh_config import open_session\n"
         "s = open_session(); q = SimpleQueue()\n"
         "sub = s.declare_subscriber('k/**', zenoh.handlers.Callback(q.put, indirect=False)); pub = s.declare_publisher('k/b')\n"
         "token = s.liveliness().declare_token('alive/b')\n"
@@ -172,7 +173,7 @@ def test_closing_twice_is_harmless() -> None:
 POOLS_PROGRAM = """
 import sys, time
 from pathlib import Path
-from palpate_bus.zenoh_config import mesh, session
+from palpate_bus.wire.zenoh_config import mesh, session
 options = mesh(["a", "b"], Path(sys.argv[1]))
 with session(options["a"]) as a, session(options["b"]):
     a.put("test/key", b"")

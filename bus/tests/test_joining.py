@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from palpate_bus.joining import BUS, NoBus, find, find_all
-from palpate_bus.runs import Announcement, Run
-from palpate_bus.zenoh_config import TLS_FILES
+
+from palpate_bus.runs.announcement import Announcement, Run
+from palpate_bus.runs.joining import BUS, NoBus, find, find_all
+from palpate_bus.wire.zenoh_config import TLS_FILES
 
 ENDPOINTS = {"robot": "tcp/127.0.0.1:17999"}
 

@@ -11,7 +11,7 @@ from palpate_bus.run import stands_back
 
 PROGRAM = """
 import os, sys, threading, time
-from palpate_bus.priority import BACKGROUND, in_the_background
+from palpate_bus.runtime.priority import BACKGROUND, in_the_background
 in_the_background()  # elsewhere than on Linux it lowers the priority at most
 after = threading.Thread(target=time.sleep, args=(30,), daemon=True)
 after.start()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from palpate_bus import codec
+
 from palpate_bus.contract import Edge, contract
-from palpate_bus.lockstep import InputBuffer, Received
-from palpate_bus.messages import JointState
-from palpate_bus.stamps import header
-from palpate_bus.suspects import failure
+from palpate_bus.messages import JointState, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.lockstep import InputBuffer, Received
+from palpate_bus.runtime.suspects import failure
 
 ROW = contract().topics["joint_states"]
 NAMES = [f"lbr_A{k}" for k in range(1, 8)]

@@ -11,6 +11,7 @@ import time
 from typing import Any
 
 import numpy as np
+
 from palpate_bus.messages import (
     CameraTrigger,
     ExamState,
@@ -35,9 +36,9 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
 )
+from palpate_bus.messages.stamps import NS, duration_message, header
 from palpate_bus.run import main
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, duration_message, header
 
 MS = 1_000_000
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]

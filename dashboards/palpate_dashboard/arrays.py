@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_bus.codec import Message
 from scipy.spatial.transform import Rotation
+
+from palpate_bus.messages.codec import Message
 
 
 def points(items: Any) -> NDArray[np.float64]:

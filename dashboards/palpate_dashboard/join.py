@@ -10,16 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from time import monotonic, sleep
 
-from palpate_bus import codec
 from palpate_bus.contract import contract
-from palpate_bus.desk import order
-from palpate_bus.member import Member
-from palpate_bus.messages import RunControl
-from palpate_bus.observer import IDLE_S, ObservedService
-from palpate_bus.operator_keys import OperatorKeys
-from palpate_bus.runs import Run, live
-from palpate_bus.zenoh_config import session
-
+from palpate_bus.messages import RunControl, codec
+from palpate_bus.runs.announcement import Run, live
+from palpate_bus.runs.desk import order
+from palpate_bus.runs.operator_keys import OperatorKeys
+from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.observer import IDLE_S, ObservedService
+from palpate_bus.wire.zenoh_config import session
 from palpate_dashboard.replay import draw, messages, recording_of
 from palpate_dashboard.service import DashboardService
 

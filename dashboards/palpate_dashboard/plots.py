@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from palpate_bus.contract import contract
 
+from palpate_bus.contract import contract
 from palpate_dashboard.columns import TIMELINE, Columns, scalars
 from palpate_dashboard.words import LEVELS, Health
 

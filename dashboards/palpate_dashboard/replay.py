@@ -16,13 +16,13 @@ from mcap.exceptions import McapError
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
-from palpate_bus import codec
-from palpate_bus.codec import Message
-from palpate_bus.contract import contract
-from palpate_models.load import load_scenario
 
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
+from palpate_bus.messages.codec import Message
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
+from palpate_models.load import load_scenario
 
 DISORDER = 2_000_000_000
 """Messages in a recording are at most so far out of order [ns]."""

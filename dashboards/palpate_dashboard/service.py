@@ -13,17 +13,11 @@ from time import perf_counter
 from typing import Any, Final
 
 import numpy as np
-from palpate_bus.codec import Message
+
 from palpate_bus.contract import contract
 from palpate_bus.messages import RobotStatus
+from palpate_bus.messages.codec import Message
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models import lbr, table
-from palpate_models.band import half_width
-from palpate_models.frames import apply, inverse
-from palpate_models.lbr_visual import visual_meshes
-from palpate_models.load import exam_input
-from palpate_models.scenario import Robot, Scenario
-
 from palpate_dashboard import arrays, palette, patient, plots, words
 from palpate_dashboard.columns import Columns
 from palpate_dashboard.force_depth import ForceDepth, ForceDepthPlane
@@ -33,6 +27,12 @@ from palpate_dashboard.map import StiffnessMap
 from palpate_dashboard.plots import Plots
 from palpate_dashboard.scene import Scene, Shaded
 from palpate_dashboard.sinks import Live, open_recording
+from palpate_models import lbr, table
+from palpate_models.band import half_width
+from palpate_models.frames import apply, inverse
+from palpate_models.lbr_visual import visual_meshes
+from palpate_models.load import exam_input
+from palpate_models.scenario import Robot, Scenario
 
 FILE: Final = "recording.rrd"
 MS: Final = 1_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from palpate_bus.codec import Message
+from palpate_bus.messages.codec import Message
 
 LEVELS = ("ok", "warning", "ERROR", "stale")
 """diagnostic_msgs/DiagnosticStatus levels."""

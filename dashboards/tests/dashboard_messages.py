@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
 from palpate_bus import messages as m
-from palpate_bus.codec import message_type
 from palpate_bus.contract import contract
-from palpate_bus.stamps import header, time_message
+from palpate_bus.messages.codec import message_type
+from palpate_bus.messages.stamps import header, time_message
 from palpate_models import lbr
 from palpate_models.scenario import Robot
-from scipy.spatial.transform import Rotation
 
 MS = 1_000_000
 OBSERVED = frozenset(topic.name for topic, _ in contract().inputs("dashboard"))

@@ -15,6 +15,7 @@ from typing import IO
 import numpy as np
 import pytest
 from dashboard_messages import FakeInbox, run
+
 from palpate_dashboard import palette
 from palpate_dashboard.picture import BROWSERS, PATIENCE_S, look, page_at
 from palpate_dashboard.service import FILE, DashboardService

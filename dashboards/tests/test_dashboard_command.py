@@ -9,15 +9,16 @@ import pytest
 import typer
 from dashboard_messages import run
 from mcap.writer import CompressionType, Writer
-from palpate_bus import codec
+from typer.testing import CliRunner
+
+from palpate.live.dashboard import dashboard
 from palpate_bus.contract import contract
+from palpate_bus.messages import codec
 from palpate_dashboard import replay
-from palpate_dashboard.command import dashboard
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.load import dump_scenario
 from palpate_models.scenario import Scenario
-from typer.testing import CliRunner
 
 app = typer.Typer()
 app.command()(dashboard)

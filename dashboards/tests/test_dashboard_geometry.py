@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dashboard_messages import dome, look
+
 from palpate_dashboard import arrays, palette
 from palpate_dashboard.geometry import Carry, VertexNormals, creased, level_lines
 from palpate_dashboard.sinks import Live

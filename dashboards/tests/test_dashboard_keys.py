@@ -14,12 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from palpate_bus.operator_keys import HINT, OperatorKeys
 from test_dashboard_browser import free_ports, start
+
+from palpate_bus.runs.operator_keys import HINT, OperatorKeys
 
 KEYS_PROGRAM = """
 import sys, time
-from palpate_bus.operator_keys import OperatorKeys
+from palpate_bus.runs.operator_keys import OperatorKeys
 with OperatorKeys() as keys:
     print("attached" if keys.attached else "not attached", flush=True)
     while True:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_dashboard.patient import HANG_M, Bed, parts, window
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Phantom

@@ -12,9 +12,11 @@ import pytest
 import rerun as rr
 from dashboard_messages import FakeInbox, Messages, latched, run
 from mcap.writer import Writer
-from palpate_bus import codec
-from palpate_bus.codec import message_type
+from rerun.chunk import RrdReader
+
 from palpate_bus.contract import contract
+from palpate_bus.messages import codec
+from palpate_bus.messages.codec import message_type
 from palpate_dashboard import replay
 from palpate_dashboard.columns import TIMELINE
 from palpate_dashboard.plots import BLAMED
@@ -23,7 +25,6 @@ from palpate_dashboard.sinks import Live
 from palpate_models import lbr
 from palpate_models.load import dump_scenario
 from palpate_models.scenario import Scenario
-from rerun.chunk import RrdReader
 
 SECONDS = 12.0
 

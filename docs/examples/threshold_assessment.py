@@ -1,11 +1,12 @@
 """An assessment of one's own: whatever takes more than twice the force of the softest tenth is stiff."""
 
 import numpy as np
-from palpate_bus.codec import message_type
+
 from palpate_bus.messages import ExamState, Finding, Findings
+from palpate_bus.messages.codec import message_type
+from palpate_bus.messages.stamps import header
 from palpate_bus.run import main
 from palpate_bus.service import Service
-from palpate_bus.stamps import header
 from palpate_models.frames import apply, inverse
 from palpate_models.load import exam_input, load_scenario
 from palpate_models.phantom import quadrant

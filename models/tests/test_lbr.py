@@ -5,6 +5,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 import pytest
+
 from palpate_models import lbr
 from palpate_models.scenario import Robot
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio
 import pytest
+
 from palpate_models import lbr
 from palpate_models.lbr_kinematics import link_transforms, tool_jacobian, tool_pose
 from palpate_models.scenario import Robot

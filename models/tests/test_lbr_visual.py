@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+
 from palpate_models import lbr
 from palpate_models.lbr_shape import Z, blend, box, cone, cut, cylinder, half_space, mesh, revolve
 from palpate_models.lbr_visual import VisualMesh, visual_meshes

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from palpate_models.load import ScenarioError, dump_scenario, load_scenario, scenario_names
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from palpate_models.nearest import nearest_vertex
 from scipy.spatial import cKDTree
+
+from palpate_models.nearest import nearest_vertex
 
 
 def test_it_is_the_tree_s() -> None:

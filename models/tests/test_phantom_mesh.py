@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+
 from palpate_models.frames import look_at
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.phantom.mesh import orient, refine

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_models.phantom import build_phantom
 from palpate_models.phantom.field import background_factor, edge_distance, gaussian_field, lesion_field
 from palpate_models.scenario import Background, Lesion, Phantom

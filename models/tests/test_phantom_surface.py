@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_models.phantom import build_phantom, quadrant
 from palpate_models.phantom.parametric import parametric_surface
 from palpate_models.scenario import Phantom

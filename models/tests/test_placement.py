@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+
 from palpate_models import placement
 from palpate_models.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
 from palpate_models.placement import PostureSequence, plan_redundancy, prepare

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from palpate_models.rotations import quaternion, quaternion_of
 from scipy.spatial.transform import Rotation
+
+from palpate_models.rotations import quaternion, quaternion_of
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 5e-4, 2e-3, 0.3, 2.0, 3.1])

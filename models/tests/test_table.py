@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from palpate_models.scenario import Robot
 from palpate_models.table import Box, boxes
 

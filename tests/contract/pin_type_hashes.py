@@ -6,8 +6,9 @@ A changed message cannot be read by those who have the old definition; a new typ
 from pathlib import Path
 
 import yaml
-from palpate_bus import codec
+
 from palpate_bus.contract import contract
+from palpate_bus.messages import codec
 
 HEAD = """\
 # RIHS01 hashes of every type on the bus. A test fails when one changes by accident.

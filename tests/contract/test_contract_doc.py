@@ -5,8 +5,9 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from palpate_bus.contract import Edge, contract
-from palpate_bus.doc import page
+from palpate_bus.contract.doc import page
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = contract()
@@ -14,14 +15,19 @@ RULES = contract()
 
 def test_the_page_is_current() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "palpate_bus.doc", "--check"], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-m", "palpate_bus.contract.doc", "--check"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
 
 
 def test_a_stale_page_is_told(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "palpate_bus.doc", "--check"],
+        [sys.executable, "-m", "palpate_bus.contract.doc", "--check"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -29,7 +35,7 @@ def test_a_stale_page_is_told(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 1
-    assert "run: python -m palpate_bus.doc" in done.stderr
+    assert "run: python -m palpate_bus.contract.doc" in done.stderr
 
 
 @pytest.mark.parametrize("topic", RULES.topics.values(), ids=lambda topic: topic.name)

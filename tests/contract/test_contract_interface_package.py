@@ -6,9 +6,10 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
-from palpate_bus import codec
-from palpate_bus.contract import contract
 from rosbags.interfaces import Nodetype
+
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
 
 PACKAGE = Path(__file__).parents[2] / "bus" / "palpation_msgs"
 MANIFEST = ElementTree.parse(PACKAGE / "package.xml").getroot()

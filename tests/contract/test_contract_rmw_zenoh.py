@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from palpate_bus import codec
+
 from palpate_bus.contract import contract
-from palpate_bus.liveliness import NodeTokens
-from palpate_bus.messages import Image, JointState, Vector3, Wrench, WrenchStamped
-from palpate_bus.stamps import header
-from palpate_bus.transport import Publisher
-from palpate_bus.wire import topic_key
-from palpate_bus.zenoh_config import mesh, session
+from palpate_bus.messages import Image, JointState, Vector3, Wrench, WrenchStamped, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.wire.liveliness import NodeTokens
+from palpate_bus.wire.rmw import topic_key
+from palpate_bus.wire.transport import Publisher
+from palpate_bus.wire.zenoh_config import mesh, session
 
 RULES = contract()
 LISTENER = Path(__file__).with_name("foreign_listener.py")

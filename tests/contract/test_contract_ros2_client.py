@@ -15,18 +15,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus import codec
+
+from palpate.check.live_rig import LiveRig
+from palpate.check.report import Report
+from palpate.check.rig import Settings
+from palpate.check.starting import started
+from palpate.check.suites.camera import plane
+from palpate.check.suites.robot import quiet
 from palpate_bus.contract import contract
-from palpate_bus.messages import CameraTrigger
-from palpate_bus.stamps import header
-from palpate_bus.zenoh_config import BusOptions, session
+from palpate_bus.messages import CameraTrigger, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.load import load_scenario
-from palpate_tools.live_rig import LiveRig
-from palpate_tools.report import Report
-from palpate_tools.rig import Settings
-from palpate_tools.starting import started
-from palpate_tools.suites.camera import plane
-from palpate_tools.suites.robot import quiet
 
 CLIENT = Path(__file__).with_name("ros2_client.py")
 RULES = contract()

@@ -11,15 +11,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from examination import Finished
-from palpate_bus.checker import Kind
-from palpate_bus.contract import contract
-from palpate_bus.liveliness import NodeTokens, parse_token
-from palpate_bus.wire import topic_key
-from palpate_bus.zenoh_config import BusOptions, session
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
+
+from palpate_bus.contract import contract
+from palpate_bus.contract.checker import Kind
+from palpate_bus.wire.liveliness import NodeTokens, parse_token
+from palpate_bus.wire.rmw import topic_key
+from palpate_bus.wire.zenoh_config import BusOptions, session
 
 RULES = contract()
 TYPES = {

@@ -7,11 +7,12 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from palpate_bus import codec
-from palpate_bus.conformance import leaves, numbers, violations
+
 from palpate_bus.contract import Contract, Edge, Role, Topic, Visibility, contract, parse
-from palpate_bus.stamps import header
-from palpate_bus.strategies import messages
+from palpate_bus.contract.conformance import leaves, numbers, violations
+from palpate_bus.messages import codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.testing.strategies import messages
 
 RULES = contract()
 TOPICS = pytest.mark.parametrize("topic", RULES.topics.values(), ids=lambda topic: topic.name)
@@ -211,7 +212,7 @@ def test_inputs_and_outputs_of_a_role_are_those_of_the_rows(role: Role) -> None:
     ],
 )
 def test_a_broken_row_is_refused(change: str, message: str) -> None:
-    text = (Path(codec.__file__).parent / "contract.yaml").read_text(encoding="utf-8")
+    text = (ROOT / "bus/palpate_bus/contract/contract.yaml").read_text(encoding="utf-8")
     broken = (
         text.replace(change, change[:-1] + change[-1] * 2, 1)
         if "\n" not in change

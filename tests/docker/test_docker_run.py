@@ -18,7 +18,7 @@ PROJECT = "palpate-test"
 USER = str(os.getuid() or 1000)
 SHARED_MEMORY = ("-f", "docker-compose.yml", "-f", "compose.ipc.yml")
 LINK = """
-from palpate_bus.zenoh_config import session
+from palpate_bus.wire.zenoh_config import session
 with session() as opened:
     while not opened.info.transports():
         pass

@@ -1,4 +1,4 @@
-"""The soft abdomen as an FMU: `build_fmu` writes one, `palpate_fmu.cli` looks at and simulates any. See the README."""
+"""The soft abdomen as an FMU: `build_fmu` writes one, `palpate.fmu` looks at and simulates any. See the README."""
 
 from __future__ import annotations
 

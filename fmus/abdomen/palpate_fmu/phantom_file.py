@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Phantom
 
 from palpate_fmu.variables import BRANCHES, LESIONS, Sizes, parameters
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Phantom
 
 Array = NDArray[np.float64]
 

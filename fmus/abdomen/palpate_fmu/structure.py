@@ -12,9 +12,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.phantom import PhantomModel
 
 from palpate_fmu.variables import Role, Sizes, Variable, variables
+from palpate_models.phantom import PhantomModel
 
 
 def couplings(model: PhantomModel) -> tuple[NDArray[np.intp], ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_models.scenario import Breathing, Lesion, Phantom

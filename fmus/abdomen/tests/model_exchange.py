@@ -12,6 +12,7 @@ import fmpy
 import numpy as np
 from fmpy import fmi2, fmi3
 from numpy.typing import ArrayLike
+
 from palpate_fmu.instance import read_variables
 from palpate_models.scenario import Lesion, Phantom
 

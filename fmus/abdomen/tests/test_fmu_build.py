@@ -12,6 +12,7 @@ from pathlib import Path
 import fmpy
 import numpy as np
 import pytest
+
 from palpate_fmu.compiling import WARNINGS, native, platforms
 from palpate_fmu.export import build_fmu, write_sources
 from palpate_fmu.instance import FmuInstance

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from model_exchange import Exchange, coarse_phantom
+
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from palpate_fmu.cli import app
+from typer.testing import CliRunner
+
+from palpate.fmu import app
 from palpate_fmu.compiling import native
 from palpate_fmu.running import run_and_plot
-from typer.testing import CliRunner
 
 runner = CliRunner()
 BUILD = ("build", "healthy", "--platform", native(), "--set", "phantom.edge_m=0.01")

@@ -8,6 +8,7 @@ import fmpy
 import numpy as np
 import pytest
 from model_exchange import Exchange, coarse_phantom
+
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 

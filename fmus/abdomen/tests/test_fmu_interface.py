@@ -9,6 +9,7 @@ import fmpy
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
+
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuError, FmuInstance

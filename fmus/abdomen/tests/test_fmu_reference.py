@@ -8,6 +8,7 @@ from typing import Any
 import fmpy
 import numpy as np
 import pytest
+
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.probing import COLUMNS, Probing, plot_probing, probe, write_csv
 

@@ -1,9 +1,8 @@
 """`python -m palpate_assessment`: the assessment service as a process."""
 
+from palpate_assessment.service import create
 from palpate_bus.run import main
 from palpate_models.load import load_scenario
-
-from palpate_assessment.service import create
 
 if __name__ == "__main__":
     main("assessment", create, load_scenario)

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.scenario import Stiffness
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 from scipy.special import k0, k0e, k1, k1e
+
+from palpate_models.scenario import Stiffness
 
 Array = NDArray[np.float64]
 

@@ -7,20 +7,20 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_bus.codec import Message, message_type
-from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, StiffnessMap
-from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, header, nanoseconds
-from palpate_models.frames import apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.phantom import quadrant
-from palpate_models.scenario import ExamInput, Scenario
 
 from palpate_assessment.assess import Assessment, assess
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.findings import StiffArea
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import Sample, Sampler, State
+from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, StiffnessMap
+from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.frames import apply, inverse
+from palpate_models.load import exam_input
+from palpate_models.phantom import quadrant
+from palpate_models.scenario import ExamInput, Scenario
 
 Array = NDArray[np.float64]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.inversion import POWER, footprints, reference_force

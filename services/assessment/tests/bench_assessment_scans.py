@@ -13,20 +13,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.ndimage import gaussian_filter1d
+
+from palpate.report.evidence import centroids_of, map_of
+from palpate.report.scoring import Scores, Truth, score
 from palpate_assessment.service import AssessmentService
-from palpate_bus.codec import message_type
 from palpate_bus.messages import ExamState, SurfaceMesh
-from palpate_bus.stamps import header
-from palpate_conductor.evidence import centroids_of, map_of
-from palpate_conductor.scoring import Scores, Truth, score
+from palpate_bus.messages.codec import message_type
+from palpate_bus.messages.stamps import header
 from palpate_models.frames import apply, matrix
 from palpate_models.load import exam_input
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.field import gaussian_field
 from palpate_models.scenario import Lesion, Mode, Phantom, Scenario
 from palpate_tissue.tissue import Tissue
-from scipy.interpolate import CloughTocher2DInterpolator
-from scipy.ndimage import gaussian_filter1d
 
 Array = NDArray[np.float64]
 

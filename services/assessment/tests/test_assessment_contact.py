@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_assessment.contact import REACH, ReferenceContact, static_contact
 from palpate_assessment.memory import PathMemory
 from palpate_models.phantom.flat import flat_phantom

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assessment_samples import CONTACT, flat_grid, samples_of
+
 from palpate_assessment.assess import Assessment, assess
 from palpate_assessment.findings import CONFIDENCE, SMALLEST, confidence, outline
 from palpate_assessment.grid import MapGrid

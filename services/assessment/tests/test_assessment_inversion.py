@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assessment_samples import CONTACT, flat_grid, samples_of
+
 from palpate_assessment.inversion import Noise, estimate_noise, invert, observe, spread_under
 from palpate_assessment.prior import BACKGROUND, HEALTHY, LESION, Field
 

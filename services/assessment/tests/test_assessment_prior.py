@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assessment_samples import CONTACT, samples_of
+
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.inversion import Noise, footprints, invert, observe
 from palpate_assessment.prior import HEALTHY, LESION, Component, Field

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.grid import map_grid
 from palpate_assessment.sampling import LONGEST, TRAVEL, Sample, Sampler, State

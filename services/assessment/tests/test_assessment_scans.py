@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from bench_assessment_scans import random_lesion, scan, scenario_with, scored
+
 from palpate_models.scenario import Exam, Lesion, Mode, Phantom, Scenario
 
 RLQ = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.035, 0.030), contrast=4.0)

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_assessment_scans import FakeInbox, Scan, examine, scan
+
+from palpate.report.evidence import centroids_of, map_of
+from palpate.report.scoring import score
 from palpate_assessment.service import AssessmentService, create
-from palpate_bus.codec import encode
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
-from palpate_conductor.evidence import centroids_of, map_of
-from palpate_conductor.scoring import score
+from palpate_bus.messages.codec import encode
 from palpate_models.load import exam_input
 from palpate_models.scenario import Exam, Lesion, Phantom, Scenario
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models.scenario import Camera
 
 Array = NDArray[np.float64]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+
 from palpate_camera.pinhole import Pinhole
 from palpate_camera.scene import Caster, Mesh, Scene
 from palpate_models.frames import apply, inverse, look_at

@@ -8,9 +8,8 @@ from typing import Any
 
 from palpate_bus.contract import MS
 from palpate_bus.messages import Clock, DiagnosticArray
+from palpate_bus.messages.stamps import NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, header, nanoseconds, time_message
-
 from palpate_conductor.tree import FrameTree
 
 HEALTH_PERIOD = NS

@@ -9,14 +9,13 @@ from time import monotonic, perf_counter, sleep
 from typing import Any
 
 import zenoh
-from palpate_bus import codec
-from palpate_bus.contract import MS, Contract
-from palpate_bus.lockstep import NEVER
-from palpate_bus.member import Member
-from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport
-from palpate_bus.observer import ObservedService
-from palpate_bus.stamps import NS, header
 
+from palpate_bus.contract import MS, Contract
+from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport, codec
+from palpate_bus.messages.stamps import NS, header
+from palpate_bus.runtime.lockstep import NEVER
+from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.observer import ObservedService
 from palpate_conductor.collector import Collector
 from palpate_conductor.contract_watch import ContractWatch
 from palpate_conductor.grants import Grants

@@ -12,11 +12,12 @@ from time import monotonic
 from typing import Any
 
 import zenoh
-from palpate_bus.access import WATCHER, watched
+
 from palpate_bus.contract import Contract
-from palpate_bus.diagnostics import topic_statuses
-from palpate_bus.health import Seen
-from palpate_bus.live import LiveMonitor
+from palpate_bus.monitor.diagnostics import topic_statuses
+from palpate_bus.monitor.health import Seen
+from palpate_bus.monitor.live import LiveMonitor
+from palpate_bus.security.access import WATCHER, watched
 
 POLL_S = 0.2
 FAST_MS = 10

@@ -11,10 +11,9 @@ from collections.abc import Callable
 from time import monotonic, time_ns
 
 from palpate_bus.contract import MS
-from palpate_bus.desk import PACE
-from palpate_bus.lockstep import NEVER
-from palpate_bus.stamps import NS
-
+from palpate_bus.messages.stamps import NS
+from palpate_bus.runs.desk import PACE
+from palpate_bus.runtime.lockstep import NEVER
 from palpate_conductor.outcome import RunFailed
 
 WINDOW = 500 * MS

@@ -1,4 +1,4 @@
-"""Where an operator's word reaches a run: a queryable of the conductor (`palpate_bus.desk` asks it).
+"""Where an operator's word reaches a run: a queryable of the conductor (`palpate_bus.runs.desk` asks it).
 
 The conductor passes the word on as `operator/request` and answers once the supervisor confirms it, so that the operator knows.
 """
@@ -13,8 +13,9 @@ from time import monotonic
 from typing import Any
 
 import zenoh
-from palpate_bus.desk import CONFIRM_S, PACE, WORDS, desk_key
+
 from palpate_bus.messages import SupervisorState
+from palpate_bus.runs.desk import CONFIRM_S, PACE, WORDS, desk_key
 
 
 @dataclass

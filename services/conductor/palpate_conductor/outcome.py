@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from palpate_bus.lockstep import NEVER, run_hash
+from palpate_bus.runtime.lockstep import NEVER, run_hash
 
 
 @dataclass(frozen=True)

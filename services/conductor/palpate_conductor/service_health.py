@@ -6,11 +6,10 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from time import monotonic
 from typing import Any
 
-from palpate_bus.diagnostics import RECENT_S
-from palpate_bus.health import Seen
 from palpate_bus.messages import DiagnosticStatus, KeyValue
-from palpate_bus.stamps import NS
-
+from palpate_bus.messages.stamps import NS
+from palpate_bus.monitor.diagnostics import RECENT_S
+from palpate_bus.monitor.health import Seen
 from palpate_conductor.watchdog import Progress
 
 

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
-from palpate_bus.stamps import header
+from palpate_bus.messages.stamps import header
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.lbr_kinematics import link_transforms

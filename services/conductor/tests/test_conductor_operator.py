@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from palpate_bus.messages import SupervisorState
-from palpate_bus.stamps import header
+from palpate_bus.messages.stamps import header
 from palpate_conductor.operator import OperatorDesk
 
 

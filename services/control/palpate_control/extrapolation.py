@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.compiled import compiled
 
 from palpate_control.layout import F_W, P_WD, QD, QDD, R_WD, V_WD, Q
 from palpate_control.rotations import exp3
+from palpate_models.compiled import compiled
 
 Array = NDArray[np.float64]
 

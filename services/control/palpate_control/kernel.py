@@ -11,10 +11,10 @@ from math import isfinite, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.compiled import compiled
 
 from palpate_control.layout import DAMPING_RATIO, F_W, JOINT_STIFFNESS, P_WD, QD, QDD, R_WD, STIFFNESS, V_WD, Q
 from palpate_control.rotations import jlog3_times, log3
+from palpate_models.compiled import compiled
 
 Array = NDArray[np.float64]
 

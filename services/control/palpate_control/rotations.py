@@ -6,6 +6,7 @@ from math import atan2, cos, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models.compiled import compiled
 
 Array = NDArray[np.float64]

@@ -7,20 +7,19 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from palpate_bus import codec
-from palpate_bus.codec import Message
-from palpate_bus.contract import MS, contract
-from palpate_bus.messages import ImpedanceSetpoint, JointTorqueCommand, Point, Pose, Quaternion, Twist, Vector3, Wrench
-from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, duration_message, header, nanoseconds
-from palpate_models.lbr import HOME, JOINT_NAMES, urdf
-from palpate_models.load import exam_input
-from palpate_models.scenario import Limits, Robot, Scenario
 
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import ImpedanceSetpoint, JointTorqueCommand, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
+from palpate_bus.service import Inbox, Outbox, Service
 from palpate_control import kernel
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import DOF, ArmModel
 from palpate_control.reference import Extrapolator, Mode, Setpoint, rotation_from_quaternion
+from palpate_models.lbr import HOME, JOINT_NAMES, urdf
+from palpate_models.load import exam_input
+from palpate_models.scenario import Limits, Robot, Scenario
 
 _NAMES = list(JOINT_NAMES)
 AHEAD = 500 * MS

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pinocchio as pin
+
 from palpate_control.model import ArmModel
 from palpate_control.reference import Mode, Reference, Setpoint
 from palpate_models.lbr import urdf

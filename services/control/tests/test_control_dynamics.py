@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from control_plant import ROBOT, WORKING, External, Plant, no_force, reference, setpoint
+
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Mode, Reference

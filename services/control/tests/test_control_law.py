@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from control_plant import ROBOT, WORKING, reference, setpoint
+
 from palpate_bus.contract import contract
 from palpate_control import kernel, safety
 from palpate_control.impedance import ImpedanceController

@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from palpate_control import reference as module
 from palpate_control.reference import Extrapolator, Mode, Setpoint
 

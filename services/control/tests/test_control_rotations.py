@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+
 from palpate_control.kernel import spd_inverse
 from palpate_control.rotations import exp3, jlog3_times, log3
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus import codec
+
 from palpate_bus.contract import MS, contract
-from palpate_bus.hand_inbox import HandInbox
-from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
-from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
+from palpate_bus.messages.stamps import duration_message, header, nanoseconds
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_control import extrapolation, kernel
 from palpate_control.service import ControlService, create
 from palpate_models.lbr import HOME, JOINT_NAMES

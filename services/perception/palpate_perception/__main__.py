@@ -2,7 +2,6 @@
 
 from palpate_bus.run import main
 from palpate_models.load import load_scenario
-
 from palpate_perception.service import create
 
 if __name__ == "__main__":

@@ -10,10 +10,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.frames import apply, inverse
-from palpate_models.scenario import Exam
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+from palpate_models.frames import apply, inverse
+from palpate_models.scenario import Exam
 
 Array = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models.scenario import Exam, Pattern
 
 Array = NDArray[np.float64]

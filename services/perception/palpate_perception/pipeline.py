@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models.frames import apply, inverse
 from palpate_models.scenario import Exam
 from palpate_models.table import TABLE_TOP_M
-
 from palpate_perception import cloud, pattern, surface, visibility
 from palpate_perception.cloud import Array, Box, Cloud
 from palpate_perception.fusion import DepthFusion, FusedDepth

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from palpate_bus.codec import Message, message_type
-from palpate_bus.contract import contract
-from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, header, nanoseconds
-from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
 from scipy.spatial.transform import Rotation
 
+from palpate_bus.contract import contract
+from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.load import exam_input
+from palpate_models.scenario import ExamInput, Scenario
 from palpate_perception.cloud import Array, Cloud
 from palpate_perception.fusion import DepthFusion, Image
 from palpate_perception.pipeline import Intrinsics, Mesh, Perceived, Pipeline, Targets

@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models.frames import apply, inverse
 from palpate_models.scenario import Exam
-
 from palpate_perception.cloud import Array, project
 
 CELL_M: Final = 0.01

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_perception.fusion import DepthFusion, frame_sigma
 
 SHAPE = (40, 50)

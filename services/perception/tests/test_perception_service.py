@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus import codec
+from scipy.interpolate import LinearNDInterpolator
+
 from palpate_bus.contract import MS, contract
-from palpate_bus.hand_inbox import HandInbox
-from palpate_bus.messages import CameraTrigger, Image, SurfaceMesh, TFMessage
-from palpate_bus.stamps import header
+from palpate_bus.messages import CameraTrigger, Image, SurfaceMesh, TFMessage, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.service import CameraService, transform
 from palpate_models.frames import apply, inverse, matrix
 from palpate_models.load import exam_input, load_scenario
@@ -20,7 +21,6 @@ from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Scenario
 from palpate_perception import cloud, pattern
 from palpate_perception.service import PerceptionService, create, depth_in_metres
-from scipy.interpolate import LinearNDInterpolator
 
 TICK = 100 * MS
 

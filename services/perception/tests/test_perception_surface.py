@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_perception import surface
 from palpate_perception.surface import CUTOFF_M, fit
 

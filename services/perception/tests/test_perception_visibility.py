@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_models.frames import apply, inverse, look_at
 from palpate_models.scenario import Exam
 from palpate_perception import cloud, visibility

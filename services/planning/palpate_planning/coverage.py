@@ -13,8 +13,9 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.scenario import Mode, Pattern
 from scipy.interpolate import CubicSpline
+
+from palpate_models.scenario import Mode, Pattern
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.compiled import compiled
 from scipy.interpolate import CubicSpline
+
+from palpate_models.compiled import compiled
 
 Array = NDArray[np.float64]
 

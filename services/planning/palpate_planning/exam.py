@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.scenario import ExamInput
-
 from palpate_planning import path
 from palpate_planning.follow import Follower
 from palpate_planning.kinematics import Kinematics

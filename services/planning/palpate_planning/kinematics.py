@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.scenario import Limits, Robot
 

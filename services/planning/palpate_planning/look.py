@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.scenario import ExamInput
-
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.scene import Scene, View, region_corners
 

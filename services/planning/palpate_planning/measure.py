@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.compiled import compiled
 
+from palpate_models.compiled import compiled
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.surface import Surface, foot
 from palpate_planning.timing import PERIOD_S

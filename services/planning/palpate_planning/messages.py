@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_bus.codec import Message, message_type
-from palpate_bus.messages import ExamState, ImpedanceSetpoint
-from palpate_bus.stamps import header
-from palpate_models.rotations import quaternion
 
+from palpate_bus.messages import ExamState, ImpedanceSetpoint
+from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages.stamps import header
+from palpate_models.rotations import quaternion
 from palpate_planning.measure import Contact
 from palpate_planning.setpoint import DAMPING_RATIO, Setpoint
 from palpate_planning.status import ExamStatus

@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from ompl import base, geometric, util
-from palpate_models.scenario import Limits
 
+from palpate_models.scenario import Limits
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.scene import STEP_RAD, Scene
 from palpate_planning.timing import JointTrajectory, joint_trajectory, rounded

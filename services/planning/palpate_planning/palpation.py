@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.scenario import Exam, Limits
 
+from palpate_models.scenario import Exam, Limits
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
 from palpate_planning.legs import HOVER_M, Leg
 from palpate_planning.measure import Contact

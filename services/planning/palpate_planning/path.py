@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.compiled import compiled
 from palpate_models.scenario import Limits
-
 from palpate_planning.curve import Curve, polynomial_at
 from palpate_planning.poses import angular_velocity, frame, least_twist
 from palpate_planning.setpoint import ControlMode, Setpoint

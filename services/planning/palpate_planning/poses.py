@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models.compiled import compiled
 
 Array = NDArray[np.float64]

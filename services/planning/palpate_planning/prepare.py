@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models.frames import apply, inverse
 from palpate_models.placement import plan_redundancy, prepare
 from palpate_models.scenario import ExamInput
-
 from palpate_planning.coverage import strokes
 from palpate_planning.kinematics import Kinematics
 from palpate_planning.legs import REACH, Leg, LegPlanner

@@ -9,10 +9,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+
 from palpate_models import lbr, table
 from palpate_models.frames import apply
 from palpate_models.scenario import Robot
-
 from palpate_planning.kinematics import Kinematics
 
 Array = NDArray[np.float64]

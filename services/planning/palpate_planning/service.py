@@ -10,15 +10,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_bus import priority
-from palpate_bus.codec import Message
+
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import duration_message, header
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
-
 from palpate_planning.exam import Exam
 from palpate_planning.measure import Reading
 from palpate_planning.messages import path_message, setpoint_message, state_message

@@ -6,8 +6,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.compiled import compiled
 from scipy.ndimage import spline_filter
+
+from palpate_models.compiled import compiled
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.compiled import compiled
-from palpate_models.frames import apply, inverse
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
+from palpate_models.compiled import compiled
+from palpate_models.frames import apply, inverse
 from palpate_planning.spline import UniformField, value_at
 
 Array = NDArray[np.float64]

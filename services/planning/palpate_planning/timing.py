@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 import ruckig
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.scenario import Limits
-
 from palpate_planning.kinematics import Kinematics
 
 Array = NDArray[np.float64]

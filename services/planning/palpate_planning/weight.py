@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.compiled import compiled
 from palpate_models.scenario import Robot

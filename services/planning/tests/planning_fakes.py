@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.frames import apply
 from palpate_models.load import exam_input

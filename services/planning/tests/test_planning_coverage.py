@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from palpate_models.scenario import Mode, Pattern
 from palpate_planning.coverage import SAMPLE_M, strokes, transfer
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from palpate_planning.curve import Curve, polynomial_at
 from scipy.interpolate import CubicSpline
+
+from palpate_planning.curve import Curve, polynomial_at
 
 
 def test_values_and_tangents_are_scipys_to_the_bit() -> None:

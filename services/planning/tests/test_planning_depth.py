@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+
 from palpate_planning.depth import FORCE_FRACTION, DepthRegulator, Regulation
 from palpate_planning.setpoint import NORMAL_STIFFNESS
 

@@ -7,11 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from planning_fakes import World, hertz, known
+
 from palpate_models.scenario import Mode, Pattern, Robot
 from palpate_planning.setpoint import ControlMode
 from palpate_planning.status import Phase, Unseen
 from palpate_planning.timing import PERIOD_S
-from planning_fakes import World, hertz, known
 
 
 @pytest.fixture(scope="module")

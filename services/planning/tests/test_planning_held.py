@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from planning_fakes import World, known
+
 from palpate_models import lbr
 from palpate_planning.palpation import Doing
 from palpate_planning.setpoint import ControlMode
 from palpate_planning.status import Phase
-from planning_fakes import World, known
 
 PHASES = [Phase.HOME, Phase.LOOK, Phase.PLAN, Phase.APPROACH, Phase.INDENT, Phase.SCAN, Phase.RETRACT, Phase.RETURN]
 

@@ -6,6 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from planning_fakes import BASE, World, known
+
 from palpate_models.scenario import Exam as ExamSettings
 from palpate_models.scenario import Limits
 from palpate_planning.follow import Follower
@@ -17,7 +19,6 @@ from palpate_planning.path import SurfacePath
 from palpate_planning.setpoint import Setpoint
 from palpate_planning.status import Phase
 from palpate_planning.timing import JOINT_ACCELERATION, LATE_NS, PERIOD_S, RESTART_NS, JointTrajectory, Pace, joint_trajectory
-from planning_fakes import BASE, World, known
 
 MS = 1_000_000
 KINEMATICS = Kinematics(BASE, Limits())

@@ -6,6 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from planning_fakes import BASE, known, seen_dome
+
 from palpate_models import lbr
 from palpate_models.scenario import Limits, Robot
 from palpate_planning.kinematics import Kinematics
@@ -15,7 +17,6 @@ from palpate_planning.poses import centre, least_twist, pose
 from palpate_planning.prepare import Planner
 from palpate_planning.scene import Scene, with_skirt
 from palpate_planning.timing import JOINT_ACCELERATION, PERIOD_S, Axis, SpeedLimit, joint_trajectory, rounded
-from planning_fakes import BASE, known, seen_dome
 
 LIMITS = Limits()
 KINEMATICS = Kinematics(BASE, LIMITS)

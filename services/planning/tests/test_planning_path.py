@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_planning.path import SurfacePath, lay
 from palpate_planning.poses import centre, pose
 from palpate_planning.setpoint import ControlMode

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
 from palpate_models.rotations import quaternion
 from palpate_planning.poses import angular_velocity, centre, least_twist, pose
-from scipy.spatial.transform import Rotation
 
 coordinate = st.floats(-1.0, 1.0)
 vectors = st.tuples(coordinate, coordinate, coordinate).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.05)

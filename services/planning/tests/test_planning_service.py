@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus import codec
+from planning_fakes import BASE, World, known
+from scipy.spatial.transform import Rotation
+
 from palpate_bus.contract import contract
-from palpate_bus.hand_inbox import HandInbox
 from palpate_bus.messages import (
     Findings,
     OperatorRequest,
@@ -16,16 +17,16 @@ from palpate_bus.messages import (
     RobotStatus,
     SupervisorState,
     SurfaceMesh,
+    codec,
 )
-from palpate_bus.stamps import header, nanoseconds
+from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
 from palpate_models.scenario import Exam, Scenario
 from palpate_planning.messages import pose_message
 from palpate_planning.service import PlanningService, create
 from palpate_planning.setpoint import ControlMode, Setpoint
 from palpate_planning.status import Outcome, Phase
-from planning_fakes import BASE, World, known
-from scipy.spatial.transform import Rotation
 
 Vector3 = codec.message_type("geometry_msgs/msg/Vector3")
 Point = codec.message_type("geometry_msgs/msg/Point")

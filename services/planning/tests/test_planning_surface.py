@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planning_fakes import grid_mesh
+
 from palpate_models.frames import apply, matrix
 from palpate_models.scenario import Pose
 from palpate_planning.surface import Surface
-from planning_fakes import grid_mesh
 
 X_WA = matrix(Pose(xyz_m=(0.56, 0.05, 0.93), rpy_rad=(0.05, -0.08, 0.3)))
 VERTICES, TRIANGLES = grid_mesh((0.14, 0.14))

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
 from palpate_models.scenario import Robot
 from palpate_planning.weight import GRAVITY, ToolWeight
-from scipy.spatial.transform import Rotation
 
 
 def reading(R_WS: np.ndarray, force_W: np.ndarray, bias: np.ndarray, mass: float, com: np.ndarray) -> np.ndarray:

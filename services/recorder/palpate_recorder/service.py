@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate_bus import codec
 from palpate_bus.contract import Contract, Topic, contract
+from palpate_bus.messages import codec
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.scenario import Scenario
-
 from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
 
 FOLDER = "recording_mcap"

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType
-from palpate_bus import codec
+
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointState, SurfaceMesh, ToolState, WrenchStamped
-from palpate_bus.stamps import header
+from palpate_bus.messages import JointState, SurfaceMesh, ToolState, WrenchStamped, codec
+from palpate_bus.messages.stamps import header
 from palpate_recorder.bag import BagWriter
 from palpate_recorder.service import channels
 

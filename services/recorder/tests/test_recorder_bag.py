@@ -11,15 +11,15 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from palpate_bus import codec
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointState, SurfaceMesh
-from palpate_bus.stamps import header
+from palpate_bus.messages import JointState, SurfaceMesh, codec
+from palpate_bus.messages.stamps import header
 from palpate_models.scenario import Scenario
 from palpate_recorder.recover import recover
 from palpate_recorder.service import FOLDER, RecorderService, create
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Reader
 
 MS = 1_000_000
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]
@@ -93,6 +93,7 @@ def test_every_schema_of_the_contract_parses(tmp_path: Path, name: str) -> None:
     """The ROS 2 decoder builds a decoder from the schema text alone, for each observed topic."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory as Factory
+
     from palpate_recorder.service import channels
 
     channel = next(c for c in channels(contract()) if c.topic == f"/{name}")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
+
 from palpate_models.frames import Array
 from palpate_models.lbr import Capsule
 from palpate_models.table import Box

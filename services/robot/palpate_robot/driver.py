@@ -12,9 +12,9 @@ from enum import IntEnum
 from typing import Final
 
 import numpy as np
+
 from palpate_models import lbr
 from palpate_models.frames import Array
-
 from palpate_robot import kernel
 
 HOLD_DAMPING: Final = np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])
@@ -29,7 +29,7 @@ TORQUE_RATE: Final = 2.0
 A command that was damaged on its way rarely stays within it."""
 AHEAD: Final = 500_000_000
 """A command stamped so far ahead [ns] comes from a clock that is wrong: its expiry protects nobody. More than a driver can be
-behind its own timer (`palpate_bus.wallclock.CATCH_UP`) and the command's validity: a busy machine is no wrong clock."""
+behind its own timer (`palpate_bus.runtime.wallclock.CATCH_UP`) and the command's validity: a busy machine is no wrong clock."""
 _LIMITS: Final = tuple(
     zip(
         lbr.JOINT_NAMES,

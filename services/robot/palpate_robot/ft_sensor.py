@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from operator import add
 
 import numpy as np
+
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 from math import cos, sin, sqrt
 
 import numpy as np
+
 from palpate_models import lbr
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
-
 from palpate_robot.physics import GRAVITY
 
 

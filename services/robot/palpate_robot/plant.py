@@ -22,11 +22,11 @@ from typing import Any, Final
 
 import dartpy as dart
 import numpy as np
+
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
 from palpate_models.table import boxes
-
 from palpate_robot.clearance import Clearance
 from palpate_robot.kinematics import Kinematics
 from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY, STICK_RADPS, Wrench

@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 from zlib import crc32
 
 import numpy as np
-from palpate_bus.codec import Message, message_type
+
+from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, nanoseconds
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
-
 from palpate_robot.driver import Cause, Command, Driver, Mode
 from palpate_robot.ft_sensor import FtSensor
 from palpate_robot.physics import DT, GRAVITY, Factory

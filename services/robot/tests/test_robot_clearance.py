@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_models import lbr
 from palpate_models.scenario import Robot
 from palpate_robot.plant import LEAST_CLEARANCE_RAD, Plant

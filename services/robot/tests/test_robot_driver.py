@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from palpate_bus.codec import message_type
+
+from palpate_bus.messages.codec import message_type
 from palpate_models import lbr
 from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, Cause, Command, Driver, Mode
 

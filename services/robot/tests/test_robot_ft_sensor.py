@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+
 from palpate_models import lbr
 from palpate_models.scenario import Robot
 from palpate_robot.ft_sensor import FtSensor

@@ -3,12 +3,13 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.spatial.transform import Rotation
+
 from palpate_models import lbr
 from palpate_models.scenario import Robot
 from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, GRAVITY, STICK_RADPS
 from palpate_robot.plant import Plant
-from scipy.spatial.transform import Rotation
 
 NOTHING = np.zeros(3)
 NO_DAMPING = np.zeros(7)

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus.codec import decode, encode, message_type
+
 from palpate_bus.contract import contract
-from palpate_bus.hand_inbox import HandInbox
-from palpate_bus.stamps import duration_message, header, nanoseconds
+from palpate_bus.messages.codec import decode, encode, message_type
+from palpate_bus.messages.stamps import duration_message, header, nanoseconds
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
 from palpate_models.scenario import Robot, Scenario
 from palpate_robot.physics import GRAVITY

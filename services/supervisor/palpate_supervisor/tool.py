@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+
 from palpate_models import lbr
 from palpate_models.compiled import compiled
 from palpate_models.nearest import nearest_vertex

@@ -8,8 +8,8 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.scenario import Limits
 
+from palpate_models.scenario import Limits
 from palpate_supervisor.tool import Tool
 
 Array = NDArray[np.float64]

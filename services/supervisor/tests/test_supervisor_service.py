@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus.hand_inbox import HandInbox
+
 from palpate_bus.messages import SupervisorState, SurfaceMesh
-from palpate_bus.stamps import header
+from palpate_bus.messages.stamps import header
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.load import load_scenario
 from palpate_supervisor.service import create
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from palpate_bus.contract import MS
 from palpate_models import lbr
 from palpate_models.load import exam_input, load_scenario

@@ -9,8 +9,8 @@ from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.compiled import compiled
 
+from palpate_models.compiled import compiled
 from palpate_tissue.friction import rub
 
 Array = NDArray[np.float64]

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Stiffness
 from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
+
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Stiffness
 
 Array = NDArray[np.float64]
 

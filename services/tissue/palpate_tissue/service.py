@@ -10,15 +10,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_bus.codec import Message, message_type
+from scipy.spatial.transform import Rotation
+
 from palpate_bus.contract import contract
+from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.stamps import NS, header
 from palpate_models.frames import matrix
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Pose, Scenario
-from scipy.spatial.transform import Rotation
-
 from palpate_tissue import kernel
 from palpate_tissue.soft_body import SoftBody
 from palpate_tissue.surface import Surface, placed

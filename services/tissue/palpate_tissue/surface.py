@@ -7,10 +7,11 @@ from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+
 from palpate_models.compiled import compiled
 from palpate_models.nearest import nearest_vertex
 from palpate_models.phantom import PhantomModel
-from scipy import sparse
 
 Array = NDArray[np.float64]
 Index = NDArray[np.uint32]

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Breathing, Stiffness
 from scipy.spatial import cKDTree
 
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Breathing, Stiffness
 from palpate_tissue import kernel
 from palpate_tissue.friction import Friction, shear_stiffness
 from palpate_tissue.mechanics import assemble

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+
 from palpate_models import phantom as phantoms
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Breathing, Lesion, Phantom, Stiffness

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from palpate_bus.codec import decode, encode, message_type
+from scipy.spatial.transform import Rotation
+
+from palpate_benchmarks import tissue as bench
 from palpate_bus.contract import MS, contract
-from palpate_bus.stamps import header, nanoseconds
+from palpate_bus.messages.codec import decode, encode, message_type
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.frames import matrix
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Breathing, Lesion, Phantom, Pose, Registration, Scenario
-from palpate_tissue import bench
 from palpate_tissue.service import create
 from palpate_tissue.surface import Surface, nearest_on_faces
-from scipy.spatial.transform import Rotation
 
 LESION = Lesion(centre_m=(-0.02, 0.0))
 

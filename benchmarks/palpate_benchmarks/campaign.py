@@ -1,0 +1,294 @@
+"""The fault campaign: one short examination a fault, with the fault in contact, and what came of it.
+
+A case starts the local processes of the compose file, waits until the indenter slides at depth (or, for what is sent only before,
+until the camera looks), does the damage, and watches: who noticed it first, how long after, the highest true force since, how
+the run ended. Times are of the wall clock, read every 20 ms.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from time import monotonic
+from typing import Any, Final
+
+from palpate.report.evidence import peak_force
+from palpate.run.distributed import WORKERS, conduct, write_scenario_files
+from palpate.run.forks import Forks
+from palpate.run.processes import LocalProcesses, compose_file, read_processes
+from palpate.run.result import Progress, RunResult
+from palpate_bus.contract import Topic, contract
+from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.runtime.faults import CHANGES
+from palpate_bus.wire.zenoh_config import close_session, open_session
+from palpate_conductor.outcome import Patience, RunFailed
+from palpate_models.load import load_scenario
+
+SETTINGS: Final = (
+    "exam.region_m=[0.03, 0.03]",
+    "exam.centre_m=[-0.055, -0.055]",
+    "camera.frames=2",
+    "limits.release_patience_s=0.5",
+)
+"""A small region on the lesion of rlq_guarding, so that a case takes seconds, and nobody waits long for an operator."""
+PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
+HANG_S: Final = 90.0
+"""A case that takes longer after its fault has hung."""
+CONTACT_S: Final = 0.3
+"""Simulated time at depth before the damage."""
+FORCE_LIMIT_N: Final = 25.0
+PROCESS_KINDS: Final = ("kill", "freeze", "jump")
+MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
+KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS)
+WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
+COMPLETE: Final = "complete"
+UNHARMED: Final = (COMPLETE, WENT_ON)
+"""Ends that need no cause."""
+LASTING: Final = frozenset({"nan", "stamp"})
+"""Kinds that hit every message from then on; the others one."""
+BEFORE_CONTACT: Final = frozenset({"camera", "perception"})
+"""Producers whose messages come before contact."""
+ASSESSES: Final = "assessment"
+"""The role whose faults may show after the scan only."""
+
+
+class CaseOver(RunFailed):
+    """Reaction and end of a case are known."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault."""
+
+    kind: str
+    where: str
+    """Role for faults of a process, topic for those of a message."""
+    wallclock: bool
+
+    @property
+    def name(self) -> str:
+        """A file's name."""
+        mode = "wallclock" if self.wallclock else "lockstep"
+        return f"{mode}-{self.kind}-{self.where.replace('/', '_')}"
+
+
+@dataclass
+class Finding:
+    """What came of a case."""
+
+    kind: str
+    where: str
+    mode: str
+    injected_s: float | None = None
+    """Simulated time of the damage; None when it was never done."""
+    detected_ms: float | None = None
+    """From the damage to the first sign of it, by wall clock."""
+    sign: str = ""
+    """That first sign."""
+    reaction: str = ""
+    """What the arm did."""
+    peak_force_before_n: float = 0.0
+    peak_force_n: float | None = 0.0
+    """Highest true contact force after the damage, every step of the tissue counted; None where nothing tells it."""
+    ended: str = ""
+    """How the run ended: complete, or the cause."""
+    named: bool = False
+    """Whether what was noticed names the role or topic."""
+    hung: bool = False
+    wall_s: float = 0.0
+
+    @property
+    def good(self) -> bool:
+        """Done, no hang, no force above the limit; and if the run did not simply go on, its cause named."""
+        return (
+            self.injected_s is not None
+            and not self.hung
+            and (self.peak_force_n or 0.0) <= FORCE_LIMIT_N
+            and (self.ended in UNHARMED or self.named)
+        )
+
+
+def cases(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[Case]:
+    """All faults of these modes and kinds; `only` keeps roles and topics."""
+    topics = [t for t in contract().topics.values() if t.producer in WORKERS and not t.latched and _flows(t)]
+    for mode in modes:
+        for kind in kinds:
+            for where in WORKERS if kind in PROCESS_KINDS else [topic.name for topic in topics]:
+                if not only or where in only:
+                    yield Case(kind, where, mode == "wallclock")
+
+
+def _flows(topic: Topic) -> bool:
+    """Whether an undisturbed examination sends it while a fault can hit it."""
+    return topic.name != "assessment/findings"
+
+
+@dataclass
+class _Watch:
+    """Does the damage at its time and notices what it brings."""
+
+    case: Case
+    local: LocalProcesses
+    target: str
+    finding: Finding
+    since: float = 0.0
+    held: int = 0
+    seen_scan: int | None = None
+    signs: list[str] = field(default_factory=list)
+
+    def tell(self, progress: Progress) -> None:
+        """Called every 20 ms of wall time (`palpate_conductor.conductor.POLL_S`)."""
+        if self.finding.injected_s is None:
+            self._strike(progress)
+            return
+        new = [sign for sign in _signs(progress) if sign not in self.signs]
+        if new and not self.signs:
+            self.finding.detected_ms = round((monotonic() - self.since) * 1e3, 1)
+            self.finding.sign = new[0]
+        self.signs += new
+        end = self._end(progress.collected.exam)
+        if end is not None and not progress.trouble:  # else the conductor ends it itself, after what the survivors do is recorded
+            raise CaseOver(end)
+        if monotonic() - self.since > HANG_S:
+            self.finding.hung = True
+            for child in self.local.running.values():
+                child.kill()
+
+    def _end(self, exam: Any | None) -> str | None:
+        """How the examination ended, as soon as that is sure: going home and the last second of a run tell nothing new."""
+        if exam is None:
+            return None
+        if exam.phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_DONE):
+            return COMPLETE if exam.phase == ExamState.PHASE_DONE else str(exam.message)
+        scanned = exam.phase == ExamState.PHASE_RETURN and not self.signs
+        return WENT_ON if scanned and self.target != ASSESSES else None
+
+    def _strike(self, progress: Progress) -> None:
+        exam = progress.collected.exam
+        if exam is None:
+            return
+        wanted = ExamState.PHASE_LOOK if contract().roles[self.target].name in BEFORE_CONTACT else ExamState.PHASE_SCAN
+        if self.case.kind in PROCESS_KINDS:
+            wanted = ExamState.PHASE_SCAN
+        if exam.phase != wanted:
+            return
+        if self.seen_scan is None:
+            self.seen_scan = progress.t
+        if progress.t - self.seen_scan < CONTACT_S * NS and wanted == ExamState.PHASE_SCAN:
+            return
+        self.finding.injected_s = progress.t / NS
+        self.since = monotonic()
+        number = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}.get(self.case.kind, signal.SIGUSR1)
+        self.local.running[self.target].send_signal(number)
+
+
+def _signs(progress: Progress) -> list[str]:
+    """Everything that says that something is wrong."""
+    found = list(progress.trouble)
+    collected = progress.collected
+    if collected.supervisor is not None and collected.supervisor.level != SupervisorState.LEVEL_OK:
+        found.append(f"supervisor: {collected.supervisor.reason}")
+    held = [status for status in collected.status_changes if status.mode == RobotStatus.MODE_SAFE_HOLD]
+    found += [f"driver: {status.reason}" for status in held]
+    exam = collected.exam
+    if exam is not None and (exam.phase in (ExamState.PHASE_HELD, ExamState.PHASE_ABORTED) or "lost" in exam.message):
+        found.append(f"planning: {exam.message}")
+    return found
+
+
+def forks() -> Forks:
+    """What starts the processes of many cases."""
+    return Forks(process.command[2] for process in read_processes(compose_file(), WORKERS).values())
+
+
+def run_case(case: Case, folder: Path, forks: Forks | None = None) -> Finding:
+    """Runs one case; its logs stay in a folder of its own under `folder`."""
+    scenario = load_scenario("rlq_guarding", SETTINGS)
+    out = (folder / case.name).resolve()
+    files = write_scenario_files(scenario, out)
+    processes = read_processes(compose_file(), WORKERS)
+    target = case.where if case.kind in PROCESS_KINDS else contract().topics[case.where].producer
+    environment = {**processes[target].environment, **_fault(case)}
+    processes[target] = replace(processes[target], environment=environment)
+    extra = {"PALPATE_RUNTIME": "wallclock" if case.wallclock else "lockstep", "PALPATE_RECORD": "0"}
+    finding = Finding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
+    begin = monotonic()
+    local = LocalProcesses(WORKERS, out, files, extra, forks=forks)
+    try:
+        session = open_session(local.bus["conductor"])
+        try:
+            for role in WORKERS:
+                local.start(processes[role])
+            watch = _Watch(case, local, target, finding)
+            result = conduct(session, WORKERS, watch.tell, local.ended, None, case.wallclock, PATIENCE)
+            if result.interrupted:
+                raise KeyboardInterrupt
+            _conclude(finding, watch, result)
+        finally:
+            close_session(session)
+    finally:
+        child = local.running.get(target)
+        if child is not None and case.kind == "freeze" and child.poll() is None:
+            child.kill()
+        local.stop(patience_s=3.0)
+    finding.wall_s = round(monotonic() - begin, 1)
+    return finding
+
+
+def _fault(case: Case) -> Mapping[str, str]:
+    if case.kind in ("kill", "freeze"):
+        return {}
+    if case.kind == "jump":
+        return {"PALPATE_FAULT": "clock:jump"}
+    lasting = case.kind in LASTING or (case.wallclock and case.kind == "drop")
+    return {"PALPATE_FAULT": f"{case.where}:{case.kind}", "PALPATE_FAULT_COUNT": "0" if lasting else "1"}
+
+
+def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
+    """How it ended, and what the forces were."""
+    collected = result.collected
+    last = Progress(0, 0.0, collected, ())
+    if finding.injected_s is not None:
+        watch.signs += [sign for sign in _signs(last) if sign not in watch.signs]
+        failed = result.failure is not None and result.failure not in UNHARMED
+        if finding.detected_ms is None and (watch.signs or failed):
+            finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
+            finding.sign = watch.signs[0] if watch.signs else str(result.failure)
+    split = (finding.injected_s or 0.0) * NS
+    forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in collected.indentation]
+    finding.peak_force_before_n = round(max((f for t, f in forces if t < split), default=0.0), 2)
+    after = [force for t, force in forces if t >= split]
+    finding.peak_force_n = round(max(after), 2) if after else None
+    exam = collected.exam
+    done = exam is not None and exam.phase == ExamState.PHASE_DONE
+    finding.ended = result.failure or (COMPLETE if done else str(exam.message if exam is not None else "never began"))
+    if finding.injected_s is None:
+        finding.ended = f"the fault was never done: {finding.ended}"
+    finding.reaction = _reaction(collected, finding.ended)
+    said = [finding.sign, finding.ended, *watch.signs]
+    words = " ".join(re.sub(r"^(supervisor|driver|planning): ", "", sentence) for sentence in said)  # not who said it
+    producer = contract().topics[finding.where].producer if finding.where in contract().topics else finding.where
+    finding.named = any(re.search(rf"(?<![\w/]){name}(?!\w)", words) for name in (finding.where, producer))
+
+
+def _reaction(collected: Any, ended: str) -> str:
+    """What the arm did, by the strongest that was seen."""
+    held = [status for status in collected.status_changes if status.mode == RobotStatus.MODE_SAFE_HOLD]
+    if held:
+        return "safe hold"
+    exam = collected.exam
+    phases = (ExamState.PHASE_ABORTED, ExamState.PHASE_RETURN, ExamState.PHASE_RETRACT)
+    if exam is not None and exam.phase in phases and ended != WENT_ON:
+        return "lifted off"
+    if collected.supervisor is not None and collected.supervisor.level == SupervisorState.LEVEL_SOFT_STOP:
+        return "soft stop"
+    return "none needed" if ended in UNHARMED else "run ended"
+
+
+def as_json(findings: Sequence[Finding]) -> list[dict[str, Any]]:
+    """For a file."""
+    return [{**asdict(finding), "good": finding.good} for finding in findings]

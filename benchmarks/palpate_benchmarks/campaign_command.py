@@ -1,0 +1,74 @@
+"""`palpate faults`: the fault campaign, its table, and docs/faults.md."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from palpate.command_line import EXIT_FAILED, output_file, refuse
+from palpate.report.files import write_text
+from palpate.report.marked import doc_option, write_part
+from palpate_benchmarks.campaign import KINDS, Finding, as_json, cases, forks, run_case
+from palpate_benchmarks.campaign_tables import markdown, table
+from palpate_benchmarks.case_display import CaseDisplay
+
+WIDE = 200
+
+Listed = Annotated[list[str] | None, typer.Option("--only", help="Keep these roles and topics; may be repeated.")]
+
+
+def faults(
+    mode: Annotated[list[str] | None, typer.Option(help="lockstep, wallclock; both by default.")] = None,
+    kind: Annotated[list[str] | None, typer.Option(help=f"Out of {', '.join(KINDS)}; all by default.")] = None,
+    only: Listed = None,
+    out: Annotated[Path, output_file("File for the findings; those that it holds are not run again.")] = Path("faults.json"),
+    doc: Annotated[Path | None, doc_option("faults")] = None,
+    again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
+    limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
+) -> None:
+    """Kill, freeze, delay, drop, corrupt...: every service and topic in turn, in contact; print what came of each."""
+    console = Console(stderr=True, width=max(WIDE, Console().width))
+    wanted_modes, wanted_kinds = mode or ["lockstep", "wallclock"], kind or list(KINDS)
+    for name, given, known in (("--mode", wanted_modes, ("lockstep", "wallclock")), ("--kind", wanted_kinds, KINDS)):
+        for value in given:
+            if value not in known:
+                refuse(f"{name} {value}: allowed are {', '.join(known)}")
+    found = _load(out)
+    todo = list(cases(wanted_modes, wanted_kinds, only or ()))
+    if not todo:
+        refuse(f"nothing to do: {', '.join(only or ())} is no role or topic of these kinds")
+    if not again:
+        done = {(f.kind, f.where, f.mode) for f in found}
+        todo = [case for case in todo if (case.kind, case.where, "wall clock" if case.wallclock else "lockstep") not in done]
+    todo = todo[:limit]
+    started_by = forks()
+    with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
+        display.tell(0, len(todo), "")
+        for number, case in enumerate(todo, 1):
+            finding = run_case(case, Path(folder), started_by)
+            found = [f for f in found if (f.kind, f.where, f.mode) != (finding.kind, finding.where, finding.mode)] + [finding]
+            write_text(out, json.dumps(as_json(found), indent=1) + "\n")
+            mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
+            display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
+    Console(width=max(WIDE, Console().width)).print(table(found))
+    if doc is not None:
+        write_part(doc, "faults", markdown(found))
+    if any(not finding.good for finding in found):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _load(path: Path) -> list[Finding]:
+    if not path.exists():
+        return []
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        found = [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
+    except (ValueError, TypeError, AttributeError) as error:
+        refuse(f"--out {path}: holds no findings of this command: {error}")
+    return [finding for finding in found if finding.injected_s is not None]  # those that never began are tried again

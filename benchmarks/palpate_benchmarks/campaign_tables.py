@@ -1,0 +1,85 @@
+"""What came of a fault campaign, as tables for a terminal and for the documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import median
+
+from rich.markup import escape
+from rich.table import Table
+
+from palpate_benchmarks.campaign import KINDS, UNHARMED, Finding
+
+COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
+SUMMARY = (
+    "mode",
+    "fault",
+    "cases",
+    "as they should be",
+    "noticed",
+    "after: median, longest [ms]",
+    "largest force [N]",
+    "what became of it",
+)
+
+
+def table(findings: Sequence[Finding]) -> Table:
+    """For a terminal."""
+    shown = Table(*COLUMNS, box=None)
+    for finding in _sorted(findings):
+        shown.add_row(*map(escape, _row(finding)), style=None if finding.good else "bold red")
+    return shown
+
+
+def markdown(findings: Sequence[Finding]) -> str:
+    """For the documentation: a summary, and every case folded away."""
+    good = sum(f.good for f in findings)
+    largest = max((f.peak_force_n or 0.0 for f in findings), default=0.0)
+    lines = [f"{good} of {len(findings)} as they should be; the largest force was {largest:.1f} N.", ""]
+    lines += _markdown_table(SUMMARY, _summary(findings))
+    lines += ["", "<details><summary>Every case</summary>", ""]
+    lines += _markdown_table(("", *COLUMNS), [("" if f.good else "**!**", *_row(f)) for f in _sorted(findings)])
+    return "\n".join([*lines, "", "</details>"]) + "\n"
+
+
+def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "/").replace("\n", " ") for cell in cells) + " |"
+
+    return [line(head), "|---" * len(head) + "|", *map(line, rows)]
+
+
+def _summary(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
+    """One row a mode and kind."""
+    rows: list[tuple[str, ...]] = []
+    for mode, kind in sorted({(f.mode, f.kind) for f in findings}, key=lambda key: (key[0], KINDS.index(key[1]))):
+        cases = [f for f in findings if (f.mode, f.kind) == (mode, kind)]
+        after = [f.detected_ms for f in cases if f.detected_ms is not None]
+        outcomes: dict[str, int] = {}
+        for finding in cases:
+            outcome = "went on" if finding.ended in UNHARMED else finding.reaction
+            outcomes[outcome] = outcomes.get(outcome, 0) + 1
+        rows.append(
+            (
+                mode,
+                kind,
+                str(len(cases)),
+                str(sum(f.good for f in cases)),
+                str(len(after)),
+                f"{median(after):.0f}, {max(after):.0f}" if after else "",
+                f"{max(f.peak_force_n or 0.0 for f in cases):.1f}",
+                ", ".join(f"{outcome} {count}" for outcome, count in sorted(outcomes.items(), key=lambda item: -item[1])),
+            )
+        )
+    return rows
+
+
+def _row(finding: Finding) -> tuple[str, ...]:
+    after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
+    after = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
+    force = f"{finding.peak_force_before_n:.1f}, {after}"
+    return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
+
+
+def _sorted(findings: Sequence[Finding]) -> list[Finding]:
+    return sorted(findings, key=lambda f: (f.mode, KINDS.index(f.kind), f.where))

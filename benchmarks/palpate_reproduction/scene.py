@@ -1,0 +1,124 @@
+"""What stood where at a moment of a recorded run: robot, table, patient, the abdomen as it was pressed, as bodies to draw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_dashboard import arrays, palette, patient
+from palpate_dashboard.geometry import Carry, VertexNormals, creased
+from palpate_dashboard.replay import RecordedInbox, messages
+from palpate_models import table
+from palpate_models.frames import apply, inverse
+from palpate_models.lbr_visual import visual_meshes
+from palpate_models.load import exam_input
+from palpate_models.scenario import Scenario
+from palpate_reproduction.render import Body
+
+SEEN = ("sim/link_poses", "sim/surface", "assessment/map")
+CARRY_M = 0.012
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Messages as they were at a simulated time."""
+
+    time_s: float
+    link_poses: Any
+    surface: Any
+    stiffness_map: Any | None
+
+
+def moments(recording: Sequence[Path], times_s: Sequence[float]) -> list[Moment]:
+    """The scene at each of `times_s`, in their order, from a recording's files. Raises OSError, ValueError if it ends before."""
+    inbox = RecordedInbox()
+    wanted = sorted(set(times_s))
+    found: dict[float, Moment] = {}
+
+    def take(time: float) -> None:
+        poses, surface, known = (inbox.latest(topic) for topic in SEEN)
+        found[time] = Moment(time, poses, surface, known)
+
+    for stamp, topic, payload in messages(recording):
+        while wanted and stamp / 1e9 > wanted[0]:
+            take(wanted.pop(0))
+        if topic in SEEN:
+            inbox.put(topic, payload, stamp)
+    for time in wanted:
+        take(time)
+    if any(moment.link_poses is None or moment.surface is None for moment in found.values()):
+        raise ValueError(f"{recording}: it holds no robot or no abdomen at {min(times_s):.1f} s")
+    return [found[time] for time in times_s]
+
+
+def deformation_mm(rest: Moment, pressed: Moment) -> float:
+    """How far the farthest vertex of the abdomen is from where it rests [mm]."""
+    before, after = (arrays.triples(moment.surface.vertices) for moment in (rest, pressed))
+    return float(1e3 * np.linalg.norm(after - before, axis=1).max())
+
+
+class Stage:
+    """Turns moments into bodies in world; what stands still is made once."""
+
+    def __init__(self, scenario: Scenario, rest: Moment) -> None:
+        given = exam_input(scenario)
+        self._X_WA = np.array(given.X_WA)
+        self._links = {
+            link: [(*creased(mesh.vertices, mesh.triangles), mesh.rgba) for mesh in meshes]
+            for link, meshes in visual_meshes(given.robot).items()
+        }
+        self._triangles = arrays.triples(rest.surface.triangles).astype(np.uint32)
+        vertices = arrays.triples(rest.surface.vertices).astype(np.float64)
+        self._rest = vertices
+        self._still = [_box(box) for box in table.boxes(given.robot)]
+        bed = patient.Bed(table.TABLE_TOP_M - float(self._X_WA[2, 3]), (table.TABLE_X_M[1] - table.TABLE_X_M[0]) / 2)
+        for part in patient.parts(apply(inverse(self._X_WA), vertices), bed, given.exam.region_m, given.exam.centre_m):
+            normals = part.normals @ self._X_WA[:3, :3].T
+            self._still.append(_body(apply(self._X_WA, part.vertices.astype(np.float64)), part.triangles, normals, part.color))
+
+    def bodies(self, moment: Moment) -> list[Body]:
+        """All that is seen at a moment."""
+        return [*self._still, self.abdomen(moment), *self._robot(moment)]
+
+    def abdomen(self, moment: Moment) -> Body:
+        """The deformed abdomen, coloured by what is known of its stiffness."""
+        vertices = arrays.triples(moment.surface.vertices).astype(np.float32)
+        colors = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
+        known = moment.stiffness_map
+        if known is not None and np.asarray(known.scanned).any():
+            scanned, mean = np.asarray(known.scanned, dtype=bool), np.asarray(known.stiffness, dtype=np.float64)
+            ratio = mean / (known.background if known.background > 0 else float(np.median(mean[scanned])))
+            places = apply(self._X_WA, arrays.triples(known.vertices).astype(np.float64))
+            skin = palette.packed(palette.SKIN)
+            shades = np.where(scanned, palette.stiffness_colors(ratio), skin)
+            colors = Carry(places, self._rest, CARRY_M)(shades, skin).astype(np.uint32)
+        rgb = np.stack([(colors >> shift) & 255 for shift in (24, 16, 8)], axis=1).astype(np.float32)
+        return Body(vertices, self._triangles, VertexNormals(self._triangles, len(vertices))(vertices), rgb)
+
+    def _robot(self, moment: Moment) -> list[Body]:
+        bodies = []
+        for item in moment.link_poses.transforms:
+            X = arrays.matrix(arrays.transform(item.transform))
+            for vertices, triangles, normals, rgba in self._links.get(item.child_frame_id, ()):
+                color = [255.0 * channel for channel in rgba]
+                bodies.append(_body(apply(X, vertices.astype(np.float64)), triangles, normals @ X[:3, :3].T, color))
+        return bodies
+
+
+def _body(vertices: NDArray[Any], triangles: NDArray[Any], normals: NDArray[Any], color: Sequence[float]) -> Body:
+    colors = np.tile(np.array(color[:3], dtype=np.float32), (len(vertices), 1))
+    return Body(vertices.astype(np.float32), triangles.astype(np.uint32), normals.astype(np.float32), colors)
+
+
+def _box(box: table.Box) -> Body:
+    corner = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * box.size
+    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    faces = np.array([face for a, b, c, d in sides for face in ((a, b, c), (a, c, d))])
+    vertices, triangles, normals = creased(corner, faces)
+    color = palette.PLINTH if box.name == "robot_base" else palette.SHEET
+    return _body(apply(box.X_WB, vertices.astype(np.float64)), triangles, normals @ box.X_WB[:3, :3].T, color)

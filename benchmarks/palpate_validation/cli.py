@@ -1,0 +1,69 @@
+"""`palpate validate`: the physics measured against independent references."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from palpate.command_line import output_file, output_folder, refuse
+from palpate_validation.check import Section
+from palpate_validation.report import failures, table, write, write_page
+
+EXIT_MISSED = 3
+SECTIONS = {
+    "hertz": "hertz",
+    "elastic": "elastic",
+    "lumps": "lumps",
+    "mesh": "meshes",
+    "relaxation": "relaxation",
+    "energy": "energy",
+    "drop": "drop",
+    "dart": "dart_bodies",
+    "mujoco": "flex",
+    "stability": "stability",
+}
+"""Name of each section and the module that measures it, in the order of the report."""
+
+app = typer.Typer(name="validate", help="Measure the physics against independent references.", invoke_without_command=True)
+
+
+def run_section(name: str) -> Section:
+    """Measures the section of that name. Raises KeyError if there is none."""
+    section: Section = importlib.import_module(f"palpate_validation.{SECTIONS[name]}").section()
+    return section
+
+
+@app.callback()
+def validate(
+    out: Annotated[Path, output_folder("Folder for validate.json and the plots.")] = Path("out/validation"),
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="SECTION", help=f"One of: {', '.join(SECTIONS)}. May be repeated.")
+    ] = None,
+    docs: Annotated[Path | None, output_file("Also write this Markdown page, PNGs next to it.")] = None,
+) -> None:
+    """Measure the physics against Hertz, DART, MuJoCo and theory. Leaves with status 3 if a bound is missed."""
+    console = Console(stderr=True)
+    unknown = [name for name in only or () if name not in SECTIONS]
+    if unknown:
+        refuse(f"--only {unknown[0]}: sections are {', '.join(SECTIONS)}")
+    sections = []
+    for name in [name for name in SECTIONS if not only or name in only]:
+        with console.status(f"measuring: {name}"):
+            sections.append(run_section(name))
+    try:
+        write(sections, out)
+        if docs is not None:
+            write_page(sections, docs, docs.parent / "images" / "validation")
+    except OSError as error:
+        refuse(error)
+    shown = Console()
+    Console(width=max(150, shown.width)).print(table(sections))
+    console.print(f"plots and figures in {out}", highlight=False)
+    missed = failures(sections)
+    if missed:
+        console.print(f"[bold red]{len(missed)} outside their bounds:[/] {'; '.join(c.name for c in missed)}", highlight=False)
+        raise typer.Exit(EXIT_MISSED)

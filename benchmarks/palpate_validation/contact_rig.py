@@ -1,0 +1,193 @@
+"""Robot, tissue and controller of a real run, without planning: pressed to a depth by a script, under bus delays.
+
+The services are those that `palpate run` starts, in the composed runtime. The arm starts 5 mm above the umbilicus, in the
+posture of an examination, presses 10 mm deep and holds; at `NUDGE_S` the set-point steps 0.5 mm deeper and back: what rings
+long after that rings by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, duration_message
+from palpate_bus.runtime.composed import Composed
+from palpate_control.service import create as create_control
+from palpate_models import lbr
+from palpate_models.frames import matrix
+from palpate_models.load import exam_input
+from palpate_models.scenario import Background, Phantom, Scenario, Stiffness
+from palpate_planning.kinematics import Kinematics
+from palpate_planning.messages import setpoint_message
+from palpate_planning.poses import least_twist, pose
+from palpate_planning.setpoint import ControlMode, Setpoint
+from palpate_robot.plant import Plant
+from palpate_robot.service import RobotService
+from palpate_tissue.service import TissueService
+from palpate_tissue.service import create as create_tissue
+from palpate_validation.delays import BusDelay, Delayed
+
+Array = NDArray[np.float64]
+
+DEPTH_M = 0.010
+ABOVE_M = 0.005
+BEGIN_S, PRESS_S, NUDGE_S, END_S = 0.05, 0.45, 0.8, 1.6
+NUDGE_M, NUDGE_FOR_S = 0.0005, 0.05
+WATCH_S = 0.3
+"""The end of the run, over which ringing is measured [s]."""
+EVENTS = ("joint_states", "control/joint_torque", "sim/tool_state", "sim/contact_wrench")
+CONTROL_PATH = EVENTS[:2]
+"""What a real robot sends over its bus."""
+CONTACT_PATH = EVENTS[2:]
+"""What only a co-simulation sends: on hardware robot and tissue touch."""
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Delay and jitter [s] on each message of the given topics; a path's loop holds two of them."""
+
+    topics: tuple[str, ...] = EVENTS
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    seed: int = 0
+
+    def on(self, *topics: str) -> dict[str, BusDelay]:
+        """The delays among `topics`, each with a random stream of its own."""
+        return {
+            topic: BusDelay(self.delay_s, self.jitter_s, 100 * self.seed + EVENTS.index(topic))
+            for topic in topics
+            if topic in self.topics
+        }
+
+
+@dataclass(frozen=True)
+class Ringing:
+    """How a contact fared; arrays of shape (n,), a value a millisecond."""
+
+    time: Array
+    """[s]"""
+    force: Array
+    """Of the tissue on the indenter, along the vertical [N]."""
+    held: bool
+    """Whether the driver gave up into its safe hold."""
+
+    def _swing(self, start: float) -> float:
+        part = self.force[(self.time >= start) & (self.time < start + WATCH_S)]
+        return float(np.ptp(part - np.polyval(np.polyfit(np.arange(len(part)), part, 1), np.arange(len(part)))))
+
+    @property
+    def mean_force(self) -> float:
+        """Over the end of the run [N]."""
+        return float(self.force[self.time >= self.time[-1] - WATCH_S].mean())
+
+    @property
+    def swing(self) -> float:
+        """Peak to peak at the end of the run, drift taken out [N]."""
+        return self._swing(END_S - WATCH_S)
+
+    @property
+    def stable(self) -> bool:
+        """Whether the ringing dies: no safe hold, contact kept, at most 5 % of the force left swinging (and 0.05 N)."""
+        return not self.held and self.mean_force > 0.1 and self.swing < max(0.05, 0.05 * self.mean_force)
+
+
+@cache
+def scenario(contrast: float) -> Scenario:
+    """A uniform abdomen `contrast` times as stiff as the default, on the default robot without sensor noise."""
+    wall = Stiffness(k_w_n_per_m3=1.7e5 * contrast)
+    plain = Scenario()
+    robot = plain.robot.model_copy(update={"position_noise_rad": 0.0, "velocity_noise_radps": 0.0})
+    phantom = Phantom(stiffness=wall, background=Background(cv=0.0, margins=1.0), edge_m=0.006)
+    return plain.model_copy(update={"phantom": phantom, "robot": robot})
+
+
+@cache
+def _tissue(contrast: float) -> TissueService:
+    """A tissue that has not been touched; a run takes a copy of it."""
+    return create_tissue(scenario(contrast))
+
+
+@dataclass
+class _Script:
+    """Set-points as planning would send them."""
+
+    contrast: float
+    stiffness: float
+    ready: Array = field(init=False)
+    """Joint positions at the start."""
+    R: Array = field(init=False)
+    top: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        chosen = scenario(self.contrast)
+        kinematics = Kinematics(chosen.robot, chosen.limits)
+        self.R = least_twist(np.array((0.0, 0.0, -1.0)), kinematics.pose(lbr.HOME)[:3, :3])
+        self.top = matrix(chosen.phantom.pose.true)[:3, 3] + (0.0, 0.0, chosen.robot.indenter_radius_m)
+        self.ready = kinematics.solve(self._at(-ABOVE_M), lbr.HOME).q
+        self._valid = duration_message((contract().topics["planning/setpoint"].expiry_ms or 0) * MS)
+
+    def _at(self, depth: float) -> Array:
+        return pose(self.R, self.top - (0.0, 0.0, depth))
+
+    def depth(self, t: float) -> float:
+        """Of the set-point below the skin at rest [m] at time `t` [s]."""
+        if t < PRESS_S:
+            return -ABOVE_M + (DEPTH_M + ABOVE_M) * _smooth((t - BEGIN_S) / (PRESS_S - BEGIN_S))
+        return DEPTH_M + (NUDGE_M if NUDGE_S <= t < NUDGE_S + NUDGE_FOR_S else 0.0)
+
+    def __call__(self, t: int) -> Mapping[str, Message]:
+        if t % (10 * MS):
+            return {}
+        now = t / NS
+        setpoint = Setpoint(ControlMode.CARTESIAN, self._at(self.depth(now)), self.ready)
+        message = setpoint_message(t, setpoint, self._valid)
+        message.stiffness = setpoint.stiffness * (1, 1, self.stiffness / setpoint.stiffness[2], 1, 1, 1)
+        return {"planning/setpoint": message}
+
+
+def _smooth(t: float) -> float:
+    t = min(max(t, 0.0), 1.0)
+    return t * t * t * (10 - 15 * t + 6 * t * t)
+
+
+def start_posture(contrast: float = 1.0) -> Array:
+    """Joint positions in which a run starts [rad], shape (7,)."""
+    return _Script(contrast, 0.0).ready
+
+
+@cache
+def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
+    """Presses a wall `contrast` times as stiff as the default, with a controller of `stiffness` [N/m] along the tool.
+
+    Runs repeat exactly, so one that has been made is remembered.
+    """
+    chosen = scenario(contrast)
+    time, force, modes = [], [], []
+
+    def see_wrench(t: int, outbox: Mapping[str, Any]) -> None:
+        time.append(t / NS)
+        force.append(outbox["sim/contact_wrench"].wrench.force.z)
+
+    def see_status(_: int, outbox: Mapping[str, Any]) -> None:
+        if "robot/status" in outbox:
+            modes.append(outbox["robot/status"].mode)
+
+    script = _Script(contrast, stiffness)
+    robot = RobotService(exam_input(chosen), lambda robot: Plant(robot, script.ready))
+    run = Composed(
+        [
+            Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_status),
+            Delayed(deepcopy(_tissue(contrast)), delays.on("sim/tool_state"), see_wrench),
+            Delayed(create_control(chosen), delays.on("joint_states"), script=script),
+        ]
+    )
+    run.run(lambda: None, round(END_S * NS))
+    return Ringing(np.array(time), np.array(force), 2 in modes)

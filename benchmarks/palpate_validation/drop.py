@@ -1,0 +1,160 @@
+"""The contact test of the paper's figure 3: an indenter dropped on a soft and on a rigid surface, force and position over time.
+
+The paper plunges by about 3 mm, oscillates and comes to rest at about 1 mm; on the rigid surface it stops where it touches.
+Our default wall is softer than the paper's surface: this tool would sink 14 mm into it and dip twice more. The figure's surface
+is stiffer and less damped, as DART's was, with the stiffness chosen for the 1 mm, drop and damping for the 3 mm.
+
+    from palpate_validation.drop import measure, draw
+    draw(figure, measure())
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import find_peaks
+
+from palpate_models.phantom import flat_phantom
+from palpate_models.scenario import Stiffness
+from palpate_tissue.tissue import Tissue
+from palpate_validation.check import Check, Section
+from palpate_validation.dart_scene import Box, DartScene, Flesh
+from palpate_validation.plots import COLOURS, INK, QUIET
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.81
+MASS_KG = 0.35
+"""Stand-off and indenter of the default tool."""
+RADIUS_M = 0.015
+HEIGHT_M = 0.006
+SECONDS = 0.8
+DT = 4e-4
+SURFACE = Stiffness(k_w_n_per_m3=3.3e7, length_m=0.004, dashpot_s=0.004, prony_g=(), prony_tau_s=(), friction=0.0)
+"""Our surface for the figure."""
+SURFACE_EDGE_M = 0.0025
+FLESH = Flesh(Box((0.03, 0.03, 0.02), (13, 13, 3)), k_v=560.0, k_e=0.0, damping=0.7, mass=1e-3)
+"""DART's soft body for the figure, vertices 2.5 mm apart."""
+
+
+@dataclass(frozen=True)
+class Drop:
+    """What a dropped indenter did; arrays of shape (n,)."""
+
+    name: str
+    time: Array
+    """Since the first contact [s]."""
+    depth: Array
+    """Of its lowest point below the rest surface [m]; negative in the air."""
+    force: Array
+    """Normal force on it [N]."""
+
+    @property
+    def deepest(self) -> float:
+        """Greatest depth [m]."""
+        return float(self.depth.max())
+
+    @property
+    def settled(self) -> float:
+        """Mean depth of the last 0.1 s [m]."""
+        return float(self.depth[self.time > self.time[-1] - 0.1].mean())
+
+    @property
+    def oscillations(self) -> int:
+        """Times that it dips again after the first dip, by at least 0.05 mm."""
+        peaks, _ = find_peaks(self.depth, prominence=5e-5)
+        return max(0, len(peaks) - 1)
+
+    @property
+    def last_force(self) -> float:
+        """Mean force of the last 0.1 s [N]."""
+        return float(self.force[self.time > self.time[-1] - 0.1].mean())
+
+
+def drop_on_tissue(
+    surface: Stiffness = SURFACE, mass: float = MASS_KG, height: float = HEIGHT_M, seconds: float = SECONDS
+) -> Drop:
+    """Drops a sphere of `mass` [kg] from `height` [m] on our tissue; semi-implicit Euler at 0.4 ms."""
+    tissue = Tissue(flat_phantom(0.035, SURFACE_EDGE_M, surface.k_w_n_per_m3), surface, dt=DT)
+    z, v, contact = height, 0.0, 0.0
+    p = np.array((0.0, 0.0, RADIUS_M + height))
+    velocity = np.zeros(3)
+    depth, force = [], []
+    for k in range(round(seconds / DT)):
+        v += DT * (contact / mass - GRAVITY)
+        z += DT * v
+        p[2], velocity[2] = RADIUS_M + z, v
+        contact = float(tissue.step(k * DT, p, velocity, RADIUS_M)[0][2])
+        depth.append(-z)
+        force.append(contact)
+    return _since_contact("soft, Palpate", np.array(depth), np.array(force), DT)
+
+
+def drop_in_dart(flesh: Flesh | None, mass: float = MASS_KG, height: float = HEIGHT_M, seconds: float = SECONDS) -> Drop:
+    """The same in DART, on its soft body or, without `flesh`, on a rigid block without restitution."""
+    scene = DartScene(flesh, RADIUS_M, DT, friction=1.0, mass=mass, height=height)
+    depth, force = [], []
+    for _ in range(round(seconds / DT)):
+        scene.fall(mass * GRAVITY)
+        depth.append(scene.depth)
+        force.append(scene.force())
+    return _since_contact("soft, DART" if flesh else "rigid, DART", np.array(depth), np.array(force), DT)
+
+
+def _since_contact(name: str, depth: Array, force: Array, dt: float) -> Drop:
+    time = dt * np.arange(len(depth))
+    first = int(np.argmax(force > 0))
+    return Drop(name, time - time[first], depth, force)
+
+
+def measure(seconds: float = SECONDS) -> tuple[Drop, Drop, Drop]:
+    """Soft in our tissue, soft in DART, rigid in DART."""
+    return drop_on_tissue(seconds=seconds), drop_in_dart(FLESH, seconds=seconds), drop_in_dart(None, seconds=seconds)
+
+
+def section(drops: tuple[Drop, ...] | None = None) -> Section:
+    """The figure with what the paper says of it as bounds."""
+    drops = drops or measure()
+    soft, flesh, rigid = drops
+    weight = MASS_KG * GRAVITY
+    checks = (
+        Check("Palpate: deepest plunge", 1e3 * soft.deepest, "mm", 2.5, 3.5, "paper: about 3 mm"),
+        Check("Palpate: depth at rest", 1e3 * soft.settled, "mm", 0.9, 1.1, "paper: about 1 mm"),
+        Check("Palpate: dips after the first", soft.oscillations, "", low=2, against="paper: oscillates"),
+        Check("Palpate: force at rest over the weight", soft.last_force / weight, "", 0.99, 1.01, "statics"),
+        Check("DART soft body: deepest plunge", 1e3 * flesh.deepest, "mm", 2.5, 3.5, "paper: about 3 mm"),
+        Check("DART soft body: depth at rest", 1e3 * flesh.settled, "mm", 0.8, 1.2, "paper: about 1 mm"),
+        Check("DART soft body: dips after the first", flesh.oscillations, "", low=2, against="paper: oscillates"),
+        Check("rigid: deepest plunge", 1e3 * rigid.deepest, "mm", high=0.3, against="paper: stops at contact"),
+        Check("rigid: dips after the first", rigid.oscillations, "", high=0, against="paper: no oscillation"),
+    )
+    text = (
+        f"A tool of {MASS_KG:g} kg with a sphere of {RADIUS_M * 1e3:g} mm, dropped from {HEIGHT_M * 1e3:g} mm, "
+        "as in the paper's figure 3. "
+        "Soft surfaces oscillate and settle about 1 mm in; the rigid one stops it at once. The paper gives no masses and "
+        "no stiffness: stiffness is chosen for its 1 mm, drop and damping for its 3 mm. Into the default wall this tool would "
+        "sink 14 mm."
+    )
+    data = {drop.name: {"time_s": drop.time, "depth_m": drop.depth, "force_n": drop.force} for drop in drops}
+    return Section("drop", "The contact test of the paper (figure 3)", text, checks, lambda f: draw(f, drops), (7.0, 3.6), data)
+
+
+def draw(figure: Figure, drops: tuple[Drop, ...]) -> None:
+    """Force above, position below; soft on the left, rigid on the right."""
+    axes = figure.subplots(2, 2, sharex="col")
+    for drop, colour in zip(drops, COLOURS, strict=False):
+        column = 1 if drop.name.startswith("rigid") else 0
+        style = {"color": colour, "lw": 1.0, "label": drop.name}
+        axes[0, column].plot(drop.time, drop.force, **style)
+        axes[1, column].plot(drop.time, -1e3 * drop.depth, **style)
+    for column in (0, 1):
+        axes[0, column].axhline(MASS_KG * GRAVITY, color=QUIET, lw=0.6, ls="--")
+        axes[1, column].axhline(0, color=INK, lw=0.6)
+        axes[1, column].set(xlabel="time since contact [s]", xlim=(-0.05, 0.6))
+        axes[1, column].set_ylim(-3.6, 4.4)
+        axes[0, column].legend()
+    axes[0, 0].set_ylabel("normal force [N]")
+    axes[1, 0].set_ylabel("position [mm]")

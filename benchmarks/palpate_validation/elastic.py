@@ -1,0 +1,88 @@
+"""The elastic tier against Hertz and Sneddon: a flat half-space, pressed by paraboloids and spheres of several radii."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from palpate_tissue.backends.elastic.slab import FlatSlab
+from palpate_validation.check import Check, Section
+from palpate_validation.hertz import YOUNG_PA, hertz_force, sneddon_force
+from palpate_validation.plots import COLOURS, INK, QUIET
+
+Array = NDArray[np.float64]
+
+RADII_M = (0.010, 0.015, 0.020, 0.030)
+DEPTHS_M = np.array((2, 3, 5, 7, 10)) * 1e-3
+BOUND_PERCENT = 2.0
+
+
+@dataclass(frozen=True)
+class ElasticCurves:
+    """Forces [N] of the elastic tier, shapes (radii, depths)."""
+
+    paraboloid: Array
+    sphere: Array
+    hertz: Array
+    sneddon: Array
+
+
+def measure() -> ElasticCurves:
+    """Presses the half-space at rest, at a place between its vertices."""
+    slab = FlatSlab(young_pa=YOUNG_PA)
+    between = (0.0004, 0.00025)
+
+    def press(profile: str) -> Array:
+        return np.array(
+            [[slab.press(r, float(d), between, profile).force_n for d in DEPTHS_M] for r in RADII_M]  # type: ignore[arg-type]
+        )
+
+    return ElasticCurves(
+        press("paraboloid"),
+        press("sphere"),
+        np.array([hertz_force(DEPTHS_M, r, YOUNG_PA, slab.poisson) for r in RADII_M]),
+        np.array([[sneddon_force(float(d), r, YOUNG_PA, slab.poisson) for d in DEPTHS_M] for r in RADII_M]),
+    )
+
+
+def section(curves: ElasticCurves | None = None) -> Section:
+    """The comparison with its bounds."""
+    c = curves or measure()
+    by_hertz, by_sneddon = 100 * (c.paraboloid / c.hertz - 1), 100 * (c.sphere / c.sneddon - 1)
+    at = int(np.argmin(np.abs(DEPTHS_M - 0.005)))
+    force = c.paraboloid[:, at]
+    power = float(np.polyfit(np.log(RADII_M), np.log(force), 1)[0])
+    checks = (
+        Check("paraboloid, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_hertz).max()), "%", high=BOUND_PERCENT,
+              against="Hertz"),
+        Check("sphere, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_sneddon).max()), "%", high=BOUND_PERCENT,
+              against="Sneddon"),
+        Check("exponent of the force in the radius", power, "", 0.48, 0.52, "Hertz: 0.5"),
+        Check("sphere at 10 mm depth, R = 20 mm, against the paraboloid's law",
+              100 * float(c.sphere[2, -1] / c.hertz[2, -1] - 1), "%", against="Hertz"),
+    )  # fmt: skip
+    text = (
+        "The elastic tier as a half-space of 10 kPa. Hertz speaks of a paraboloid, and that is what is pressed first; a true "
+        "sphere "
+        "falls short of it by some percent at depths of half a radius, as Sneddon's solution says."
+    )
+    data = {"radii_m": RADII_M, "depths_m": DEPTHS_M, "paraboloid_n": c.paraboloid, "sphere_n": c.sphere, "hertz_n": c.hertz,
+            "sneddon_n": c.sneddon}  # fmt: skip
+    return Section("elastic", "Elastic tier on a flat half-space: Hertz", text, checks, lambda f: draw(f, c), (4.5, 2.8), data)
+
+
+def draw(figure: Figure, c: ElasticCurves) -> None:
+    """Force over theory against depth, for each radius."""
+    axes = figure.subplots()
+    mm = DEPTHS_M * 1e3
+    for k, radius in enumerate(RADII_M):
+        axes.plot(mm, c.paraboloid[k] / c.hertz[k], "o-", color=COLOURS[k], ms=3, lw=1, label=f"R = {radius * 1e3:g} mm")
+        axes.plot(mm, c.sphere[k] / c.sneddon[k], "x--", color=COLOURS[k], ms=4, lw=0.7)
+    axes.plot([], [], "o-", color=INK, ms=3, lw=1, label="paraboloid over Hertz")
+    axes.plot([], [], "x--", color=INK, ms=4, lw=0.7, label="sphere over Sneddon")
+    axes.axhspan(0.98, 1.02, color=QUIET, alpha=0.15, lw=0)
+    axes.set(xlabel="depth [mm]", ylabel="force over theory", ylim=(0.95, 1.05))
+    axes.legend(ncols=2)

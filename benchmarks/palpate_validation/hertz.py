@@ -1,0 +1,143 @@
+"""The surface tier against Hertz: where a Winkler-Pasternak wall is a half-space, and where it stops being one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from palpate_models.phantom import flat_phantom
+from palpate_validation.check import Check, Section
+from palpate_validation.plots import COLOURS, INK, QUIET
+from palpate_validation.probing import static_curve
+
+Array = NDArray[np.float64]
+
+YOUNG_PA = 1.0e4
+POISSON = 0.49
+"""The half-space that the default wall stands for (10 kPa)."""
+CALIBRATED_RADIUS_M = 0.020
+"""The indenter for which k_w and l were chosen."""
+TOLERANCE = 0.10
+RANGE_M = (0.005, 0.015)
+RADII_M = (0.010, 0.015, 0.020, 0.030)
+DEPTHS_M = np.array((1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 17, 20, 25)) * 1e-3
+
+
+def hertz_force(depth: Array | float, radius: float, young: float = YOUNG_PA, poisson: float = POISSON) -> Array:
+    """Force [N] of a rigid sphere of `radius` [m] on an elastic half-space at `depth` [m]: 4/3 E* sqrt(R) d^1.5.
+
+    Hertz 1882; Johnson, Contact Mechanics, section 4.2. Small strain: it holds for depths well below the radius.
+    """
+    return np.asarray(4 / 3 * young / (1 - poisson**2) * np.sqrt(radius) * np.asarray(depth, dtype=float) ** 1.5)
+
+
+def sneddon_force(depth: float, radius: float, young: float = YOUNG_PA, poisson: float = POISSON) -> float:
+    """Force [N] of a rigid sphere, not a paraboloid, on an elastic half-space at `depth` [m] (Sneddon 1965).
+
+    d = a/2 ln((R + a) / (R - a)),  F = E* [(a^2 + R^2)/2 ln((R + a) / (R - a)) - a R].
+    """
+    low, high = 0.0, radius * (1 - 1e-12)
+    a = 0.0
+    for _ in range(100):
+        a = (low + high) / 2
+        low, high = (a, high) if a * np.arctanh(a / radius) < depth else (low, a)
+    modulus = young / (1 - poisson**2)
+    return float(modulus * ((a**2 + radius**2) * np.arctanh(a / radius) - a * radius))
+
+
+@dataclass(frozen=True)
+class HertzCurves:
+    """Static forces of the surface tier and of Hertz, shapes (radii, depths)."""
+
+    radii: tuple[float, ...]
+    depths: Array
+    force: Array
+    hertz: Array
+
+    @property
+    def error(self) -> Array:
+        """Force over Hertz's, minus one."""
+        return np.asarray(self.force / self.hertz - 1)
+
+    def within(self, radius: float, tolerance: float = TOLERANCE) -> tuple[float, float]:
+        """The interval of depths [m] about 10 mm in which the force is within `tolerance` of Hertz, interpolated."""
+        error = self.error[self.radii.index(radius)]
+        fine = np.linspace(self.depths[0], self.depths[-1], 2000)
+        bad = np.flatnonzero(np.abs(np.interp(fine, self.depths, error)) > tolerance)
+        middle = int(np.searchsorted(fine, 0.010))
+        if middle in bad:
+            return (float("nan"), float("nan"))
+        below, above = bad[bad < middle], bad[bad > middle]
+        return (
+            float(fine[below[-1]]) if len(below) else float(fine[0]),
+            float(fine[above[0]]) if len(above) else float(fine[-1]),
+        )
+
+
+def measure(radii: tuple[float, ...] = RADII_M, depths: Array = DEPTHS_M) -> HertzCurves:
+    """Presses spheres of `radii` [m] into the flat phantom, to `depths` [m]."""
+    model = flat_phantom()
+    force = np.array([static_curve(model, depths, radius) for radius in radii])
+    return HertzCurves(radii, depths, force, np.array([hertz_force(depths, radius) for radius in radii]))
+
+
+def section(curves: HertzCurves | None = None) -> Section:
+    """The comparison with its bounds."""
+    curves = curves or measure()
+    calibrated = curves.error[curves.radii.index(CALIBRATED_RADIUS_M)]
+    inside = (curves.depths >= RANGE_M[0] - 1e-9) & (curves.depths <= RANGE_M[1] + 1e-9)
+    checks = [
+        Check(
+            f"largest error over {RANGE_M[0] * 1e3:g} to {RANGE_M[1] * 1e3:g} mm at R = {CALIBRATED_RADIUS_M * 1e3:g} mm",
+            100 * float(np.abs(calibrated[inside]).max()),
+            "%",
+            high=100 * TOLERANCE,
+            against="Hertz, 10 kPa, nu 0.49",
+        )
+    ]
+    ranges = {}
+    for radius in curves.radii:
+        low, high = curves.within(radius)
+        ranges[f"{radius * 1e3:g} mm"] = [low, high]
+        at_ten = float(np.interp(0.010, curves.depths, curves.error[curves.radii.index(radius)]))
+        checks.append(Check(f"error at 10 mm depth, R = {radius * 1e3:g} mm", 100 * at_ten, "%", against="Hertz"))
+    said = ", ".join(
+        f"{low * 1e3:.1f} to {high * 1e3:.1f} mm at R = {name}" if np.isfinite(low) else f"nowhere near 10 mm at R = {name}"
+        for name, (low, high) in ranges.items()
+    )
+    text = (
+        "A rigid sphere held in the flat surface of the default wall, force as a mean over five places on the vertex lattice, "
+        f"against an elastic half-space of 10 kPa. Within {100 * TOLERANCE:g} %: {said} (25 mm is the deepest that was tried). "
+        "A surface of springs has a length of its own, l = 15 mm, where a half-space has none. Shallow contacts, smaller than l, "
+        "are too stiff; deep ones of a small sphere are too soft, and deeper than about half a radius Hertz's small strains are "
+        "in doubt themselves. Beyond these ranges take the elastic tier."
+    )
+    data = {
+        "radii_m": curves.radii,
+        "depths_m": curves.depths,
+        "force_n": curves.force,
+        "hertz_n": curves.hertz,
+        "within_m": ranges,
+    }
+    return Section("hertz", "Surface tier on a flat half-space: Hertz", text, tuple(checks), lambda f: draw(f, curves), data=data)
+
+
+def draw(figure: Figure, curves: HertzCurves) -> None:
+    """Force against depth, and its ratio to Hertz with the band in which it counts as right."""
+    left, right = figure.subplots(1, 2)
+    mm = curves.depths * 1e3
+    for k, radius in enumerate(curves.radii):
+        colour = COLOURS[k]
+        left.plot(mm, curves.hertz[k], color=colour, lw=1, ls="--")
+        left.plot(mm, curves.force[k], "o-", color=colour, ms=2.5, lw=1, label=f"R = {radius * 1e3:g} mm")
+        right.plot(mm, curves.force[k] / curves.hertz[k], "o-", color=colour, ms=2.5, lw=1)
+    left.plot([], [], color=QUIET, lw=1, ls="--", label="Hertz")
+    left.set(xlabel="depth [mm]", ylabel="force [N]", xscale="log", yscale="log")
+    left.legend()
+    right.axhspan(1 - TOLERANCE, 1 + TOLERANCE, color=QUIET, alpha=0.15, lw=0)
+    right.axhline(1, color=INK, lw=0.6)
+    right.axvspan(RANGE_M[0] * 1e3, RANGE_M[1] * 1e3, color=QUIET, alpha=0.08, lw=0)
+    right.set(xlabel="depth [mm]", ylabel="force over Hertz", ylim=(0.7, 1.4))

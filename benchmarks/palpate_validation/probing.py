@@ -1,0 +1,49 @@
+"""Probing a tissue: a sphere held at depths below a flat surface until nothing moves any more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Stiffness
+from palpate_tissue.tissue import Tissue
+
+Array = NDArray[np.float64]
+
+ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
+"""The default wall without relaxation and friction: what static references know."""
+SETTLE_S = 0.3
+"""How long a depth is held: six times the dashpot's 0.05 s."""
+OFFSETS = ((0.0, 0.0), (0.0025, 0.0), (0.0, 0.0029), (0.0013, 0.0008), (0.0031, 0.0017))
+"""Places on the vertex lattice over which a force is averaged [m]: on a vertex, an edge, a triangle."""
+STILL = np.zeros(3)
+
+
+def hold(tissue: Tissue, depth: float, radius: float, xy: Sequence[float] = (0.0, 0.0), seconds: float = SETTLE_S) -> float:
+    """Normal force [N] on a sphere of `radius` [m] held at `depth` [m] below z = 0, after `seconds` [s]."""
+    p = np.array((*xy, radius - depth))
+    force = STILL
+    for k in range(round(seconds / tissue.dt)):
+        force, _ = tissue.step(k * tissue.dt, p, STILL, radius)
+    return float(force[2])
+
+
+def static_curve(
+    model: PhantomModel,
+    depths: Array,
+    radius: float,
+    stiffness: Stiffness = ELASTIC,
+    offsets: Sequence[tuple[float, float]] = OFFSETS,
+) -> Array:
+    """Static force [N] at rising `depths` [m], shape as theirs, as a mean over places on the lattice.
+
+    Without relaxation the equilibrium does not depend on the path, so one tissue is pressed deeper and deeper.
+    """
+    forces = np.zeros(len(depths))
+    for xy in offsets:
+        tissue = Tissue(model, stiffness)
+        forces += [hold(tissue, float(depth), radius, xy) for depth in depths]
+    return forces / len(offsets)

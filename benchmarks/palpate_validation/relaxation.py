@@ -1,0 +1,92 @@
+"""Relaxation of a held contact: the Prony series read back from the force alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.optimize import curve_fit
+
+from palpate_models.phantom import flat_phantom
+from palpate_models.scenario import Stiffness
+from palpate_tissue.tissue import Tissue
+from palpate_validation.check import Check, Section
+from palpate_validation.plots import COLOURS, INK
+from palpate_validation.probing import ELASTIC, STILL, hold
+
+Array = NDArray[np.float64]
+
+HALF_M = 0.04
+RADIUS_M = 0.015
+DEPTH_M = 0.008
+HOLD_S = 160.0
+"""Three of the longest time constants."""
+FROM_S = 0.5
+"""Before it the dashpot's 0.05 s is still in the force."""
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """A held contact's force over time, and the series fitted to it."""
+
+    time: Array
+    """[s], shape (n,)"""
+    ratio: Array
+    """Force over the instantaneous one, shape (n,)."""
+    g: Array
+    """Fitted relaxing fractions, shape (2,)."""
+    tau: Array
+    """Fitted time constants [s], shape (2,)."""
+
+
+def series(t: Array, g1: float, tau1: float, g2: float, tau2: float) -> Array:
+    """F(t) / F0 = 1 - sum g (1 - exp(-t / tau)) of two branches."""
+    return np.asarray(1 - g1 * (1 - np.exp(-t / tau1)) - g2 * (1 - np.exp(-t / tau2)))
+
+
+def measure(hold_s: float = HOLD_S) -> Relaxation:
+    """Holds the sphere for `hold_s` [s] and fits the series to the force by least squares, from a guess of 1 s and 20 s."""
+    model = flat_phantom(HALF_M)
+    instantaneous = hold(Tissue(model, ELASTIC), DEPTH_M, RADIUS_M)
+    tissue = Tissue(model, Stiffness(friction=0.0))
+    p = np.array((0.0, 0.0, RADIUS_M - DEPTH_M))
+    force = np.array([tissue.step(0.0, p, STILL, RADIUS_M)[0][2] for _ in range(round(hold_s / tissue.dt))])
+    time = tissue.dt * np.arange(1, len(force) + 1)
+    keep = np.unique(np.geomspace(FROM_S, hold_s, 400) / tissue.dt).astype(int) - 1
+    time, ratio = time[keep], force[keep] / instantaneous
+    (g1, tau1, g2, tau2), _ = curve_fit(series, time, ratio, p0=(0.2, 1.0, 0.2, 20.0))
+    order = np.argsort((tau1, tau2))
+    return Relaxation(time, ratio, np.array((g1, g2))[order], np.array((tau1, tau2))[order])
+
+
+def section(found: Relaxation | None = None) -> Section:
+    """The series read back, with its bounds."""
+    found = found or measure()
+    wall = Stiffness()
+    checks = []
+    for k, (g, tau) in enumerate(zip(wall.prony_g, wall.prony_tau_s, strict=True)):
+        checks.append(Check(f"relaxing fraction g{k + 1} read from the force", found.g[k], "", 0.98 * g, 1.02 * g, f"{g:g}"))
+        checks.append(
+            Check(f"time constant tau{k + 1} read from the force", found.tau[k], "s", 0.98 * tau, 1.02 * tau, f"{tau:g} s")
+        )
+    left = 1 - sum(wall.prony_g)
+    checks.append(Check("ratio left for ever", float(1 - found.g.sum()), "", 0.98 * left, 1.02 * left, f"{left:g}"))
+    text = (
+        f"A sphere of {RADIUS_M * 1e3:g} mm held {DEPTH_M * 1e3:g} mm deep for {HOLD_S:g} s; two exponentials fitted to its "
+        "force without knowledge of the scenario. Displacements are held, so the force must relax by the material's own series."
+    )
+    data = {"time_s": found.time, "ratio": found.ratio, "g": found.g, "tau_s": found.tau}
+    return Section("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, found), (4.5, 2.8), data)
+
+
+def draw(figure: Figure, found: Relaxation) -> None:
+    """The force ratio over the logarithm of time, with the scenario's series."""
+    axes = figure.subplots()
+    wall = Stiffness()
+    axes.plot(found.time, found.ratio, ".", color=COLOURS[0], ms=3, label="tissue")
+    expected = series(found.time, wall.prony_g[0], wall.prony_tau_s[0], wall.prony_g[1], wall.prony_tau_s[1])
+    axes.plot(found.time, expected, color=INK, lw=0.8, label="Prony series of the scenario")
+    axes.set(xlabel="time [s]", ylabel="force over the instantaneous", xscale="log")
+    axes.legend()

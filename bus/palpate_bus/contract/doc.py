@@ -1,0 +1,179 @@
+"""Writes docs/topics.md from the contract: `python -m palpate_bus.contract.doc`; `--check` only says whether it is current."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Container, Iterable, Sequence
+from pathlib import Path
+
+from palpate_bus.contract.rows import Contract, Edge, Qos, Role, Topic, Visibility, contract
+from palpate_bus.messages import codec
+
+PAGE = Path("docs/topics.md")
+
+_HEAD = """\
+# Topics
+
+Generated from [the contract](../bus/palpate_bus/contract/contract.yaml) by `python -m palpate_bus.contract.doc`; do not edit.
+
+A message goes by the key `<domain>/<topic>/<type>/<hash>`, as rmw_zenoh of ROS 2 Jazzy writes it (the domain is
+`ROS_DOMAIN_ID`, 0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID. Types of `palpation_msgs`
+are in [bus/palpation_msgs](../bus/palpation_msgs/msg). Frames: `world` (on the floor, z up), `abdomen` (origin at the umbilicus,
+x to the patient's left, y to the head, z outward). Units are SI, as REP 103 has them.
+"""
+
+_EDGES = {
+    Edge.SAME_TICK: "of the same tick",
+    Edge.PREVIOUS: "one period late",
+    Edge.LATCHED: "before the first tick",
+    Edge.OBSERVE: "as it comes",
+}
+
+_VISIBILITY = {
+    Visibility.PUBLIC: "everyone",
+    Visibility.SIM: "the simulation only: physics knows it, hardware has no sensor for it",
+    Visibility.TRUTH: "scoring, dashboard, recorder and tests only",
+}
+
+
+def page(rules: Contract) -> str:
+    """The page of topics, in Markdown."""
+    senders = {role.name: role for role in rules.roles.values() if rules.outputs(role.name)}
+    parts = [_HEAD, _dataflow(rules), _delays(rules), _secrets(rules), _qos(rules.qos.values())]
+    parts += [_roles(rules.roles.values(), senders), *(_producer(rules, role) for role in senders.values())]
+    parts.append(_internal(rules))
+    return "\n".join(parts)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _milliseconds(topic: Topic) -> str:
+    if topic.latched:
+        return "once"
+    return f"at most every {topic.period_ms} ms" if topic.event else f"{topic.period_ms} ms"
+
+
+def _dataflow(rules: Contract) -> str:
+    """A mermaid diagram of the dataflow between services; observers are left out, they read nearly everything."""
+    lines = ["## Dataflow\n", "Thick arrows are of the same tick, thin ones arrive one period late, dotted ones hold nobody up."]
+    lines += [
+        "The recorder and the dashboard read every topic that they may know and are not drawn.\n",
+        "```mermaid",
+        "flowchart LR",
+    ]
+    drawn = [name for name, role in rules.roles.items() if not role.observer]
+    lines += [f"  {name}([{name}<br/>{rules.roles[name].period_ms} ms])" for name in drawn]
+    arrows: dict[tuple[str, str, str], list[str]] = {}
+    for topic in rules.topics.values():
+        for reader, edge in topic.readers.items():
+            if topic.producer in drawn and reader in drawn:
+                arrow = {Edge.SAME_TICK: "==>", Edge.PREVIOUS: "-->"}.get(edge, "-.->")
+                arrows.setdefault((topic.producer, arrow, reader), []).append(topic.name)
+    lines += [f'  {source} {arrow}|"{"<br/>".join(names)}"| {target}' for (source, arrow, target), names in arrows.items()]
+    return "\n".join([*lines, "```\n"])
+
+
+def _delays(rules: Contract) -> str:
+    """Every one-period delay, since users of a co-simulation mistake them for bugs."""
+    rows = []
+    for topic in rules.topics.values():
+        period = rules.roles[topic.producer].period_ms
+        readers = [role for role, edge in topic.readers.items() if edge is Edge.PREVIOUS]
+        if readers:
+            rows.append((f"`{topic.name}`", topic.producer, ", ".join(readers), f"{period} ms"))
+    text = (
+        "## Delays\n\nAn edge that is one period late lets producer and reader run in parallel: at time T the reader has what was"
+        " sent up to T less the producer's period. These delays are part of the model, not of the transport:\n\n"
+    )
+    return text + _table(("topic", "from", "to", "delay"), rows)
+
+
+def _secrets(rules: Contract) -> str:
+    rows = [
+        (f"`{topic.name}`", topic.visibility.value, topic.producer, ", ".join(topic.readers))
+        for topic in rules.topics.values()
+        if topic.visibility is not Visibility.PUBLIC
+    ]
+    text = "## Who may know\n\nWhat no real examination could know stays out of it. A test holds the contract to this table.\n\n"
+    return text + _table(("topic", "kind", "from", "to"), rows)
+
+
+def _qos(classes: Iterable[Qos]) -> str:
+    rows = []
+    for qos in classes:
+        delivery = f"{qos.reliability}, {qos.congestion} on congestion, {qos.priority}{', express' if qos.express else ''}"
+        kept = f"last {qos.depth}{', for late joiners too' if qos.transient_local else ''}"
+        rows.append((f"`{qos.name}`", delivery, kept, qos.reason))
+    text = (
+        "## Quality of service\n\nIn lockstep every edge is reliable and the barrier bounds what is in flight; a lost message"
+        " ends the run.\n\n"
+    )
+    return text + _table(("class", "zenoh", "keeps", "because"), rows)
+
+
+def _roles(roles: Iterable[Role], senders: Container[str]) -> str:
+    """The roles; those that send have a section of their own."""
+    rows = []
+    for role in roles:
+        kind = "observer: never slows the run" if role.observer else "critical: its loss ends the run" if role.critical else ""
+        name = f"[{role.name}](#{role.name})" if role.name in senders else role.name
+        rows.append((name, f"{role.period_ms} ms", role.doc, kind))
+    return "## Roles\n\n" + _table(("role", "steps every", "what it is", ""), rows)
+
+
+def _producer(rules: Contract, role: Role) -> str:
+    parts = [f"## {role.name}\n", f"{role.doc[0].upper()}{role.doc[1:]}; steps every {role.period_ms} ms.\n"]
+    inputs = [(f"`{topic.name}`", topic.producer, _EDGES[edge]) for topic, edge in rules.inputs(role.name)]
+    if inputs and not role.observer:
+        parts += ["Reads:\n", _table(("topic", "from", "when"), inputs)]
+    for topic in rules.outputs(role.name):
+        parts += [f"### `{topic.name}`\n", topic.doc + ".\n", _table(("", ""), _facts(topic))]
+        if topic.units or topic.ranges:
+            parts.append(_table(("field", "unit", "range"), _fields(topic)))
+    return "\n".join(parts)
+
+
+def _facts(topic: Topic) -> list[tuple[str, str]]:
+    readers = ", ".join(f"{role} ({_EDGES[edge]})" for role, edge in topic.readers.items())
+    rows = [("type", f"`{topic.type}`"), ("hash", f"`{codec.type_hash(topic.type)}`"), ("sent", _milliseconds(topic))]
+    rows += [("frame", f"`{topic.frame}`")] if topic.frame else []
+    rows += [("QoS class", f"`{topic.qos}`"), ("read by", readers), ("may be known to", _VISIBILITY[topic.visibility])]
+    rows += [("in the run hash", "yes" if topic.hashed else "no")]
+    rows += [("may be sent by", "anyone: a ROS 2 node too")] if topic.open else []
+    rows += [("stale after", f"{topic.max_age_ms} ms")] if topic.max_age_ms else []
+    rows += [("expires after", f"{topic.expiry_ms} ms: the receiver then acts safely")] if topic.expiry_ms else []
+    return rows
+
+
+def _fields(topic: Topic) -> list[tuple[str, str, str]]:
+    rows = []
+    for path in dict.fromkeys([*topic.units, *topic.ranges]):
+        least, most = topic.ranges.get(path, (None, None))
+        rows.append((f"`{path}`", topic.units.get(path, ""), "" if least is None else f"{least:g} .. {most:g}"))
+    return rows
+
+
+def _internal(rules: Contract) -> str:
+    rows = [(f"`{row.name}`", f"`{row.type}`", row.producer, row.readers, row.doc) for row in rules.internal.values()]
+    return "## Messages of the runtime\n\n" + _table(("key", "type", "from", "to", "what for"), rows)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Writes the page into the working directory's docs/, or checks it; returns the exit status."""
+    text = page(contract())
+    if "--check" in arguments:
+        if not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text:
+            print(f"{PAGE} is not what the contract says; run: python -m palpate_bus.contract.doc", file=sys.stderr)
+            return 1
+        return 0
+    PAGE.parent.mkdir(exist_ok=True)
+    PAGE.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

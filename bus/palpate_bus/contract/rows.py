@@ -1,0 +1,222 @@
+"""The contract as typed rows: what every role and topic is, read once from `contract.yaml` and checked.
+
+`contract()` is the contract; `Contract.inputs(role)` and `Contract.outputs(role)` are what the runtime wires.
+"""
+
+from __future__ import annotations
+
+import os
+from enum import StrEnum
+from functools import cache
+from importlib import resources
+from typing import Annotated
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from palpate_bus.messages import codec
+
+MS = 1_000_000
+"""Nanoseconds in a millisecond."""
+
+
+class Edge(StrEnum):
+    """How a reader depends on a topic's producer. See the head of contract.yaml."""
+
+    SAME_TICK = "same_tick"
+    PREVIOUS = "previous"
+    LATCHED = "latched"
+    OBSERVE = "observe"
+
+    @property
+    def blocking(self) -> bool:
+        """Whether the reader waits for the producer's tick in lockstep."""
+        return self in (Edge.SAME_TICK, Edge.PREVIOUS)
+
+
+class Visibility(StrEnum):
+    """Who may know a topic's content."""
+
+    PUBLIC = "public"
+    SIM = "sim"
+    TRUTH = "truth"
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Role(_Row):
+    """A role that a service plays. Its period is in whole milliseconds of simulated time."""
+
+    name: str
+    period_ms: Annotated[int, Field(ge=1)]
+    critical: bool = False
+    observer: bool = False
+    doc: str
+
+    @property
+    def period(self) -> int:
+        """Period [ns]."""
+        return self.period_ms * MS
+
+
+class Qos(_Row):
+    """A stance on delivery, by zenoh's terms, with its reason."""
+
+    name: str
+    priority: str
+    congestion: str
+    express: bool
+    reliability: str
+    depth: int
+    transient_local: bool = False
+    reason: str
+
+
+class Topic(_Row):
+    """A row of the contract."""
+
+    name: str
+    type: str
+    producer: str
+    period_ms: Annotated[int, Field(ge=1)] = 1
+    event: bool = False
+    latched: bool = False
+    readers: dict[str, Edge]
+    qos: str
+    hashed: bool = False
+    visibility: Visibility = Visibility.PUBLIC
+    frame: str | None = None
+    units: dict[str, str] = {}
+    ranges: dict[str, tuple[float, float]] = {}
+    max_age_ms: int | None = None
+    expiry_ms: int | None = None
+    open: bool = False
+    """Whether others than the producer may send on it too."""
+    doc: str
+
+    @property
+    def period(self) -> int:
+        """Period [ns]."""
+        return self.period_ms * MS
+
+    @property
+    def periodic(self) -> bool:
+        """Whether the topic carries exactly one message on each of its ticks, and so is its own advance."""
+        return not (self.event or self.latched)
+
+    @property
+    def type_hash(self) -> str:
+        """RIHS01 hash of the message type."""
+        return codec.type_hash(self.type)
+
+
+class Internal(_Row):
+    """A message of the runtime itself."""
+
+    name: str
+    type: str
+    producer: str
+    readers: str
+    doc: str
+
+
+_MAY_KNOW: dict[Visibility, frozenset[str]] = {
+    Visibility.SIM: frozenset({"robot", "tissue", "camera", "dashboard", "recorder"}),
+    Visibility.TRUTH: frozenset({"conductor", "dashboard", "recorder"}),
+}
+
+
+class Contract(_Row):
+    """All rows, checked: roles exist, periods fit, no cycle of same_tick edges, secrets reach only those who may know them."""
+
+    roles: dict[str, Role]
+    qos: dict[str, Qos]
+    topics: dict[str, Topic]
+    internal: dict[str, Internal]
+
+    @model_validator(mode="after")
+    def _check(self) -> Contract:
+        for topic in self.topics.values():
+            codec.message_type(topic.type)
+            for role in (topic.producer, *topic.readers):
+                if role not in self.roles:
+                    raise ValueError(f"topic {topic.name}: no role {role!r}; roles are {sorted(self.roles)}")
+            if topic.qos not in self.qos:
+                raise ValueError(f"topic {topic.name}: no QoS class {topic.qos!r}; classes are {sorted(self.qos)}")
+            if not topic.latched and topic.period_ms % self.roles[topic.producer].period_ms:
+                raise ValueError(
+                    f"topic {topic.name}: period {topic.period_ms} ms is no multiple of the period of "
+                    f"{topic.producer}, {self.roles[topic.producer].period_ms} ms"
+                )
+            allowed = _MAY_KNOW.get(topic.visibility)
+            if allowed is not None and not set(topic.readers) <= allowed:
+                raise ValueError(
+                    f"topic {topic.name} is {topic.visibility} and must not be read by {sorted(set(topic.readers) - allowed)}"
+                )
+        self.step_order(tuple(self.roles))
+        return self
+
+    def outputs(self, role: str) -> tuple[Topic, ...]:
+        """Topics that a role produces, in contract order."""
+        return tuple(topic for topic in self.topics.values() if topic.producer == role)
+
+    def inputs(self, role: str) -> tuple[tuple[Topic, Edge], ...]:
+        """Topics that a role reads, with the kind of edge, in contract order."""
+        return tuple((topic, topic.readers[role]) for topic in self.topics.values() if role in topic.readers)
+
+    def step_order(self, roles: tuple[str, ...]) -> tuple[str, ...]:
+        """The roles in an order in which each runs after the producers of its same_tick inputs.
+
+        Raises ValueError naming the members of a cycle of same_tick edges.
+        """
+        before = {
+            role: {t.producer for t, edge in self.inputs(role) if edge is Edge.SAME_TICK and t.producer in roles}
+            for role in roles
+        }
+        order: list[str] = []
+        while before:
+            ready = [role for role, needs in before.items() if not needs & before.keys()]
+            if not ready:
+                raise ValueError(f"cycle of same_tick edges among {sorted(before)}")
+            order += ready
+            for role in ready:
+                del before[role]
+        return tuple(order)
+
+
+def parse(text: str) -> Contract:
+    """A contract from YAML text. Raises ValueError (pydantic's ValidationError) that names the row and field."""
+    raw = yaml.safe_load(text)
+    for section in ("roles", "qos", "topics", "internal"):
+        raw[section] = {name: {"name": name, **row} for name, row in raw[section].items()}
+    return Contract.model_validate(raw)
+
+
+def with_periods(text: str, periods: str) -> str:
+    """A contract's text with other periods of roles: `periods` is "role=ms,...", as in "control=5". For experiments.
+
+    A role's periodic topics that would come more often than it steps come at each of its steps. Raises ValueError that names the
+    entry and what is wanted.
+    """
+    document = yaml.safe_load(text)
+    for entry in periods.split(","):
+        role, _, number = (part.strip() for part in entry.partition("="))
+        if role not in document["roles"] or not number.isdigit() or int(number) < 1:
+            raise ValueError(
+                f"PALPATE_PERIODS: {entry!r}: want ROLE=MILLISECONDS with ROLE one of {', '.join(document['roles'])}"
+            )
+        document["roles"][role]["period_ms"] = int(number)
+        for topic in document["topics"].values():
+            if topic["producer"] == role and "period_ms" in topic:
+                topic["period_ms"] = -(-topic["period_ms"] // int(number)) * int(number)
+    return yaml.safe_dump(document, sort_keys=False)
+
+
+@cache
+def contract() -> Contract:
+    """The contract of this installation; PALPATE_PERIODS may set other periods, see `with_periods`."""
+    text = resources.files("palpate_bus.contract").joinpath("contract.yaml").read_text(encoding="utf-8")
+    periods = os.environ.get("PALPATE_PERIODS")
+    return parse(with_periods(text, periods) if periods else text)

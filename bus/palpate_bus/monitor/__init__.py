@@ -1,0 +1,1 @@
+"""What a live bus does against its contract."""

@@ -1,0 +1,164 @@
+"""A monitor on a bus: listens to every topic of the contract under any type, to who is there, and to what services report.
+
+    with session(run.options()) as bus:
+        monitor = LiveMonitor(bus, contract(), run.domain, wallclock=run.runtime == "wallclock")
+        while True:
+            for violation in monitor.poll():
+                print(violation)
+            sleep(0.05)
+
+Nothing computes in zenoh's callbacks: samples wait in channels until `poll`, which the owner calls often. It costs each producer
+of a 1 kHz topic one more subscriber.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from time import monotonic, time_ns
+from typing import Any
+
+import zenoh
+
+from palpate_bus.contract import Contract, Topic
+from palpate_bus.messages import RunControl, ServiceReport, codec
+from palpate_bus.monitor.health import Violation
+from palpate_bus.monitor.monitor import Monitor
+from palpate_bus.wire.liveliness import GraphWatch
+from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
+from palpate_bus.wire.transport import HELLO
+
+ROOM = 1 << 15
+"""Messages that wait for a poll, a topic."""
+WALL_CLOCK_TICK = 10**17
+"""A grant beyond this [ns] is a wall time: the common start of a wall-clock run."""
+
+
+@dataclass(frozen=True)
+class RoleReport:
+    """What a service last said of itself."""
+
+    state: int
+    tick: int
+    """Last finished tick [ns]."""
+    waiting_for: str
+    heard: float
+    """By the monotonic clock [s]."""
+
+
+class LiveMonitor:
+    """A `Monitor` with ears. `topics` limits it to some; by default it hears all. See `listen`."""
+
+    def __init__(
+        self, session: zenoh.Session, rules: Contract, domain: int, topics: Iterable[str] | None = None, wallclock: bool = False
+    ) -> None:
+        self.monitor = Monitor(rules, wallclock)
+        self.graph = GraphWatch(session, domain)
+        self.reports: dict[str, RoleReport] = {}
+        self.offsets: dict[str, float] = {}
+        """Smallest age [ms] of a message by topic: negative when the sender's clock is ahead of ours."""
+        self._session, self._domain = session, domain
+        self._ears: dict[str, _Ear] = {}
+        self.listen(rules.topics if topics is None else topics)
+        report, control = "palpation_msgs/msg/ServiceReport", "palpation_msgs/msg/RunControl"
+        self._reports: Any = session.declare_subscriber(
+            message_key("palpate/report/*", report, domain), zenoh.handlers.FifoChannel(ROOM)
+        )
+        self._control: Any = session.declare_subscriber(
+            message_key("palpate/control", control, domain), zenoh.handlers.FifoChannel(ROOM)
+        )
+        self._decode_report, self._decode_control = codec.decoder(report), codec.decoder(control)
+
+    def listen(self, topics: Iterable[str]) -> None:
+        """Listens to `topics` and no others from now on."""
+        chosen = set(topics)
+        for name in self._ears.keys() - chosen:
+            self._ears.pop(name).close()
+        for name in chosen - self._ears.keys():
+            self._ears[name] = _Ear(self._session, self.monitor.rules.topics[name], self._domain)
+        self.monitor.listen(chosen, monotonic())
+
+    def poll(self) -> list[Violation]:
+        """Takes in what has come, judges, and returns what is newly wrong."""
+        now = monotonic()
+        self.graph.changes()
+        self.monitor.see(self.graph.alive.values(), now)
+        self._hear_control()
+        self._hear_reports(now)
+        for ear in self._ears.values():
+            for sent, sequence, gid, payload in ear.drain(self.monitor, now):
+                self.monitor.hear(ear.topic.name, sent, sequence, gid, payload, now)
+                age = (time_ns() - sent) / 1e6
+                self.offsets[ear.topic.name] = min(age, self.offsets.get(ear.topic.name, age))
+        return self.monitor.look(monotonic(), time_ns())
+
+    def close(self) -> None:
+        """Stops listening."""
+        self.graph.close()
+        for ear in self._ears.values():
+            ear.close()
+        self._reports.undeclare()
+        self._control.undeclare()
+
+    def _hear_control(self) -> None:
+        while (sample := self._control.handler.try_recv()) is not None:
+            try:
+                message = self._decode_control(sample.payload.to_bytes())
+            except codec.CodecError:
+                continue
+            if message.command == RunControl.GRANT and message.tick > WALL_CLOCK_TICK:
+                self.monitor.wallclock = True
+
+    def _hear_reports(self, now: float) -> None:
+        while (sample := self._reports.handler.try_recv()) is not None:
+            try:
+                message = self._decode_report(sample.payload.to_bytes())
+            except codec.CodecError:
+                continue
+            if message.state in (ServiceReport.READY, ServiceReport.PROGRESS, ServiceReport.FINISHED, ServiceReport.FAILED):
+                self.reports[message.role] = RoleReport(message.state, int(message.tick), message.waiting_for, now)
+
+
+class _Ear:
+    """Listens to one topic under any type and hash."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
+        self.topic = topic
+        key = any_type_key(topic.name, domain)
+        channel: Any = zenoh.handlers.FifoChannel(ROOM)
+        if topic.latched:
+            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                session, key, channel, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            )
+        else:
+            self._subscriber = session.declare_subscriber(key, channel)
+        self._receive = self._subscriber.handler.try_recv
+        self._wanted = (topic.type, topic.type_hash)
+
+    def drain(self, monitor: Monitor, now: float) -> list[tuple[int, int, bytes, bytes]]:
+        """Messages of the contract's type that came since last time: (source time [ns], sequence, GID, payload)."""
+        received = []
+        while (sample := self._receive()) is not None:
+            attachment = sample.attachment
+            try:
+                sequence, sent, gid = unpack(attachment.to_bytes())
+            except (WireError, AttributeError) as error:
+                why = "no attachment" if attachment is None else str(error)
+                monitor.garbage(self.topic.name, why, now)
+                continue
+            if sequence == HELLO and not (self.topic.open and len(sample.payload)):
+                continue
+            try:
+                key = parse_key(str(sample.key_expr))
+            except WireError as error:
+                monitor.garbage(self.topic.name, str(error), now)
+                continue
+            if (key.type, key.type_hash) != self._wanted:
+                monitor.foreign(self.topic.name, key.type, key.type_hash, gid, now)
+                continue
+            received.append((sent, sequence, gid, sample.payload.to_bytes()))
+        return received
+
+    def close(self) -> None:
+        """Stops listening."""
+        self._subscriber.undeclare()

@@ -1,0 +1,216 @@
+"""The contract, enforced live: what every topic of a bus does against its row, from the contract alone.
+
+`Monitor` is the judgement, without any transport: give it what was heard (`hear`) and who is there (`see`), and ask it (`look`).
+`LiveMonitor` in `live` listens on a bus for it. A violation names topic, sender, what is expected and what came.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from palpate_bus.contract import MS, Contract, Topic
+from palpate_bus.contract.checker import Checker, Kind
+from palpate_bus.messages import codec
+from palpate_bus.monitor import pace
+from palpate_bus.monitor.health import Seen, TopicHealth, Violation
+from palpate_bus.monitor.streams import WINDOW_S, Stream
+from palpate_bus.wire.liveliness import Entity
+from palpate_bus.wire.liveliness import Kind as EntityKind
+
+
+class Monitor:
+    """Judges a bus by the contract. `wallclock` says whether time on it is the wall's (else simulated)."""
+
+    def __init__(self, rules: Contract, wallclock: bool = False) -> None:
+        self.rules = rules
+        self.wallclock = wallclock
+        self.active: dict[tuple[str, str, Kind, str], Seen] = {}
+        """Every violation so far, by (topic, sender, kind, field)."""
+        self.time = pace.BusTime(0.0, 0, None)
+        """How the bus's time moves, as of the last look."""
+        self.listening: frozenset[str] = frozenset(rules.topics)
+        """Topics that are listened to; the others are not judged by what does not come. See `listen`."""
+        self._kept: dict[str, TopicHealth] = {}
+        self._streams: dict[str, dict[bytes, Stream]] = {name: {} for name in rules.topics}
+        self._checkers = {name: Checker(topic) for name, topic in rules.topics.items()}
+        self._decoders = {name: codec.decoder(topic.type) for name, topic in rules.topics.items()}
+        self._nodes: dict[bytes, str] = {}
+        self._publishers: dict[str, set[str]] = {}
+        self._since: dict[tuple[str, str], float] = {}
+        self._news: list[Violation] = []
+
+    def listen(self, names: Iterable[str], now: float) -> None:
+        """Says which topics are listened to from now on. What was last known of the others is kept."""
+        chosen = frozenset(names)
+        for name in self.listening - chosen:
+            if self._streams[name]:
+                self._kept[name] = self._health(self.rules.topics[name])
+                self._streams[name] = {}
+        for name, node in self._since:
+            if name in chosen - self.listening:
+                self._since[name, node] = now
+        self.listening = chosen
+
+    def see(self, entities: Iterable[Entity], now: float) -> None:
+        """Takes who is on the bus (`GraphWatch.alive.values()`): names for senders, types and hashes, who may send what."""
+        present = list(entities)
+        self._nodes = {entity.gid: entity.node for entity in present}
+        self._publishers = {}
+        for entity in present:
+            if entity.endpoint is None or entity.endpoint.topic not in self.rules.topics:
+                continue
+            topic, described = self.rules.topics[entity.endpoint.topic], entity.endpoint
+            publishes = entity.kind is EntityKind.PUBLISHER
+            if publishes:
+                self._publishers.setdefault(topic.name, set()).add(entity.node)
+                self._since.setdefault((topic.name, entity.node), now)
+                self._check_sender(topic, entity.node, now)
+            if (described.type, described.type_hash) != (topic.type, topic.type_hash):
+                self._note(topic, entity.node, Kind.TYPE, _type(topic.type, topic.type_hash),
+                           f"{_type(described.type, described.type_hash)}{'' if publishes else ' wanted'}", now)  # fmt: skip
+
+    def hear(self, name: str, sent: int, sequence: int, gid: bytes, payload: bytes, now: float) -> None:
+        """Takes a message of a topic: source time [ns, wall], sequence number, GID and CDR. `now` [s] is any steady clock."""
+        topic = self.rules.topics[name]
+        stream = self._streams[name].get(gid)
+        if stream is None:
+            stream = self._streams[name][gid] = Stream(self._sender(gid), now, sequence=sequence - 1)
+        if stream.sender.startswith("unknown") and gid in self._nodes:
+            stream.sender = self._nodes[gid]
+        stream.count += 1
+        stream.size += len(payload)
+        stream.sent = sent
+        self._check_sequence(topic, stream, sequence, now)
+        try:
+            message = self._decoders[name](payload)
+        except codec.CodecError as error:
+            self._note(topic, stream.sender, Kind.GARBAGE, topic.type, str(error), now)
+            return
+        checker = self._checkers[name]
+        for fault in checker(message):
+            self._note(topic, stream.sender, fault.kind, fault.expected, fault.got, now, fault.field)
+        stamp = checker.stamp(message) if not topic.latched else None
+        if stamp is not None:
+            self._check_stamp(topic, stream, sequence, stamp, now)
+            stream.stamp = stamp
+
+    def garbage(self, name: str, why: str, now: float) -> None:
+        """Takes note of bytes on a topic that are no message."""
+        self._note(self.rules.topics[name], "unknown", Kind.GARBAGE, "rmw_zenoh's attachment of 33 bytes", why, now)
+
+    def foreign(self, name: str, type_name: str, type_hash: str, gid: bytes | None, now: float) -> None:
+        """Takes note of a message that came on a topic's key with another type or hash."""
+        topic = self.rules.topics[name]
+        sender = "unknown" if gid is None else self._sender(gid)
+        self._note(topic, sender, Kind.TYPE, _type(topic.type, topic.type_hash), _type(type_name, type_hash), now)
+
+    def look(self, now: float, wall: int) -> list[Violation]:
+        """Judges rates and ages; returns what is new since the last look. `wall` is the wall time [ns]. Call it often."""
+        for streams in self._streams.values():
+            for stream in streams.values():
+                stream.mark(now)
+                stream.ages.append((wall - stream.sent) / MS)
+        rows = self.rules.topics
+        periodic = [(rows[name], streams) for name, streams in self._streams.items() if rows[name].periodic]
+        self.time = pace.bus_time((stream for _, streams in periodic for stream in streams.values()), self.wallclock)
+        for topic, streams in periodic:
+            for gid, stream in streams.items():
+                if not self._nodes or gid in self._nodes:
+                    for fault in pace.faults(topic, stream, self.time, self.wallclock, now):
+                        self._note(topic, stream.sender, fault.kind, fault.expected, fault.got, now)
+        self._judge_unheard(now)
+        news, self._news = self._news, []
+        return news
+
+    def health(self) -> list[TopicHealth]:
+        """Every topic of the contract, in its order."""
+        return [self._health(topic) for topic in self.rules.topics.values()]
+
+    def _health(self, topic: Topic) -> TopicHealth:
+        streams = [stream for stream in self._streams[topic.name].values() if stream.window]
+        passed = [stream.passed() for stream in streams]
+        seconds = max((p.seconds for p in passed), default=0.0)
+        kept = self._kept.get(topic.name)
+        if kept is not None and seconds < pace.GRACE_S:
+            return self._kept_health(kept)
+        messages, size = sum(p.messages for p in passed), sum(p.bytes for p in passed)
+        own = [p.messages * 1e9 / p.stamps for p in passed if p.stamps]
+        senders = sorted({stream.sender for stream in streams} | self._publishers.get(topic.name, set()))
+        alive: bool | None = None
+        if topic.latched and senders:
+            alive = bool(streams)
+        elif topic.periodic and senders and self.time.progress and seconds >= pace.GRACE_S:
+            alive = messages > 0
+        rate = messages / seconds if seconds else 0.0
+        return TopicHealth(
+            topic, tuple(senders), alive, sum(stream.count for stream in streams), rate,
+            max(own, default=None),
+            min((stream.ages[-1] for stream in streams if stream.ages), default=None),
+            size / seconds if seconds else 0.0, sum(stream.missing for stream in streams), self._violations(topic),
+            topic.name in self.listening,
+        )  # fmt: skip
+
+    def _kept_health(self, kept: TopicHealth) -> TopicHealth:
+        """A topic as it was when it was last listened to, with who is there and what was seen by now."""
+        there = tuple(sorted(self._publishers.get(kept.topic.name, set())))
+        return replace(kept, senders=there, violations=self._violations(kept.topic))
+
+    def _violations(self, topic: Topic) -> int:
+        return sum(seen.count for key, seen in self.active.items() if key[0] == topic.name)
+
+    # -- judgements
+
+    def _sender(self, gid: bytes) -> str:
+        return self._nodes.get(gid, f"unknown sender {gid.hex()[:8]}")
+
+    def _note(self, topic: Topic, sender: str, kind: Kind, expected: str, got: str, now: float, path: str = "") -> None:
+        key = (topic.name, sender, kind, path)
+        seen = self.active.get(key)
+        if seen is not None:
+            seen.last = now
+            seen.count += 1
+            seen.violation = Violation(topic.name, sender, kind, expected, got, path)
+            return
+        violation = Violation(topic.name, sender, kind, expected, got, path)
+        self.active[key] = Seen(violation, now, now)
+        self._news.append(violation)
+
+    def _check_sender(self, topic: Topic, sender: str, now: float) -> None:
+        if sender != topic.producer and not topic.open:
+            self._note(topic, sender, Kind.SENDER, f"{topic.producer} only", f"a publisher of {sender}", now)
+
+    def _check_sequence(self, topic: Topic, stream: Stream, sequence: int, now: float) -> None:
+        missing = sequence - stream.sequence - 1
+        if missing > 0:
+            stream.missing += missing
+            self._note(topic, stream.sender, Kind.GAP, f"sequence {stream.sequence + 1}",
+                       f"{sequence}: {missing} missing, or lost on the way to this monitor", now)  # fmt: skip
+        elif missing < 0:
+            self._note(topic, stream.sender, Kind.GAP, f"sequence {stream.sequence + 1}", f"{sequence} again", now)
+        stream.sequence = max(stream.sequence, sequence)
+
+    def _check_stamp(self, topic: Topic, stream: Stream, sequence: int, stamp: int, now: float) -> None:
+        if stream.stamp is not None and stamp < stream.stamp:
+            self._note(topic, stream.sender, Kind.STAMP, f"at least {stream.stamp} ns", f"{stamp} ns: it goes backwards", now)
+        elif topic.periodic and not self.wallclock and stamp != (sequence - 1) * topic.period:
+            expected = f"{(sequence - 1) * topic.period} ns, by its sequence number {sequence}"
+            self._note(topic, stream.sender, Kind.STAMP, expected, f"{stamp} ns", now)
+
+    def _judge_unheard(self, now: float) -> None:
+        """Topics whose producer is there but from whom nothing came."""
+        for name, nodes in self._publishers.items():
+            topic = self.rules.topics[name]
+            if name not in self.listening:
+                continue
+            heard = {stream.sender for stream in self._streams[name].values()}
+            due = (topic.periodic and pace.is_due(topic, self.time)) or (topic.latched and self.time.passed > 0)
+            for node in nodes - heard:
+                waited = now - self._since[name, node]
+                if waited > WINDOW_S and due:
+                    expected = "its latched message" if topic.latched else f"{1000 / topic.period_ms:g} Hz"
+                    self._note(topic, node, Kind.SILENT, expected, f"nothing for {waited:.1f} s", now)
+
+
+def _type(name: str, digest: str) -> str:
+    return f"{name} {digest[:15]}"

@@ -1,0 +1,368 @@
+"""Conservative synchronisation of one service, without any transport (Chandy and Misra 1979; Bryant 1977).
+
+A `Stepper` holds a service's input buffers and output ports. A message of a periodic topic carries its simulated time in its
+sequence number, (sequence - 1) * period; those of an event topic get theirs from the Advance message that closes a tick.
+So the wire format stays plain ROS 2, and inputs are consumed in (stamp, topic, sequence) order whatever order they arrive in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from time import perf_counter_ns
+
+from palpate_bus.contract import Contract, Edge, Topic
+from palpate_bus.messages import codec
+from palpate_bus.messages.codec import Message
+from palpate_bus.runtime.blame import Blame
+from palpate_bus.service import Outbox, Service
+
+_CHAIN = struct.Struct("<qqq")
+_SMALL = 4096
+"""A payload up to this size [bytes] is cheaper copied behind its head than hashed in a call of its own."""
+_CHAIN_NS = 64_000_000
+"""Simulated time [ns] over which what was sent is gathered for the digests: hashing each by itself would meet cold code."""
+NEVER = -1
+"""The tick of something that has not happened."""
+
+
+class LockstepError(RuntimeError):
+    """The dataflow broke: a gap in a sequence, or a service that does not keep to its contract."""
+
+
+class Received:
+    """A message as bytes, decoded when first looked at."""
+
+    __slots__ = ("message", "payload", "sequence", "stamp")
+
+    def __init__(self, payload: bytes, stamp: int, sequence: int) -> None:
+        self.payload = payload
+        self.stamp = stamp
+        self.sequence = sequence
+        self.message: Message | None = None
+
+
+class InputBuffer:
+    """What a service holds of one topic, and how far the producer has advanced.
+
+    `advanced` is the producer's tick [ns] up to which the topic is known completely; `new` are the messages of the current step,
+    `pending` those of later ones.
+    """
+
+    __slots__ = (
+        "_advances", "_blocks", "_last_sequence", "_latched", "_periodic", "_unstamped",
+        "advanced", "decode", "delay", "edge", "grid", "latest", "lost", "new", "pending", "period", "topic",
+    )  # fmt: skip
+
+    def __init__(self, topic: Topic, edge: Edge, producer_period: int) -> None:
+        self.topic = topic
+        self.edge = edge
+        self.period = topic.period
+        self.delay = topic.period if edge is Edge.PREVIOUS else 0
+        self.grid = topic.period if topic.periodic else producer_period
+        self.decode = codec.decoder(topic.type)
+        self.advanced = NEVER
+        self.latest: Received | None = None
+        self.new: list[Received] = []
+        self.lost = False
+        self._blocks, self._latched, self._periodic = edge.blocking, edge is Edge.LATCHED, topic.periodic
+        self.pending: deque[Received] = deque()
+        self._unstamped: deque[Received] = deque()
+        self._advances: deque[tuple[int, int]] = deque()
+        self._last_sequence = 0
+
+    def ready(self, t: int) -> bool:
+        """Whether the reader may step at `t` as far as this topic goes: its producer has reached the newest tick that counts."""
+        if self.lost:
+            return True
+        if not self._blocks:
+            return not self._latched or self.holds_any
+        limit = t - self.delay
+        return limit < 0 or self.advanced >= limit - limit % self.grid
+
+    def accept(self, sequence: int, payload: bytes) -> None:
+        """Takes a message off the wire. Raises LockstepError when one is missing before it."""
+        if sequence != self._last_sequence + 1:
+            if sequence <= self._last_sequence:
+                raise LockstepError(f"{self.topic.name}: sequence {sequence} came again after {self._last_sequence}")
+            raise LockstepError(
+                f"{self.topic.name}: messages {self._last_sequence + 1}..{sequence - 1} of {self.topic.producer} are missing"
+            )
+        self._last_sequence = sequence
+        if self._periodic:
+            stamp = (sequence - 1) * self.period
+            self.pending.append(Received(payload, stamp, sequence))
+            self.advanced = stamp
+        elif self.topic.latched:
+            self.pending.append(Received(payload, 0, sequence))
+        else:
+            self._unstamped.append(Received(payload, NEVER, sequence))
+            self._settle()
+
+    def advance(self, tick: int, sequence: int) -> None:
+        """The producer has finished `tick`, having sent `sequence` messages of this event topic in all."""
+        self._advances.append((tick, sequence))
+        self._settle()
+
+    def _settle(self) -> None:
+        while self._advances and self._advances[0][1] <= self._last_sequence:
+            tick, sequence = self._advances.popleft()
+            while self._unstamped and self._unstamped[0].sequence <= sequence:
+                received = self._unstamped.popleft()
+                received.stamp = tick
+                self.pending.append(received)
+            self.advanced = tick
+
+    @property
+    def waits_for_data(self) -> bool:
+        """Whether an advance is known whose messages are not all here."""
+        return bool(self._advances)
+
+    @property
+    def holds_any(self) -> bool:
+        """Whether any message has come."""
+        return bool(self.pending) or self.latest is not None
+
+    def deliver(self, received: Received) -> None:
+        """Takes a message whose stamp is known (composed run, observers)."""
+        self.pending.append(received)
+        self.advanced = received.stamp
+
+    def take(self, t: int) -> None:
+        """Moves what the reader may see at `t` into `new` and `latest`."""
+        limit = t - self.delay
+        pending = self.pending
+        if not pending or pending[0].stamp > limit:
+            if self.new:
+                self.new = []
+            return
+        new = self.new = [pending.popleft()]
+        while pending and pending[0].stamp <= limit:
+            new.append(pending.popleft())
+        self.latest = new[-1]
+
+
+class TickInbox:
+    """The inbox of one service in lockstep, over its input buffers."""
+
+    __slots__ = ("_blame", "_buffers", "lost_roles")
+
+    def __init__(self, buffers: Mapping[str, InputBuffer], blame: Blame) -> None:
+        self._buffers = buffers
+        self._blame = blame
+        self.lost_roles: set[str] = set()
+
+    def _decode(self, buffer: InputBuffer, received: Received) -> Message:
+        start = perf_counter_ns()
+        message = received.message = buffer.decode(received.payload)
+        self._blame.decode += perf_counter_ns() - start
+        return message
+
+    def latest(self, topic: str) -> Message | None:
+        """The newest message, or None before the first."""
+        buffer = self._buffers[topic]
+        received = buffer.latest
+        if received is None:
+            return None
+        message = received.message
+        return self._decode(buffer, received) if message is None else message
+
+    def new(self, topic: str) -> list[Message]:
+        """The messages since the step before, oldest first."""
+        buffer = self._buffers[topic]
+        if not buffer.new:
+            return []
+        return [self._decode(buffer, one) if one.message is None else one.message for one in buffer.new]
+
+    def raw(self, topic: str) -> Sequence[Received]:
+        """The messages since the step before, undecoded."""
+        return self._buffers[topic].new
+
+    def stamp(self, topic: str) -> int | None:
+        """The simulated time [ns] of the newest message."""
+        latest = self._buffers[topic].latest
+        return None if latest is None else latest.stamp
+
+    def lost(self, role: str) -> bool:
+        """Whether that role's service is gone."""
+        return role in self.lost_roles
+
+
+class OutputPort:
+    """One topic that a service writes: its sequence and the digest over all that it sent."""
+
+    __slots__ = ("_digest", "encode", "event", "latched", "period", "sequence", "topic")
+
+    def __init__(self, topic: Topic) -> None:
+        self.topic = topic
+        self.period = topic.period
+        self.event = topic.event
+        self.latched = topic.latched
+        self.encode = codec.encoder(topic.type)
+        self.sequence = 0
+        self._digest = hashlib.sha256() if topic.hashed else None
+
+    def pack(self, message: Message) -> Sent:
+        """Encodes and numbers a message."""
+        sequence = self.sequence = self.sequence + 1
+        return self, self.encode(message), sequence
+
+    def chain(self, payload: bytes, stamp: int, sequence: int) -> None:
+        """Takes a sent message into the digest."""
+        digest = self._digest
+        if digest is None:
+            return
+        size = len(payload)
+        if size <= _SMALL:
+            digest.update(_CHAIN.pack(stamp, sequence, size) + payload)
+        else:
+            digest.update(_CHAIN.pack(stamp, sequence, size))
+            digest.update(payload)
+
+    def digest(self) -> str | None:
+        """Hexadecimal digest, None for a topic that is not hashed."""
+        return None if self._digest is None else self._digest.hexdigest()
+
+
+Sent = tuple[OutputPort, bytes, int]
+"""A message on its way out: port, payload, sequence."""
+
+
+class Stepper:
+    """Drives one service: buffers in, step, ports out."""
+
+    def __init__(self, service: Service, contract: Contract, strict: bool = True) -> None:
+        """`strict` holds the service to a message on every tick of its periodic topics; observers are never held to it."""
+        self.service = service
+        self.role = contract.roles[service.role]
+        self.buffers = {
+            topic.name: InputBuffer(topic, edge, contract.roles[topic.producer].period)
+            for topic, edge in contract.inputs(service.role)
+        }
+        self.ports = {topic.name: OutputPort(topic) for topic in contract.outputs(service.role)}
+        self.blame = Blame()
+        self.inbox = TickInbox(self.buffers, self.blame)
+        self._all = tuple(self.buffers.values())
+        self._whole = type(service).parts is Service.parts
+        periodic = tuple(port for port in self.ports.values() if not (port.event or port.latched))
+        if not strict or self.role.observer:
+            periodic = ()
+        self._steady = tuple(port for port in periodic if port.period == self.role.period)
+        self._rarer = tuple(port for port in periodic if port.period != self.role.period)
+        self._unchained: list[tuple[int, list[Sent]]] = []
+        """What has been sent, by tick, and is not in the digests yet: many small messages are hashed in one go."""
+        self._chain_every = max(_CHAIN_NS // self.role.period, 1)
+
+    def start(self) -> list[Sent]:
+        """The latched messages, packed. They are numbered and stamped zero."""
+        sent = []
+        for name, message in self.service.start().items():
+            port = self._port(name)
+            if not port.latched:
+                raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
+            _, payload, sequence = port.pack(message)
+            port.chain(payload, 0, sequence)
+            sent.append((port, payload, sequence))
+        missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
+        if missing:
+            raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
+        return sent
+
+    def step(self, t: int) -> list[Sent]:
+        """Steps the service at `t` [ns] and returns all that it sends, packed, in outbox order.
+
+        Raises LockstepError when the service leaves out a periodic message or sends one off its tick.
+        """
+        blame = self.blame
+        begin, decoded, encoded = perf_counter_ns(), blame.decode, blame.encode
+        sent: list[Sent] = []
+        for outbox in self._outboxes(t):
+            stepped = perf_counter_ns()
+            sent += self._pack(outbox, t)
+            blame.encode += perf_counter_ns() - stepped
+        self._unchained.append((t, sent))
+        self._close(t)
+        blame.compute += perf_counter_ns() - begin - (blame.decode - decoded) - (blame.encode - encoded)
+        return sent
+
+    def parts(self, t: int) -> Iterator[list[Sent]]:
+        """As `step`, but yields what each part of the step sends before the next is computed."""
+        blame = self.blame
+        begin, decoded = perf_counter_ns(), blame.decode
+        for outbox in self._outboxes(t):
+            stepped = perf_counter_ns()
+            blame.compute += stepped - begin - (blame.decode - decoded)
+            sent = self._pack(outbox, t)
+            self._unchained.append((t, sent))
+            blame.encode += perf_counter_ns() - stepped
+            yield sent
+            begin, decoded = perf_counter_ns(), blame.decode
+        self._close(t)
+
+    def _outboxes(self, t: int) -> Iterable[Outbox]:
+        """The service's step at `t` [ns] on what it may see then, in parts where it has any."""
+        for buffer in self._all:
+            if buffer.pending or buffer.new:
+                buffer.take(t)
+        return (self.service.step(t, self.inbox),) if self._whole else self.service.parts(t, self.inbox)
+
+    def _close(self, t: int) -> None:
+        """Checks that all is sent that was due at `t` [ns], and hashes when enough has gathered: by now it is on its way."""
+        number = t // self.role.period + 1
+        for port in self._steady:
+            if port.sequence != number:
+                raise self._missing(port, t)
+        for port in self._rarer:
+            if not t % port.period and port.sequence != t // port.period + 1:
+                raise self._missing(port, t)
+        if len(self._unchained) >= self._chain_every:
+            begin = perf_counter_ns()
+            self._chain()
+            self.blame.encode += perf_counter_ns() - begin
+        self.blame.steps += 1
+
+    def _missing(self, port: OutputPort, t: int) -> LockstepError:
+        return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+
+    def _chain(self) -> None:
+        """Brings the digests up to date."""
+        for t, sent in self._unchained:
+            for port, payload, sequence in sent:
+                port.chain(payload, t, sequence)
+        self._unchained.clear()
+
+    def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
+        sent: list[Sent] = []
+        ports = self.ports
+        for name, message in outbox.items():
+            port = ports.get(name) or self._port(name)
+            if port.event:
+                sent += map(port.pack, message) if isinstance(message, list) else (port.pack(message),)
+            elif t % port.period:
+                raise LockstepError(f"{self.role.name} sent {name} at {t} ns, which is no tick of its period {port.period} ns")
+            else:
+                sent.append(port.pack(message))
+        return sent
+
+    def _port(self, name: str) -> OutputPort:
+        try:
+            return self.ports[name]
+        except KeyError:
+            raise LockstepError(
+                f"{self.role.name} sent {name}, which the contract does not give it; it may send {', '.join(self.ports)}"
+            ) from None
+
+    def digests(self) -> dict[str, str]:
+        """Digest by topic, of the hashed ones."""
+        self._chain()
+        return {name: digest for name, port in self.ports.items() if (digest := port.digest()) is not None}
+
+
+def run_hash(digests: Mapping[str, str]) -> str:
+    """The run hash: SHA-256 over the sorted (topic, digest) pairs of all services."""
+    pairs = hashlib.sha256()
+    for topic, digest in sorted(digests.items()):
+        pairs.update(f"{topic} {digest}\n".encode())
+    return pairs.hexdigest()

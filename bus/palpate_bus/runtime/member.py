@@ -1,0 +1,90 @@
+"""A role's membership of the bus: its session, its liveliness tokens, and how it publishes and subscribes by the contract.
+
+What it declares shows in the ROS graph (`ros2 node list`, `ros2 topic info`). A peer that publishes or wants a topic of the
+contract with another type or hash can never meet us; that is silent in ROS 2, so `complaints` says it.
+"""
+
+from __future__ import annotations
+
+from time import monotonic
+
+import zenoh
+
+from palpate_bus.contract import Contract, Topic
+from palpate_bus.messages import codec
+from palpate_bus.runtime.faults import faulty
+from palpate_bus.wire.liveliness import GraphWatch, NodeTokens, mismatches
+from palpate_bus.wire.rmw import message_key, topic_key
+from palpate_bus.wire.transport import Publisher, Subscription
+
+CHECK_S = 0.5
+"""How often the graph is looked at."""
+
+
+class Member:
+    """One role on the bus."""
+
+    def __init__(self, session: zenoh.Session, role: str, rules: Contract, domain: int) -> None:
+        self.session = session
+        self.role = role
+        self.rules = rules
+        self.domain = domain
+        self.graph = GraphWatch(session, domain)
+        self._tokens = NodeTokens(session, role, domain)
+        self._said: set[str] = set()
+        self._checked = 0.0
+        self._changed = False
+
+    def publisher(self, topic: Topic) -> Publisher:
+        """A publisher of a topic of the contract."""
+        qos = self.rules.qos[topic.qos]
+        publisher: Publisher = faulty(
+            Publisher(self.session, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos)), topic
+        )
+        return publisher
+
+    def subscription(self, topic: Topic, history: bool = False) -> Subscription:
+        """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
+        self._tokens.subscription(topic, self.rules.qos[topic.qos])
+        decode = codec.decoder(topic.type) if topic.open else None
+        return Subscription(self.session, topic_key(topic, self.domain), history, decode)
+
+    def observed(self, topic: Topic) -> str:
+        """Declares a subscription that the caller makes; returns the key."""
+        self._tokens.subscription(topic, self.rules.qos[topic.qos])
+        return topic_key(topic, self.domain)
+
+    def internal_publisher(self, name: str, type_name: str, qos: str) -> Publisher:
+        """A publisher of the runtime's own messages."""
+        return Publisher(self.session, message_key(name, type_name, self.domain), self.rules.qos[qos], self._tokens.node.gid)
+
+    def internal_subscription(self, name: str, type_name: str) -> Subscription:
+        """A subscription to the runtime's own messages."""
+        return Subscription(self.session, message_key(name, type_name, self.domain))
+
+    def complaints(self) -> list[str]:
+        """New mismatches of message types on the bus, each said once; looks at most every `CHECK_S`."""
+        now = monotonic()
+        if now - self._checked < CHECK_S:
+            return []
+        self._checked = now
+        self._catch_up()
+        if not self._changed:
+            return []
+        self._changed = False
+        new = [sentence for sentence in mismatches(self.graph.alive.values()) if sentence not in self._said]
+        self._said.update(new)
+        return new
+
+    def gone(self) -> frozenset[str]:
+        """Roles that were on the bus and are no more."""
+        self._catch_up()
+        return self.graph.gone()
+
+    def _catch_up(self) -> None:
+        self._changed = bool(self.graph.changes()) or self._changed
+
+    def leave(self) -> None:
+        """Withdraws the tokens."""
+        self._tokens.undeclare()
+        self.graph.close()

@@ -1,0 +1,134 @@
+"""The recorder's process: it takes the chunks that every service passes on, and says how far it has written.
+
+The conductor grants at most a second of simulated time beyond that, so nothing is lost: at worst the run is slower.
+"""
+
+from __future__ import annotations
+
+import logging
+from time import sleep
+from typing import Any, Protocol, runtime_checkable
+
+from palpate_bus.contract import Topic
+from palpate_bus.messages import RunControl, ServiceReport, codec
+from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.runtime.distributed import Link, RunAborted
+from palpate_bus.runtime.lockstep import NEVER
+from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.service import Service
+
+log = logging.getLogger(__name__)
+
+IDLE_S = 0.01
+CLOCK = "clock"
+
+_decode_clock = codec.decoder("rosgraph_msgs/msg/Clock")
+
+
+@runtime_checkable
+class RawRecorder(Protocol):
+    """A service that wants every message as bytes."""
+
+    def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
+        """Takes one message: its row, CDR bytes, simulated stamp [ns] and sequence number."""
+
+
+class RecorderNode:
+    """A recorder in a process of its own."""
+
+    def __init__(self, service: Service, member: Member) -> None:
+        if not isinstance(service, RawRecorder):
+            raise TypeError(f"the {service.role} service has no record(topic, payload, stamp, sequence)")
+        self._service: Service = service
+        self._recorder: RawRecorder = service
+        self._topics = member.rules.topics
+        self._link = Link(member)
+        producers = [role.name for role in member.rules.roles.values() if not role.observer]
+        self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
+        self._covered = dict.fromkeys(producers, NEVER)
+        # What observers say (clock, diagnostics, an operator's request) is rare and comes directly; the clock dates the rest.
+        observed = [topic for topic, _ in member.rules.inputs(service.role) if member.rules.roles[topic.producer].observer]
+        observed.sort(key=lambda topic: topic.name != CLOCK)
+        self._observed = [(topic, member.subscription(topic)) for topic in observed]
+        self._clock = 0
+        self._lost: set[str] = set()
+        self._messages = 0
+        self._garbage = 0
+
+    @property
+    def covered(self) -> int:
+        """The tick [ns] up to which every living producer's messages are written."""
+        return min((tick for role, tick in self._covered.items() if role not in self._lost), default=NEVER)
+
+    def run(self) -> None:
+        """Records until the conductor ends the run."""
+        try:
+            while True:
+                busy = self._drain()
+                message = self._link.poll()
+                if message is None:
+                    if not busy:
+                        sleep(IDLE_S)
+                    self._link.progress(self.covered)
+                elif message.command == RunControl.HELLO:
+                    self._drain()
+                    missing = [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.heard]
+                    self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
+                elif message.command == RunControl.LOST:
+                    self._lost.add(message.role)
+                elif message.command == RunControl.HANDOVER and message.role in self._chunks:
+                    self._chunks[message.role].hand_over()
+                elif message.command == RunControl.END:
+                    break
+            while self._drain():
+                pass
+        except RunAborted as aborted:
+            log.warning("run aborted: %s", aborted)
+            self._drain()
+            self._service.finish()
+            raise
+        detail: dict[str, Any] = {
+            "facts": dict(self._service.finish()),
+            "messages": self._messages,
+            "garbage": self._garbage + sum(chunk.garbage for chunk in self._chunks.values()),
+        }
+        self._link.report(ServiceReport.FINISHED, max(self._covered.values()), detail=detail)
+
+    def _drain(self) -> bool:
+        busy = False
+        for role, chunks in self._chunks.items():
+            while (sample := chunks.get(0)) is not None:
+                busy = True
+                try:
+                    tick, messages = unpack_chunk(sample.payload)
+                except codec.CodecError as error:
+                    log.warning("chunk of %s: %s", role, error)
+                    self._garbage += 1
+                    continue
+                for name, payload, stamp, sequence in messages:
+                    if name in self._topics:
+                        self._record(self._topics[name], payload, stamp, sequence)
+                    else:
+                        self._garbage += 1
+                self._covered[role] = tick
+        return self._drain_observed() or busy
+
+    def _drain_observed(self) -> bool:
+        """Takes what observers said. It carries no simulated stamp, so it is dated by the clock that came before it."""
+        busy = False
+        for topic, subscription in self._observed:
+            while (sample := subscription.get(0)) is not None:
+                busy = True
+                if topic.name == CLOCK:
+                    try:
+                        self._clock = nanoseconds(_decode_clock(sample.payload).clock)
+                    except codec.CodecError:
+                        self._garbage += 1
+                        continue
+                self._record(topic, sample.payload, self._clock, sample.sequence)
+        return busy
+
+    def _record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
+        self._recorder.record(topic, payload, stamp, sequence)
+        self._messages += 1

@@ -1,0 +1,209 @@
+"""Wall clock: one service a process, each on its own timer, freshest sample wins: for hardware, real or simulated in real time.
+
+A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
+A late step is counted as an overrun. A critical role has physics, which has to keep time: it catches up tick by tick, up to
+`CATCH_UP`, unless its service drives real hardware, whose physics keeps its own. Whoever else is late, and who is later than
+that, goes on at the present tick: what should have been commanded a while ago helps nobody, and stamps stay on the common
+clock. Nothing waits for anybody. Expiry protects those who depend on a late sample.
+"""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from time import monotonic_ns, perf_counter_ns, sleep, time_ns
+from typing import Any
+
+from palpate_bus.contract import MS, Edge
+from palpate_bus.messages import RunControl, ServiceReport
+from palpate_bus.messages.codec import CodecError
+from palpate_bus.runtime.ages import Ages
+from palpate_bus.runtime.distributed import Link, RunAborted
+from palpate_bus.runtime.lockstep import NEVER, Received, Sent, Stepper
+from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.outlet import Outlet
+from palpate_bus.runtime.priority import by_period, give_way
+from palpate_bus.runtime.suspects import failure
+from palpate_bus.service import Service
+
+log = logging.getLogger(__name__)
+
+CATCH_UP = 200 * MS
+"""Lag [ns] beyond which a critical role gives up catching up."""
+HANDSHAKE_POLL_S = 0.02
+READ_NS = 100_000
+"""Two clocks read within this time [ns] were read at once."""
+
+
+def _on_monotonic_clock(wall: int) -> int:
+    """A wall time [ns] on this process's monotonic clock [ns].
+
+    Read again when the process was set aside between the readings: that would put this service ahead of the others for good.
+    """
+    while True:
+        before, now, after = monotonic_ns(), time_ns(), monotonic_ns()
+        if after - before < READ_NS:
+            return (before + after) // 2 + wall - now
+
+
+class WallClockNode:
+    """One service on its own timer."""
+
+    def __init__(self, service: Service, member: Member) -> None:
+        self._service = service
+        self._stepper = Stepper(service, member.rules, strict=False)
+        self._link = Link(member)
+        self._outlet = Outlet(member)
+        self._data = {
+            name: member.subscription(buffer.topic, history=buffer.topic.latched)
+            for name, buffer in self._stepper.buffers.items()
+        }
+        self._sequences = dict.fromkeys(self._data, 0)
+        self.gaps = 0
+        self.undecodable = 0
+        self.overruns = 0
+        self.skips = 0
+        self._ages = {name: Ages() for name in self._data}
+        self._end: int | None = None
+        self._tick = NEVER
+
+    def run(self) -> None:
+        """Runs until the conductor ends the run."""
+        try:
+            give_way(by_period(self._stepper.role.period))
+            epoch = self._await_start()
+            latched = self._stepper.start()
+            self._outlet.send(latched)
+            self._outlet.record(latched, 0)
+            self._loop(epoch)
+            self._finish()
+        except RunAborted:
+            self._service.finish()
+            raise
+        except Exception as error:
+            with suppress(Exception):
+                self._outlet.flush(self._tick)  # what others have heard belongs in the recording
+            words = failure(error, self._stepper.buffers.values())
+            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
+            with suppress(Exception):
+                self._service.finish()  # what it has open is closed
+            raise
+
+    def _await_start(self) -> int:
+        """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns].
+
+        The conductor repeats the start, so that who takes a place over in the middle of a run hears it too.
+        """
+        while True:
+            message = self._link.poll(HANDSHAKE_POLL_S)
+            self._receive(0)  # a quicker service may have sent its latched topics already
+            if message is None:
+                continue
+            if message.command == RunControl.HELLO:
+                self._outlet.hello()
+                missing = [
+                    name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
+                ]
+                self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
+            elif message.command == RunControl.GRANT and message.last:
+                raise RunAborted("the run is already ending")
+            elif message.command == RunControl.GRANT:
+                return _on_monotonic_clock(int(message.tick))
+
+    def _obey(self, message: Any) -> None:
+        if message.command == RunControl.LOST:
+            log.warning("%s lost: %s", message.role, message.reason)
+            self._stepper.inbox.lost_roles.add(message.role)
+        elif message.command == RunControl.HANDOVER:
+            log.warning("%s changes hands: %s", message.role, message.reason)
+            for name, buffer in self._stepper.buffers.items():
+                if buffer.topic.producer == message.role:
+                    self._data[name].hand_over()
+                    self._sequences[name] = 0
+        elif message.command == RunControl.GRANT and message.last:
+            self._end = int(message.tick)
+
+    def _loop(self, epoch: int) -> None:
+        period = self._stepper.role.period
+        catch_up = CATCH_UP if self._stepper.role.critical and self._service.catches_up else period
+        t = self._await_inputs(epoch)
+        while self._end is None or t <= self._end:
+            due = epoch + t
+            now = monotonic_ns()
+            if now < due:
+                sleep((due - now) / 1e9)
+            elif now - due > period:
+                self.overruns += 1
+                if now - due > catch_up:
+                    t += (now - due) // period * period
+                    self.skips += 1
+            self._receive(t)
+            everything: list[Sent] = []
+            for sent in self._stepper.parts(t):
+                start = perf_counter_ns()
+                self._outlet.send(sent)
+                self._stepper.blame.send += perf_counter_ns() - start
+                everything += sent
+            self._outlet.record(everything, t)
+            self._tick = t
+            while (message := self._link.poll()) is not None:
+                self._obey(message)
+            self._link.progress(t)
+            t += period
+
+    def _await_inputs(self, epoch: int) -> int:
+        """Waits until every input that the first step needs has come once; returns the tick [ns] at which it may step."""
+        needed = [b for b in self._stepper.buffers.values() if b.edge in (Edge.SAME_TICK, Edge.LATCHED)]
+        while True:
+            self._receive(0)
+            if all(b.holds_any for b in needed):
+                break
+            message = self._link.poll(HANDSHAKE_POLL_S if needed else None)
+            if message is not None:
+                self._obey(message)
+        period = self._stepper.role.period
+        return max(0, (monotonic_ns() - epoch) // period * period)
+
+    def _receive(self, t: int) -> None:
+        now = time_ns()
+        for name, buffer in self._stepper.buffers.items():
+            data = self._data[name]
+            while (sample := data.get(0)) is not None:
+                last = self._sequences[name]
+                if sample.sequence <= last and not buffer.topic.open:
+                    continue
+                if sample.sequence > last + 1 and not buffer.topic.open:
+                    self.gaps += sample.sequence - last - 1
+                self._sequences[name] = sample.sequence
+                self._ages[name].add(now - sample.sent)
+                received = Received(sample.payload, t - buffer.delay, sample.sequence)
+                try:
+                    # Now, not when the service looks: broken bytes must not end a driver whose arm is in contact.
+                    received.message = buffer.decode(sample.payload)
+                except CodecError as error:
+                    self.undecodable += 1
+                    if self.undecodable == 1:
+                        log.error("%s: %s; it and its like are dropped and counted", name, error)
+                    continue
+                buffer.deliver(received)
+
+    def _finish(self) -> None:
+        self._outlet.flush(self._tick)
+        facts = dict(self._service.finish())
+        detail = {
+            "digests": {},
+            "blame": self._stepper.blame.per_step_us(),
+            "garbage": sum(s.garbage for s in self._data.values()) + self._link.garbage,
+            "foreign": sum(s.foreign for s in self._data.values()),
+            "gaps": self.gaps,
+            "undecodable": self.undecodable,
+            "overruns": self.overruns,
+            "skips": self.skips,
+            "age_ms": {name: ages.as_ms() for name, ages in self._ages.items() if ages.count},
+            "facts": facts,
+        }
+        self._link.report(ServiceReport.FINISHED, self._tick, detail=detail)
+        while True:
+            message = self._link.poll(0.05)
+            if message is not None and message.command == RunControl.END:
+                return

@@ -1,0 +1,147 @@
+"""zenoh's access control from the contract, for a router: each role may send what it produces and get what it reads, no more.
+
+    python -m palpate_bus.security.access > access.json5      # the `access_control` part of zenohd's configuration
+
+A member is known by the common name of its certificate (`keys.py`), or with `--users` by its zenoh user name
+(`transport/auth/usrpwd` with a dictionary file; keep that file out of the repository). Peers that talk directly do not pass the
+router, so services are clients of it (`PALPATE_MODE=client`) where this must hold: `palpate run --secure`.
+
+What follows from the rows: data of a topic goes from its producer to its readers, with the history of latched topics and the
+queries for it; control messages (grants, the end) come from the conductor alone; reports and chunks for the recorder come from
+the role that they name, and go to the conductor and the recorder alone; liveliness tokens are of a role's own node, for everybody
+to see. Anything else is denied.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from palpate_bus.contract import Contract, Internal, Visibility, contract
+from palpate_bus.wire.liveliness import ADMIN_SPACE
+
+VIEWER = "viewer"
+"""A member who may read every public topic and send nothing: a guest's RViz or Foxglove, or `palpate doctor`."""
+OPERATOR = "operator"
+"""A viewer who may also stop and release: `palpate stop` asks the conductor, who alone passes it on."""
+WATCHER = "conductor"
+"""The role that watches over the contract in a run: it hears every public topic, as a viewer does."""
+ROUTER = "router"
+"""The router's own certificate; it may tell whom it turned away, and nothing else."""
+DENIALS = "palpate/denials"
+"""Where a router is asked whom it turned away (see `guard`)."""
+OPERATOR_DESK = "*/palpate/operator"
+"""Where the conductor is asked to stop or release, in any domain."""
+
+_VIEWED = ("palpate/control", "palpate/report/*")
+"""Messages of the runtime that a viewer may see: how far each service is."""
+
+_PUT = ["put", "delete", "reply", "declare_queryable"]
+_GET = ["declare_subscriber", "query"]
+_TOKEN = ["liveliness_token"]
+_WATCH = ["liveliness_query", "declare_liveliness_subscriber"]
+
+
+class _Rules:
+    """Collects rules and who they are for."""
+
+    def __init__(self) -> None:
+        self.rules: list[dict[str, Any]] = []
+        self.policies: dict[str, list[str]] = {}
+
+    def allow(self, who: str, what: str, keys: Sequence[str], sends: bool, messages: tuple[list[str], list[str]]) -> None:
+        """Lets `who` send on `keys`, or else get from them.
+
+        To the router a message that a member sends is an ingress and one that it gets an egress; for a declared subscription or
+        a query it is the other way round.
+        """
+        if not keys:
+            return
+        to, of = ("ingress", "egress") if sends else ("egress", "ingress")
+        for flow, kinds in ((to, messages[0]), (of, messages[1])):
+            name = f"{who} {what} {flow}"
+            rule = {"id": name, "permission": "allow", "flows": [flow], "messages": kinds, "key_exprs": list(keys)}
+            self.rules.append(rule)
+            self.policies.setdefault(who, []).append(name)
+
+
+def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, Any]:
+    """The value of `access_control` in a router's configuration.
+
+    `by` is the attribute by which zenoh knows a member: `cert_common_names` or `usernames`.
+    """
+    made = _Rules()
+    presence = (_TOKEN, _WATCH)
+    data = (_PUT + _TOKEN, _GET + _WATCH)  # an advanced publisher shows itself by a token below its key
+    for role in rules.roles:
+        sends = [key for topic in rules.outputs(role) for key in _keys(topic.name)]
+        sends += [key for row in rules.internal.values() for key in _internal_sent(row, role)]
+        gets = [key for topic, _ in rules.inputs(role) for key in _keys(topic.name)]
+        gets += [key for row in rules.internal.values() for key in _internal_got(row, role)]
+        made.allow(role, "sends", sends, True, data)
+        made.allow(role, "gets", gets, False, data)
+        made.allow(role, "lives", _tokens(role), True, presence)
+    shown = public(rules)
+    made.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
+    for guest in (VIEWER, OPERATOR):
+        made.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
+    made.allow("conductor", "serves", [OPERATOR_DESK], True, data)
+    made.allow(OPERATOR, "orders", [OPERATOR_DESK], False, data)
+    for member in (*rules.roles, VIEWER, OPERATOR):
+        made.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
+        made.allow(member, "asks", [DENIALS], False, data)
+    made.allow(ROUTER, "tells", [DENIALS], True, data)
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": made.rules,
+        "subjects": [{"id": member, by: [member]} for member in made.policies],
+        "policies": [{"rules": names, "subjects": [member]} for member, names in made.policies.items()],
+    }
+
+
+def watched(rules: Contract) -> list[str]:
+    """Topics that the contract's monitor of a run may hear, in the contract's order."""
+    own = {topic.name for topic, _ in rules.inputs(WATCHER)}
+    shown = set(public(rules))
+    return [name for name in rules.topics if name in own or name in shown]
+
+
+def public(rules: Contract) -> list[str]:
+    """Topics that everyone may hear, in the contract's order."""
+    return [topic.name for topic in rules.topics.values() if topic.visibility is Visibility.PUBLIC]
+
+
+def _keys(topic: str) -> list[str]:
+    """Keys of a topic in any domain: of its messages, and of what zenoh's advanced publishers add for latched ones."""
+    return [f"*/{topic}/*/*", f"*/{topic}/*/*/@adv/**"]
+
+
+def _internal_sent(row: Internal, role: str) -> list[str]:
+    """Keys of a message of the runtime that `role` may send: its own."""
+    if row.producer not in ("any", role):
+        return []
+    return _keys(row.name.replace("<role>", role))
+
+
+def _internal_got(row: Internal, role: str) -> list[str]:
+    """Keys of a message of the runtime that `role` may get, whoever sends it."""
+    if row.readers not in ("any", role):
+        return []
+    return _keys(row.name.replace("<role>", "*"))
+
+
+def _tokens(role: str) -> list[str]:
+    """Liveliness tokens of a role's node and of its publishers and subscriptions (see `liveliness`)."""
+    return [f"{ADMIN_SPACE}/*/*/*/*/*/*/*/{role}/**"]
+
+
+if __name__ == "__main__":
+    json.dump(
+        {"access_control": access_control(contract(), "usernames" if "--users" in sys.argv[1:] else "cert_common_names")},
+        sys.stdout,
+        indent=2,
+    )
+    print()

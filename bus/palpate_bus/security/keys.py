@@ -1,0 +1,168 @@
+"""Certificates for a bus of known members: a certificate authority, and one certificate a name.
+
+    <folder>/ca.pem, ca.key                     the authority; its key only signs: keep it off the machines of a run
+    <folder>/<name>/ca.pem, cert.pem, key.pem   what one member needs, and all that it is given (PALPATE_TLS=<folder>/<name>)
+
+Keys are ECDSA on P-256 (RFC 5480), certificates X.509 version 3 (RFC 5280). The name is the subject's common name, by which a
+router knows its members (`access.py`). Needs the `cryptography` package: `pip install palpate-bus[secure]`.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from palpate_bus.contract import contract
+from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER
+
+CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
+CA_KEY = "ca.key"
+CA_YEARS = 10
+DAYS = 825
+"""Days that a certificate holds unless said otherwise."""
+HOSTS = ("localhost", "127.0.0.1", "::1")
+"""Names under which a router is always known; others are given."""
+_SKEW = timedelta(minutes=5)
+"""Clocks may be this far apart."""
+
+
+class KeysError(ValueError):
+    """Keys that cannot be made or read. Names the file and what to do."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What a certificate says."""
+
+    name: str
+    path: Path
+    until: datetime
+    fingerprint: str
+    """SHA-256, hexadecimal."""
+
+    @property
+    def expired(self) -> bool:
+        """Whether it no longer holds."""
+        return datetime.now(UTC) >= self.until
+
+
+def members() -> tuple[str, ...]:
+    """Everybody who gets a certificate: roles, the router, a viewer, who may only read, and an operator, who may also stop."""
+    return (*contract().roles, ROUTER, VIEWER, OPERATOR)
+
+
+def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), days: int = DAYS) -> list[Certificate]:
+    """Makes what is missing in `folder`: the authority, and a certificate for each of `names` (by default `members()`).
+
+    `hosts` are further names and addresses of the router. Certificates that still hold are kept; those expired are made anew.
+    Returns the new ones. Raises KeysError when the folder holds half an authority.
+    """
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    authority, signer = _authority(folder)
+    made = []
+    for name in names or members():
+        place = folder / name
+        if (place / CERTIFICATE).exists() and not read(place / CERTIFICATE).expired:
+            continue
+        place.mkdir(exist_ok=True, mode=0o700)
+        key = ec.generate_private_key(ec.SECP256R1())
+        subject = _issue(name, key.public_key(), authority, signer, days, (*HOSTS, *hosts) if name == ROUTER else ())
+        _write_key(place / KEY, key)
+        (place / CERTIFICATE).write_bytes(subject.public_bytes(serialization.Encoding.PEM))
+        (place / CA).write_bytes(authority.public_bytes(serialization.Encoding.PEM))
+        made.append(read(place / CERTIFICATE))
+    return made
+
+
+def read(path: Path) -> Certificate:
+    """What the certificate in a PEM file says. Raises KeysError."""
+    try:
+        loaded = x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise KeysError(f"{path}: no certificate: {error}; palpate keys init makes them") from error
+    name = str(loaded.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+    return Certificate(name, path, loaded.not_valid_after_utc, loaded.fingerprint(hashes.SHA256()).hex())
+
+
+def certificates(folder: Path) -> list[Certificate]:
+    """All certificates in a folder made by `init`, the authority's first."""
+    return [read(path) for path in (folder / CA, *sorted(folder.glob(f"*/{CERTIFICATE}")))]
+
+
+def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    certificate, key_file = folder / CA, folder / CA_KEY
+    if certificate.exists() != key_file.exists():
+        lacking = key_file if certificate.exists() else certificate
+        raise KeysError(f"{lacking}: missing, so nothing can be signed; fetch it, or choose another folder")
+    if certificate.exists():
+        key = serialization.load_pem_private_key(key_file.read_bytes(), None)
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise KeysError(f"{key_file}: not an ECDSA key")
+        return x509.load_pem_x509_certificate(certificate.read_bytes()), key
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name("Palpate bus authority")
+    usage = x509.KeyUsage(
+        digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False, key_agreement=False,
+        key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,
+    )  # fmt: skip
+    now = datetime.now(UTC)
+    made = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - _SKEW)
+        .not_valid_after(now + timedelta(days=365 * CA_YEARS))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    _write_key(key_file, key)
+    certificate.write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    return made, key
+
+
+def _issue(
+    name: str,
+    public: ec.EllipticCurvePublicKey,
+    authority: x509.Certificate,
+    signer: ec.EllipticCurvePrivateKey,
+    days: int,
+    hosts: Sequence[str],
+) -> x509.Certificate:
+    now = datetime.now(UTC)
+    uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
+    return (
+        x509.CertificateBuilder(authority.subject, _name(name), public, x509.random_serial_number())
+        .not_valid_before(now - _SKEW)
+        .not_valid_after(now + timedelta(days=days))
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts or (name,)]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+        .sign(signer, hashes.SHA256())
+    )
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Writes a private key that only its owner may read, from the first byte on."""
+    path.unlink(missing_ok=True)
+    text = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(text)

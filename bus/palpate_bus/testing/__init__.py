@@ -1,0 +1,1 @@
+"""For tests of services: messages of any type, an inbox filled by hand."""

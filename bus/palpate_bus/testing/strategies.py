@@ -1,0 +1,65 @@
+"""Hypothesis strategies for messages: any valid message of any type, from its definition. Needs `hypothesis`."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from rosbags.interfaces import Nodetype
+
+from palpate_bus.messages.codec import message_type, store
+
+LONGEST = 4
+"""Items in a sequence, at most."""
+
+_INTEGER = {"byte": "int8", "char": "uint8"}
+
+
+def messages(name: str) -> st.SearchStrategy[Any]:
+    """Valid messages of a type: full ranges of numbers (NaN and infinities too), any text, sequences of up to LONGEST items."""
+    message_type(name)
+    return _message(name)
+
+
+@cache
+def _message(name: str) -> st.SearchStrategy[Any]:
+    definition = store.get_msgdef(name)
+    return st.builds(definition.cls, **{field: _field(description) for field, description in definition.fields})
+
+
+def _field(description: Any) -> st.SearchStrategy[Any]:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return _message(detail)
+    if kind == Nodetype.BASE:
+        return _scalar(detail[0])
+    least, most = (detail[1], detail[1]) if kind == Nodetype.ARRAY else (0, LONGEST)
+    item_kind, item = detail[0]
+    if item_kind == Nodetype.BASE and item[0] != "string":
+        return _array(item[0], least, most)
+    return st.lists(_field(detail[0]), min_size=least, max_size=most)
+
+
+def _scalar(base: str) -> st.SearchStrategy[Any]:
+    if base == "string":
+        # No surrogates: they have no UTF-8. No NUL: it ends a string in CDR.
+        return st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
+    if base == "bool":
+        return st.booleans()
+    if base in ("float32", "float64"):
+        return st.floats(width=32 if base == "float32" else 64)
+    limits = np.iinfo(_INTEGER.get(base, base))
+    return st.integers(int(limits.min), int(limits.max))
+
+
+def _array(base: str, least: int, most: int) -> st.SearchStrategy[Any]:
+    dtype = np.dtype({"bool": "?", "byte": "i1", "char": "u1"}.get(base, base))
+    if base == "bool":
+        return st.lists(st.booleans(), min_size=least, max_size=most).map(lambda values: np.array(values, dtype))
+    return (
+        st.integers(least, most)
+        .flatmap(lambda size: st.binary(min_size=size * dtype.itemsize, max_size=size * dtype.itemsize))
+        .map(lambda data: np.frombuffer(data, dtype))
+    )

@@ -1,0 +1,249 @@
+"""Who is on the bus: liveliness tokens as rmw_zenoh has them, so that `ros2 node list` and `ros2 topic info` see our services.
+
+A token is a key that exists as long as its process does:
+
+    @ros2_lv/<domain>/<zid>/<node id>/<entity id>/<kind>/<enclave>/<namespace>/<node>[/<topic>/<type>/<hash>/<qos>]
+
+with every `/` inside a part written `%`. Kinds are NN (node), MP (publisher), MS (subscription), SS and SC (service, client).
+The GID of an entity, which every message's attachment carries, is the XXH3 128-bit hash of its token, low half first.
+
+A role is a ROS node of that name. Sources: ros2/rmw_zenoh, `docs/design.md`, `rmw_zenoh_cpp/src/detail/liveliness_utils.cpp`
+and `qos.cpp`; the numbers of the policies are those of ros2/rmw, `rmw/types.h`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import count
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import xxhash
+import zenoh
+
+from palpate_bus.contract import Qos, Topic
+from palpate_bus.wire.rmw import GID_SIZE, WireError, dds_type, ros_type
+
+ADMIN_SPACE = "@ros2_lv"
+_DEFAULT_DEPTH = 42  # RMW_ZENOH_DEFAULT_HISTORY_DEPTH
+_PARTS_OF_NODE = 9
+_PARTS_OF_ENDPOINT = 13
+
+
+class Kind(StrEnum):
+    """What an entity of the ROS graph is."""
+
+    NODE = "NN"
+    PUBLISHER = "MP"
+    SUBSCRIPTION = "MS"
+    SERVICE = "SS"
+    CLIENT = "SC"
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """What a publisher, subscription, service or client is declared with. `type` is the ROS name."""
+
+    topic: str
+    type: str
+    type_hash: str
+    qos: str
+
+
+@dataclass(frozen=True, slots=True)
+class Entity:
+    """An entity of the ROS graph, with what its token says."""
+
+    domain: int
+    zid: str
+    node_id: int
+    entity_id: int
+    kind: Kind
+    node: str
+    namespace: str = "/"
+    enclave: str = "/"
+    endpoint: Endpoint | None = None
+
+    @property
+    def token(self) -> str:
+        """The key of the token."""
+        parts = [str(self.domain), self.zid, str(self.node_id), str(self.entity_id), self.kind.value]
+        parts += [_mangle(self.enclave), _mangle(self.namespace), _mangle(self.node)]
+        if self.endpoint is not None:
+            topic = "/" + self.endpoint.topic.strip("/")
+            parts += [_mangle(topic), dds_type(self.endpoint.type), self.endpoint.type_hash, self.endpoint.qos]
+        return "/".join([ADMIN_SPACE, *parts])
+
+    @property
+    def gid(self) -> bytes:
+        """The GID, 16 bytes."""
+        return gid(self.token)
+
+
+def _mangle(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def _demangle(name: str) -> str:
+    return name.replace("%", "/")
+
+
+def gid(token: str) -> bytes:
+    """The GID that rmw_zenoh gives to the entity of a token."""
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(GID_SIZE, "little")
+
+
+def qos_token(qos: Qos) -> str:
+    """A QoS class as rmw_zenoh writes it into a token: what is rmw_zenoh's default stays empty.
+
+    `<reliability>:<durability>:<history>,<depth>:<deadline>:<lifespan>:<liveliness>`; the last three are always defaults here.
+    """
+    reliability = "" if qos.reliability == "RELIABLE" else "2"
+    durability = "1" if qos.transient_local else ""
+    depth = "" if qos.depth == _DEFAULT_DEPTH else str(qos.depth)
+    return f"{reliability}:{durability}:,{depth}:,:,:,,"
+
+
+def parse_token(key: str) -> Entity:
+    """The entity of a token's key. Raises WireError if the key is no such token."""
+    parts = key.split("/")
+    if len(parts) < _PARTS_OF_NODE or parts[0] != ADMIN_SPACE or not all(parts):
+        raise WireError(f"no liveliness token: {key!r}")
+    _, domain, zid, node_id, entity_id, kind, enclave, namespace, node, *endpoint = parts
+    try:
+        entity_kind = Kind(kind)
+        numbers = int(domain), int(node_id), int(entity_id)
+    except ValueError as error:
+        raise WireError(f"liveliness token {key!r}: {error}") from error
+    described = None
+    if entity_kind is not Kind.NODE:
+        if len(parts) < _PARTS_OF_ENDPOINT:
+            raise WireError(f"liveliness token {key!r} lacks topic, type, hash or QoS")
+        topic, dds, type_hash, qos = endpoint[:4]
+        described = Endpoint(_demangle(topic).strip("/"), ros_type(dds), type_hash, qos)
+    return Entity(
+        numbers[0], zid, numbers[1], numbers[2], entity_kind, node, _demangle(namespace), _demangle(enclave), described
+    )  # fmt: skip
+
+
+class NodeTokens:
+    """The tokens of one role: of its node at once, of its publishers and subscriptions as they are added.
+
+    Keep it as long as the role lives. `undeclare` withdraws all of them; the process's end does so too.
+    """
+
+    def __init__(self, session: zenoh.Session, role: str, domain: int) -> None:
+        self._liveliness = session.liveliness()
+        self._ids = count(1)
+        self.node = Entity(domain, str(session.zid()), 0, 0, Kind.NODE, role)
+        self._tokens: list[Any] = [self._liveliness.declare_token(self.node.token)]
+
+    def publisher(self, topic: Topic, qos: Qos) -> bytes:
+        """Declares a publisher of a topic and returns its GID, for the attachments."""
+        return self._declare(Kind.PUBLISHER, topic, qos)
+
+    def subscription(self, topic: Topic, qos: Qos) -> bytes:
+        """Declares a subscription to a topic and returns its GID."""
+        return self._declare(Kind.SUBSCRIPTION, topic, qos)
+
+    def _declare(self, kind: Kind, topic: Topic, qos: Qos) -> bytes:
+        endpoint = Endpoint(topic.name, topic.type, topic.type_hash, qos_token(qos))
+        node = self.node
+        entity = Entity(node.domain, node.zid, node.node_id, next(self._ids), kind, node.node, endpoint=endpoint)
+        self._tokens.append(self._liveliness.declare_token(entity.token))
+        return entity.gid
+
+    def undeclare(self) -> None:
+        """Withdraws the tokens."""
+        while self._tokens:
+            self._tokens.pop().undeclare()
+
+
+class GraphWatch:
+    """Watches the tokens of a domain: those there already, those that come and those that go.
+
+    Nothing happens in zenoh's callback but a put into a queue; call `changes` to catch up.
+    """
+
+    def __init__(self, session: zenoh.Session, domain: int) -> None:
+        self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        self._subscriber: Any = session.liveliness().declare_subscriber(
+            f"{ADMIN_SPACE}/{domain}/**", zenoh.handlers.Callback(self._queue.put, indirect=False), history=True
+        )
+        self.alive: dict[str, Entity] = {}
+        """Entities by token."""
+        self.garbage = 0
+        """Tokens that are not rmw_zenoh's."""
+        self._seen: set[str] = set()
+
+    def changes(self, timeout: float = 0.0) -> list[tuple[Entity, bool]]:
+        """What changed since last time, oldest first: (entity, whether it appeared or else vanished).
+
+        Waits for the first change for `timeout` [s].
+        """
+        found: list[tuple[Entity, bool]] = []
+        wait = timeout
+        while True:
+            try:
+                sample = self._queue.get(timeout=wait) if wait > 0 else self._queue.get_nowait()
+            except Empty:
+                return found
+            wait = 0.0
+            token = str(sample.key_expr)
+            appeared = sample.kind == zenoh.SampleKind.PUT
+            try:
+                entity = parse_token(token)
+            except WireError:
+                self.garbage += 1
+                continue
+            if appeared == (token in self.alive):
+                continue  # told twice, over two links
+            if appeared:
+                self.alive[token] = entity
+                self._seen.add(entity.node)
+            else:
+                del self.alive[token]
+            found.append((entity, appeared))
+
+    def roles(self) -> frozenset[str]:
+        """Names of the nodes that live, as of the last `changes`."""
+        return frozenset(entity.node for entity in self.alive.values() if entity.kind is Kind.NODE)
+
+    def gone(self) -> frozenset[str]:
+        """Names of the nodes that lived and are gone, as of the last `changes`."""
+        return frozenset(self._seen) - self.roles()
+
+    def close(self) -> None:
+        """Stops watching."""
+        self._subscriber.undeclare()
+
+
+def mismatches(entities: Iterable[Entity]) -> list[str]:
+    """One sentence for each publisher and subscription of one topic that cannot meet, because type or hash differ."""
+    endpoints = [(entity, entity.endpoint) for entity in entities if entity.endpoint is not None]
+    found = set()
+    for publisher, sent in endpoints:
+        for subscription, wanted in endpoints:
+            if publisher.kind is not Kind.PUBLISHER or subscription.kind is not Kind.SUBSCRIPTION:
+                continue
+            if sent.topic == wanted.topic and (sent.type, sent.type_hash) != (wanted.type, wanted.type_hash):
+                found.add(
+                    f"topic {sent.topic}: {publisher.node} publishes {sent.type} {sent.type_hash}, but {subscription.node} "
+                    f"wants {wanted.type} {wanted.type_hash}; both need the same message definitions"
+                )
+    return sorted(found)
+
+
+def entities(session: zenoh.Session, domain: int, timeout: float = 1.0) -> list[Entity]:
+    """The entities that live now, by token; waits `timeout` [s] at most for the answers."""
+    found = {}
+    for reply in session.liveliness().get(f"{ADMIN_SPACE}/{domain}/**", timeout=timeout):
+        if reply.ok is not None:
+            token = str(reply.ok.key_expr)
+            try:
+                found[token] = parse_token(token)
+            except WireError:
+                continue
+    return [found[token] for token in sorted(found)]

@@ -1,0 +1,137 @@
+"""The wire as rmw_zenoh has it in ROS 2 Jazzy: key expressions and the attachment of every message.
+
+A topic's key is `<domain>/<topic>/<DDS type>/<RIHS01 hash>`, for example
+`0/ft/wrench/geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_8dc3de...`. Publisher and subscriber meet only when all
+four agree; `any_type_key` is for noticing peers that differ in nothing but the type or its hash.
+
+The attachment is 33 bytes, as zenoh's serializer writes (int64, int64, 16 bytes) since rmw_zenoh_cpp 0.2.4 (Jazzy):
+
+| offset | size | field |
+|---|---|---|
+| 0 | 8 | sequence number, little-endian, from 1 a publisher |
+| 8 | 8 | source time stamp [ns] |
+| 16 | 1 | length of the GID, 16 |
+| 17 | 16 | GID of the publisher (see `liveliness.gid`) |
+
+Sources: ros2/rmw_zenoh, `docs/design.md` and, in `rmw_zenoh_cpp/src/detail/`, `attachment_helpers.cpp`,
+`liveliness_utils.cpp` and `type_support_common.cpp`.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+
+from palpate_bus.contract import Topic
+from palpate_bus.messages.codec import type_hash
+
+GID_SIZE = 16
+"""Bytes in a GID (RMW_GID_STORAGE_SIZE)."""
+
+ATTACHMENT_SIZE = 8 + 8 + 1 + GID_SIZE
+"""Bytes in an attachment."""
+
+_ATTACHMENT = struct.Struct(f"<qqB{GID_SIZE}s")
+_TYPE = re.compile(r"([a-z][a-z0-9_]*)::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]*)_")
+_HASH = re.compile(r"RIHS01_[0-9a-f]{64}")
+_DOMAIN = re.compile(r"[0-9]{1,5}")
+# Chunks of a ROS topic name; the internal topics carry a role name, which may hold a dash.
+_CHUNK = re.compile(r"[A-Za-z0-9_~.{}-]+")
+
+
+class WireError(ValueError):
+    """A key, token or attachment that is not rmw_zenoh's."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicKey:
+    """The parts of a topic's key expression. `type` is the ROS name, e.g. `sensor_msgs/msg/JointState`."""
+
+    domain: int
+    topic: str
+    type: str
+    type_hash: str
+
+    def __str__(self) -> str:
+        return f"{self.domain}/{self.topic}/{dds_type(self.type)}/{self.type_hash}"
+
+
+def dds_type(name: str) -> str:
+    """The DDS name of a ROS type: `sensor_msgs/msg/JointState` becomes `sensor_msgs::msg::dds_::JointState_`.
+
+    Raises WireError if `name` is no ROS type name.
+    """
+    package, slash, rest = name.partition("/")
+    kind, slash_2, base = rest.partition("/")
+    dds = f"{package}::{kind}::dds_::{base}_"
+    if not (slash and slash_2 and _TYPE.fullmatch(dds)):
+        raise WireError(f"not a ROS type name: {name!r}; expected <package>/msg/<Name>")
+    return dds
+
+
+def ros_type(dds: str) -> str:
+    """The ROS name of a DDS type: the inverse of `dds_type`. Raises WireError if `dds` is none."""
+    match = _TYPE.fullmatch(dds)
+    if match is None:
+        raise WireError(f"not a DDS type name: {dds!r}; expected <package>::msg::dds_::<Name>_")
+    return "/".join(match.groups())
+
+
+def message_key(topic: str, type_name: str, domain: int) -> str:
+    """The key of any topic of a known message type; slashes around `topic` are dropped, as in rmw_zenoh."""
+    if not 0 <= domain <= 65535:
+        raise WireError(f"domain {domain} is outside 0..65535")
+    return str(TopicKey(domain, topic.strip("/"), type_name, type_hash(type_name)))
+
+
+def topic_key(topic: Topic, domain: int) -> str:
+    """The key expression of a topic of the contract in a ROS domain."""
+    return message_key(topic.name, topic.type, domain)
+
+
+@lru_cache(maxsize=256)
+def parse_key(key: str) -> TopicKey:
+    """The parts of a key expression. Raises WireError if it is not of rmw_zenoh's form."""
+    chunks = key.split("/")
+    if len(chunks) < 4:
+        raise WireError(f"key {key!r} has {len(chunks)} parts; expected <domain>/<topic>/<type>/<hash>")
+    domain, *topic, dds, digest = chunks
+    if not _DOMAIN.fullmatch(domain) or int(domain) > 65535:
+        raise WireError(f"key {key!r}: {domain!r} is no ROS domain")
+    if not all(_CHUNK.fullmatch(chunk) for chunk in topic):
+        raise WireError(f"key {key!r}: {'/'.join(topic)!r} is no topic name")
+    if not _HASH.fullmatch(digest):
+        raise WireError(f"key {key!r}: {digest!r} is no RIHS01 hash")
+    return TopicKey(int(domain), "/".join(topic), ros_type(dds), digest)
+
+
+def any_type_key(topic: str, domain: int) -> str:
+    """A key expression that matches a topic whatever its type and hash: to notice peers whose definition differs."""
+    return f"{domain}/{topic.strip('/')}/*/*"
+
+
+class AttachmentWriter:
+    """Packs the attachments of one publisher."""
+
+    __slots__ = ("_gid",)
+
+    def __init__(self, gid: bytes):
+        if len(gid) != GID_SIZE:
+            raise WireError(f"a GID has {GID_SIZE} bytes, not {len(gid)}")
+        self._gid = bytes(gid)
+
+    def pack(self, sequence: int, source_timestamp_ns: int) -> bytes:
+        """The attachment of a message. Both numbers are signed 64-bit; `struct.error` says when one is not."""
+        return _ATTACHMENT.pack(sequence, source_timestamp_ns, GID_SIZE, self._gid)
+
+
+def unpack(attachment: bytes | bytearray | memoryview) -> tuple[int, int, bytes]:
+    """(sequence, source time stamp [ns], GID) of an attachment. Raises WireError if it is none."""
+    if len(attachment) != ATTACHMENT_SIZE:
+        raise WireError(f"an attachment has {ATTACHMENT_SIZE} bytes, not {len(attachment)}")
+    sequence, stamp, length, gid = _ATTACHMENT.unpack(attachment)
+    if length != GID_SIZE:
+        raise WireError(f"an attachment's GID has {GID_SIZE} bytes, not {length}")
+    return sequence, stamp, gid

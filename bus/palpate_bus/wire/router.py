@@ -1,0 +1,55 @@
+"""A zenoh router in Python, for runs over a network: `palpate router [ENDPOINT...]` or `python -m palpate_bus.wire.router`.
+
+Peers find each other through it and then talk directly; clients talk through it. `zenohd` does the same, faster for clients.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, session
+
+DEFAULT_ENDPOINT = "tcp/[::]:7447"
+"""Where a router listens, as zenohd and rmw_zenohd do."""
+
+log = logging.getLogger(__name__)
+
+
+def serve(
+    listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = (), ready: Callable[[str], None] = log.info
+) -> None:
+    """Routes until SIGINT or SIGTERM; call it from the main thread. `connect` names other routers.
+
+    `ready` is told, once, where it listens. Raises BusConfigError when it cannot listen there.
+    """
+    stop = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with session(BusOptions(mode="router", listen=tuple(listen), connect=tuple(connect))) as router:
+            ready(f"router {router.zid()} listens on {', '.join(listen)}")
+            while not stop.wait(1.0):  # in slices, so that signals are handled on every platform
+                pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs a router on the given endpoints; returns the exit status."""
+    if any(argument.startswith("-") for argument in arguments):
+        print("usage: python -m palpate_bus.wire.router [ENDPOINT...], e.g. tcp/0.0.0.0:7447", file=sys.stderr)
+        return 0 if "--help" in arguments or "-h" in arguments else 2
+    try:
+        serve(arguments or (DEFAULT_ENDPOINT,), ready=lambda line: print(line, flush=True))
+    except BusConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,136 @@
+"""zenoh publishers and subscriptions with rmw_zenoh's attachment, garbage counted and set aside.
+
+No callback computes: a received sample goes into a queue of its own, which the service's thread empties.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+from time import time_ns
+from typing import Any, NamedTuple
+
+import zenoh
+
+from palpate_bus.contract import Qos
+from palpate_bus.messages.codec import CodecError
+from palpate_bus.wire.rmw import AttachmentWriter, WireError, unpack
+
+HELLO = 0
+"""Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""
+
+
+class Sample(NamedTuple):
+    """What came in on a subscription."""
+
+    sequence: int
+    sent: int
+    """Wall time [ns] at which the sender handed it over."""
+    payload: bytes
+
+
+class Publisher:
+    """Sends on one key with the QoS of the contract."""
+
+    def __init__(self, session: zenoh.Session, key: str, qos: Qos, gid: bytes) -> None:
+        self.key = key
+        options: dict[str, Any] = {
+            "priority": getattr(zenoh.Priority, qos.priority),
+            "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),
+            "express": qos.express,
+            "reliability": getattr(zenoh.Reliability, qos.reliability),
+        }
+        if qos.transient_local:
+            self._publisher: Any = zenoh.ext.declare_advanced_publisher(
+                session, key, cache=zenoh.ext.CacheConfig(qos.depth), publisher_detection=True, **options
+            )
+        else:
+            self._publisher = session.declare_publisher(key, **options)
+        self._pack = AttachmentWriter(gid).pack
+
+    def put(self, payload: bytes, sequence: int) -> None:
+        """Sends a message."""
+        self._publisher.put(payload, attachment=self._pack(sequence, time_ns()))
+
+    def hello(self) -> None:
+        """Sends the empty message that tests the edge."""
+        self.put(b"", HELLO)
+
+    def close(self) -> None:
+        """Undeclares the publisher."""
+        self._publisher.undeclare()
+
+
+class Subscription:
+    """Receives on one key.
+
+    After its hello only the first sender's messages count: bytes without a valid attachment are counted in `garbage`, those of
+    another sender in `foreign`. A topic that is open to all takes every sender's messages, if they can be decoded.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None
+    ) -> None:
+        """Subscribes. With `history`, what a latched topic sent before is delivered too; `decode` opens the topic to all."""
+        self.key = key
+        self._decode = decode
+        self.garbage = 0
+        self.foreign = 0
+        self.heard = False
+        self._gid: bytes | None = None
+        self._retired: bytes | None = None
+        self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
+        if history:
+            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                session, key, handler, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            )
+        else:
+            self._subscriber = session.declare_subscriber(key, handler)
+
+    def get(self, timeout: float | None) -> Sample | None:
+        """The next message; None when `timeout` [s] passes without one. A timeout of 0 does not wait."""
+        while True:
+            if not timeout and self._queue.empty():  # nobody else takes from it; far cheaper than the exception
+                return None
+            try:
+                raw = self._queue.get(timeout=timeout) if timeout else self._queue.get_nowait()
+            except Empty:
+                return None
+            try:
+                attachment: Any = raw.attachment
+                sequence, sent, gid = unpack(attachment.to_bytes())
+            except (WireError, AttributeError):
+                self.garbage += 1
+                continue
+            if gid != self._gid:
+                if (self._gid is not None or gid == self._retired) and self._decode is None:
+                    self.foreign += 1
+                    continue
+                self._gid = gid
+            payload = raw.payload.to_bytes()
+            # Some clients of rmw_zenoh's wire number their messages from 0.
+            if sequence == HELLO and not (payload and self._decode is not None):
+                self.heard = True
+                continue
+            if self._decode is not None and decoded(self._decode, payload) is None:
+                self.garbage += 1
+                continue
+            return Sample(sequence, sent, payload)
+
+    def hand_over(self) -> None:
+        """Forgets the sender: the next one that is another counts from now on, and nothing that still comes from this one."""
+        if self._gid is not None:
+            self._retired, self._gid = self._gid, None
+
+    def close(self) -> None:
+        """Undeclares the subscriber."""
+        self._subscriber.undeclare()
+
+
+def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:
+    """The message, or None where the bytes are none: used where anyone may send, so that no stranger can end a service."""
+    try:
+        return decode(payload)
+    except CodecError:
+        return None

@@ -1,0 +1,1 @@
+"""Palpate: the command line and the Python interface."""

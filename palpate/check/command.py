@@ -1,0 +1,116 @@
+"""`palpate check ROLE`: the conformance kit for an implementation of a role."""
+
+from __future__ import annotations
+
+import os
+from importlib.metadata import entry_points
+from typing import Annotated
+
+import typer
+
+from palpate.check.live_rig import LiveRig
+from palpate.check.report import Report, Verdict
+from palpate.check.rig import ServiceRig, Settings
+from palpate.check.starting import started
+from palpate.check.suites import SUITES, check
+from palpate.live.console import EXIT_TROUBLE, command, console, print_json, table
+from palpate.live.joining import Connect
+from palpate_bus.runs.joining import NoBus
+from palpate_bus.wire.zenoh_config import BusOptions, session
+from palpate_models.load import ScenarioError, load_scenario
+
+LISTEN = "tcp/127.0.0.1:7447"
+_COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED: "dim"}
+
+
+def check_command(
+    role: Annotated[str, typer.Argument(help=f"One of {', '.join(SUITES)}.")],
+    connect: Connect = None,
+    listen: Annotated[str, typer.Option(help="Where the check waits for the implementation, as a router.")] = LISTEN,
+    start: Annotated[str | None, typer.Option(metavar="COMMAND", help="Start the implementation with this command.")] = None,
+    installed: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Check an installed one in this process, in simulated time: default, fmu, ..."),
+    ] = None,
+    scenario: Annotated[str, typer.Option(help="What it was configured with.")] = "rlq_guarding",
+    motion: Annotated[bool, typer.Option("--motion", help="It may move: needed for most of the robot's checks.")] = False,
+    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
+    slack: Annotated[float, typer.Option(help="Milliseconds that transport and scheduler may add to a reaction.")] = 150.0,
+    wait: Annotated[float, typer.Option(help="Seconds to wait for it to join.")] = 60.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    failures: Annotated[bool, typer.Option("--failures", help="Print only what failed.")] = False,
+) -> None:
+    """Check an implementation of a role: rates, ranges, signs, frames, limits, expiry and safe hold, garbage and silence.
+
+    The check plays the conductor and all other roles. Leaves with status 0 when everything passed, 1 when something failed, 2
+    when nobody came. docs/conformance.md says what an implementation has to do.
+    """
+    with command():
+        if role not in SUITES:
+            raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
+        try:
+            settings = Settings(load_scenario(scenario), slack, motion or role != "robot" or installed is not None)
+        except ScenarioError as error:
+            raise NoBus(str(error)) from error
+        if installed is not None:
+            report = _check_installed(role, installed, settings)
+        else:
+            report = _check_live(role, settings, connect, listen, start, domain, wait)
+    if as_json:
+        print_json(report.as_json())
+    else:
+        _print(report, failures)
+    if not report.passed:
+        raise typer.Exit(EXIT_TROUBLE)
+
+
+def _check_installed(role: str, name: str, settings: Settings) -> Report:
+    group, wanted = ("palpate.services", role) if name == "default" else ("palpate.implementations", f"{role}.{name}")
+    found = {point.name: point for point in entry_points(group=group)}
+    if wanted not in found:
+        others = sorted(
+            p.name.partition(".")[2] for p in entry_points(group="palpate.implementations") if p.name.startswith(f"{role}.")
+        )
+        raise NoBus(f"no installed implementation {name!r} of {role}; there are {', '.join(['default', *others])}")
+    return check(ServiceRig(found[wanted].load()(settings.scenario), settings))
+
+
+def _check_live(
+    role: str, settings: Settings, connect: list[str] | None, listen: str, start: str | None, domain: int, wait: float
+) -> Report:
+    options = BusOptions(connect=tuple(connect)) if connect else BusOptions(mode="router", listen=(listen,))
+    report = Report(role)
+    with session(options) as bus:
+        where = ", ".join(connect) if connect else listen
+        typer.echo(f"waiting for {role} at {where}, domain {domain}", err=True)
+        rig = LiveRig(bus, role, settings, domain)
+        try:
+            with started(start, role, settings, where, domain):
+                rig.await_implementation(wait, report)
+                check(rig, report)
+                rig.finish(report)
+        finally:
+            rig.close()
+    return report
+
+
+def _print(report: Report, failures: bool) -> None:
+    out = console()
+    rows = table("", "check", "expected", "got")
+    group = ""
+    for result in report.results:
+        if failures and result.verdict is not Verdict.FAILED:
+            continue
+        if result.group != group:
+            group = result.group
+            rows.add_row("", f"[bold]{group}[/]", "", "")
+        texts = (text.replace("[", r"\[") for text in (result.name, result.expected, result.got))
+        rows.add_row(f"[{_COLOURS[result.verdict]}]{result.verdict}[/]", *texts)
+    out.print(rows)
+    counts = {kind: sum(result.verdict is kind for result in report.results) for kind in Verdict}
+    summary = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    verdict = "[green]conforms[/]" if report.passed else "[bold red]does not conform[/]"
+    load = os.getloadavg()[0] / (os.cpu_count() or 1)
+    if not report.passed and load > 1:
+        out.print(f"\n[yellow]this machine is overloaded (load {load:.1f} a processor): rates and reactions say little[/]")
+    out.print(f"\n{report.role}: {verdict}, {summary}")

@@ -1,0 +1,238 @@
+"""The rig for an unknown implementation on a live bus: this process is its conductor and every other role, by the wall clock.
+
+The conversation is that of a wall-clock run: hello on every edge until the implementation reports READY, the common start as a
+grant, a word at least every half second, and the end.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+from time import monotonic, sleep, time_ns
+from typing import Any
+
+import zenoh
+
+from palpate.check.report import Report
+from palpate.check.rig import Feed, Heard, Rig, Settings
+from palpate.live.listening import Listener
+from palpate_bus.contract import MS
+from palpate_bus.messages import RunControl, ServiceReport, codec
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS
+from palpate_bus.runs.joining import NoBus
+from palpate_bus.wire.liveliness import GraphWatch, Kind, NodeTokens, gid
+from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key
+from palpate_bus.wire.transport import Publisher, Subscription
+
+HELLO_S = 0.05
+READY_S = 20.0
+"""For an implementation that is there to answer on every edge."""
+LEAD = 200 * MS
+WORD_S = 0.4
+FINISH_S = 10.0
+CONTROL, REPORT = "palpation_msgs/msg/RunControl", "palpation_msgs/msg/ServiceReport"
+
+
+class LiveRig(Rig):
+    """One implementation of a role on the bus of `session`."""
+
+    live = True
+
+    def __init__(self, session: zenoh.Session, role: str, settings: Settings, domain: int = 0) -> None:
+        super().__init__(role, settings)
+        self._session = session
+        self._domain = domain
+        self.graph = GraphWatch(session, domain)
+        self._tokens: dict[str, NodeTokens] = {}
+        self._publishers: dict[str, Publisher] = {}
+        for topic, _ in self.rules.inputs(role):
+            tokens = self._tokens.setdefault(topic.producer, NodeTokens(session, topic.producer, domain))
+            qos = self.rules.qos[topic.qos]
+            self._publishers[topic.name] = Publisher(session, topic_key(topic, domain), qos, tokens.publisher(topic, qos))
+        conductor = self._tokens.setdefault("conductor", NodeTokens(session, "conductor", domain))
+        key = message_key("palpate/control", CONTROL, domain)
+        self._control = Publisher(session, key, self.rules.qos["event"], conductor.node.gid)
+        self._reports = Subscription(session, message_key(f"palpate/report/{role}", REPORT, domain))
+        self._ears = {topic.name: Listener(session, topic, domain) for topic in self.rules.outputs(role)}
+        self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
+        self._epoch = 0
+        self._spoke = 0.0
+        self.ready = False
+        self.finished = False
+        self.facts: dict[str, Any] = {}
+        """What the implementation reported at its end."""
+        self.error = ""
+        """What it reported when it failed."""
+
+    # -- the conversation
+
+    def await_implementation(self, seconds: float, report: Report) -> None:
+        """Waits for the role to appear, greets it and starts it. Raises NoBus when nobody comes within `seconds`."""
+        report.section("protocol")
+        gc.freeze()  # a full collection in mid-check would keep commands back longer than they are valid
+        end = monotonic() + seconds
+        while self.role.name not in self._others():
+            if monotonic() > end:
+                raise NoBus(f"no node {self.role.name!r} came within {seconds:.0f} s; it needs a liveliness token of that name")
+            self._say(RunControl.HELLO)
+            sleep(HELLO_S)
+        report.expect("joins as a node of its role", True, self.role.name, self.role.name)
+        self._greet(report)
+        self._check_graph(report)
+        self._epoch = time_ns() + LEAD
+        self._say(RunControl.GRANT, self._epoch)
+        while time_ns() < self._epoch:
+            sleep(0.002)
+
+    def _others(self) -> set[str]:
+        self.graph.changes()
+        ours = str(self._session.zid())
+        return {entity.node for entity in self.graph.alive.values() if entity.zid != ours}
+
+    def _greet(self, report: Report) -> None:
+        end = monotonic() + READY_S
+        missing: list[str] | None = None
+        while missing != [] and monotonic() < end:
+            self._say(RunControl.HELLO)
+            for publisher in self._publishers.values():
+                publisher.hello()
+            sleep(HELLO_S)
+            for message in self._heard_reports():
+                if message.state == ServiceReport.READY:
+                    missing = list(json.loads(message.detail or "{}").get("missing", []))
+        self.ready = missing == []
+        got = "READY" if self.ready else "nothing" if missing is None else f"READY, but it hears nothing on {', '.join(missing)}"
+        report.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
+
+    def _check_graph(self, report: Report) -> None:
+        self.graph.changes()
+        ours = str(self._session.zid())
+        ends = [e for e in self.graph.alive.values() if e.node == self.role.name and e.zid != ours and e.endpoint is not None]
+        sent = {e.endpoint.topic: e.endpoint for e in ends if e.kind is Kind.PUBLISHER and e.endpoint is not None}
+        for topic in self.rules.outputs(self.role.name):
+            end = sent.pop(topic.name, None)
+            wanted = f"{topic.type} {topic.type_hash[:15]}"
+            got = "no publisher's token" if end is None else f"{end.type} {end.type_hash[:15]}"
+            if end is None and topic.name.startswith("sim/"):
+                report.skip(f"publishes {topic.name}", "hardware has no such sensor")
+                continue
+            report.expect(f"publishes {topic.name}", got == wanted, wanted, got)
+        report.expect("publishes nothing else", not sent, "the topics of its role only", ", ".join(sent) or "nothing else")
+
+    def finish(self, report: Report) -> None:
+        """Disturbs it, ends it, and judges how it takes that."""
+        report.section("garbage")
+        self._disturb(report)
+        report.section("end")
+        self._say(RunControl.GRANT, self.t + 100 * MS, last=True)
+        end = monotonic() + FINISH_S
+        while not self.finished and monotonic() < end:
+            self._heard_reports()
+            self._drain()
+            sleep(0.02)
+        got = "FINISHED" if self.finished else f"FAILED: {self.error}" if self.error else "nothing"
+        report.expect("reports FINISHED at the end", self.finished, f"within {FINISH_S:.0f} s", got)
+        self._say(RunControl.END)
+
+    def close(self) -> None:
+        """Leaves the bus; an implementation that still runs is told to stop."""
+        self._say(RunControl.ABORT, reason="the conformance check is over")
+        for tokens in self._tokens.values():
+            tokens.undeclare()
+        self.graph.close()
+        for ear in self._ears.values():
+            ear.close()
+        self._reports.close()
+
+    def _disturb(self, report: Report) -> None:
+        """Bytes that are no messages, and messages of a stranger, on every input."""
+        stranger = AttachmentWriter(gid("a stranger")).pack
+        for name in self._publishers:
+            topic = self.rules.topics[name]
+            key = topic_key(topic, self._domain)
+            self._session.put(key, b"\xff" * 40)
+            self._session.put(key, b"\xff" * 40, attachment=b"no attachment")
+            self._session.put(key, b"\xff" * 40, attachment=stranger(1, time_ns()))
+            self._next(name, b"\x00\x01\x00\x00\xff")
+        after = self.run(0.6, {})
+        self._heard_reports()
+        silent = [t.name for t in self.rules.outputs(self.role.name) if t.periodic and self.log[t.name] and not after[t.name]]
+        there = self.role.name in self._others()
+        got = (
+            "gone"
+            if not there
+            else f"silent on {', '.join(silent)}"
+            if silent
+            else f"failed: {self.error}"
+            if self.error
+            else "goes on"
+        )
+        report.expect("garbage on its inputs does not stop it", got == "goes on", "goes on", got)
+
+    def _heard_reports(self) -> list[Any]:
+        heard = []
+        while (sample := self._reports.get(0)) is not None:
+            try:
+                message = codec.decode(sample.payload, REPORT)
+            except codec.CodecError as error:
+                self.undecodable.append(f"palpate/report: {error}")
+                continue
+            heard.append(message)
+            if message.state == ServiceReport.FINISHED:
+                self.finished = True
+                self.facts = json.loads(message.detail or "{}")
+            elif message.state == ServiceReport.FAILED:
+                self.error = message.detail
+        return heard
+
+    def _say(self, command: int, tick: int = 0, last: bool = False, role: str = "", reason: str = "") -> None:
+        self._spoke = monotonic()
+        self._sequences["control"] += 1
+        message = RunControl(command, tick, last, role, reason)
+        self._control.put(codec.encode(message, CONTROL), self._sequences["control"])
+
+    # -- the rig
+
+    def _advance(self, end: int, feed: Feed) -> None:
+        last = {name: (self.t - 1) // self.rules.topics[name].period for name in feed}
+        while True:
+            now = max(time_ns() - self._epoch, 0)
+            for name, source in feed.items():
+                period = self.rules.topics[name].period
+                if now // period > last[name]:
+                    last[name] = now // period
+                    message = source(last[name] * period)
+                    if message is not None:
+                        self.send(name, message)
+            self.t = now
+            self._drain()
+            if monotonic() - self._spoke > WORD_S:
+                self._say(RunControl.GRANT, self._epoch)
+                self._heard_reports()
+            if now >= end:
+                return
+            sleep(max(0.0, (MS - (time_ns() - self._epoch) % MS) / NS))
+
+    def send(self, topic: str, message: Message) -> None:
+        """Publishes a message as its rightful producer."""
+        self._next(topic, codec.encode(message, self.rules.topics[topic].type))
+
+    def lose(self, role: str) -> None:
+        """Says that a role is lost, as a conductor does."""
+        self._say(RunControl.LOST, self.t, role=role, reason="conformance check")
+
+    def _next(self, topic: str, payload: bytes) -> None:
+        self._sequences[topic] += 1
+        self._publishers[topic].put(payload, self._sequences[topic])
+
+    def _drain(self) -> None:
+        for name, ear in self._ears.items():
+            kind = self.rules.topics[name].type
+            while (heard := ear.take()) is not None:
+                try:
+                    message = codec.decode(heard.payload, kind)
+                except codec.CodecError as error:
+                    self.undecodable.append(f"{name}: {error}")
+                    continue
+                self.log[name].append(Heard(self.t, message, heard.sequence, heard.sent))

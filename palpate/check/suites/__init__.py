@@ -1,0 +1,29 @@
+"""The suites: what an implementation of each role has to do, by the contract and by the docs of its messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from palpate.check.report import Report
+from palpate.check.rig import Rig
+from palpate.check.suites import assessment, camera, common, control, perception, planning, robot, supervisor, tissue
+
+SUITES: dict[str, Callable[[Rig, Report], None]] = {
+    "robot": robot.suite,
+    "tissue": tissue.suite,
+    "control": control.suite,
+    "planning": planning.suite,
+    "camera": camera.suite,
+    "perception": perception.suite,
+    "assessment": assessment.suite,
+    "supervisor": supervisor.suite,
+}
+"""The suite of each role."""
+
+
+def check(rig: Rig, report: Report | None = None) -> Report:
+    """Runs the suite of a rig's role, then what holds for every role, and returns the report."""
+    report = report or Report(rig.role.name)
+    SUITES[rig.role.name](rig, report)
+    common.suite(rig, report)
+    return report

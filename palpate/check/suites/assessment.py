@@ -1,0 +1,142 @@
+"""Role assessment: the suite plays an examination of a belly with one stiff area, line by line, to its end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from palpate.check import shapes
+from palpate.check.report import Report
+from palpate.check.rig import Rig
+from palpate_bus.contract import MS
+from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
+from palpate_bus.messages.stamps import header
+from palpate_models.frames import Array, apply
+from palpate_models.load import exam_input
+
+SAMPLES, MAP, FINDINGS = "assessment/samples", "assessment/map", "assessment/findings"
+STIFF_AT = np.array((0.02, -0.015))
+STIFF_RADIUS = 0.022
+CONTRAST = 3.0
+SPEED = 0.03
+LINES = 0.0125
+FORCE_N = 3.0
+"""At the depth of the scan on unremarkable tissue."""
+ANSWER_S = 30.0
+
+
+class Examination:
+    """States of a raster scan of a square about the umbilicus, at 100 Hz; the force follows the local stiffness."""
+
+    def __init__(self, X_WA: Array, depth: float, half: float, start: int) -> None:
+        self._X_WA, self._depth, self._start = X_WA, depth, start
+        line = np.arange(-half, half, SPEED * 0.01)
+        rows = []
+        for i, y in enumerate(np.arange(-half, half + 1e-9, LINES)):
+            rows.append(np.column_stack((line if i % 2 == 0 else line[::-1], np.full(len(line), y))))
+        self.path = np.vstack(rows)
+        self.duration = len(self.path) * 0.01 + 1.0
+
+    def state(self, t: int) -> Any:
+        """The state at `t` [ns]."""
+        i = (t - self._start) // (10 * MS) - 50
+        phase = ExamState.PHASE_INDENT if i < 0 else ExamState.PHASE_SCAN if i < len(self.path) else ExamState.PHASE_ASSESS
+        x, y = self.path[int(np.clip(i, 0, len(self.path) - 1))]
+        scanning = phase == ExamState.PHASE_SCAN
+        p_A = np.array([[x, y, shapes.height(np.array(x), np.array(y))]])
+        n_A = shapes.normals(np.array([x]), np.array([y]))
+        p_W, n_W = apply(self._X_WA, p_A)[0], (n_A @ self._X_WA[:3, :3].T)[0]
+        depth = self._depth if scanning else -0.01
+        force = FORCE_N * self.stiffness(x, y) if scanning else 0.0
+        return ExamState(
+            header(t, "world"), phase, "conformance check", 0, 1, 0, scanning, scanning, False, False, self._depth, depth, force,
+            Point(*map(float, p_W)), Vector3(*map(float, n_W)), -1,
+        )  # fmt: skip
+
+    @staticmethod
+    def stiffness(x: float, y: float) -> float:
+        """Against unremarkable tissue."""
+        r = float(np.hypot(x - STIFF_AT[0], y - STIFF_AT[1]))
+        return 1.0 + (CONTRAST - 1.0) / (1.0 + float(np.exp((r - STIFF_RADIUS) / 0.004)))
+
+
+def suite(rig: Rig, report: Report) -> None:
+    """Silence before contact, samples, the map, findings."""
+    exam = rig.settings.scenario.exam
+    half = min(0.05, exam.region_m[0] / 2, exam.region_m[1] / 2)
+    X_WA = np.array(exam_input(rig.settings.scenario).X_WA)
+    report.section("before contact")
+    vertices, normals, triangles = shapes.mesh(0.12, 0.006)
+    flat = (apply(X_WA, vertices).astype(np.float32).ravel(), (normals @ X_WA[:3, :3].T).astype(np.float32).ravel())
+    rig.send("perception/surface", SurfaceMesh(header(rig.t, "world"), *flat, triangles.astype(np.uint32).ravel()))
+    rig.run(0.2, {})
+    quiet = len(rig.log[SAMPLES]) + len(rig.log[FINDINGS])
+    report.expect("finds nothing before contact", quiet == 0, "no samples, no findings", quiet)
+    play = Examination(X_WA, exam.depth_m, half, rig.t)
+    rig.run(play.duration, {"exam/state": play.state})
+    _samples(rig, half, report)
+    _findings(rig, play, report)
+
+
+def _samples(rig: Rig, half: float, report: Report) -> None:
+    report.section("samples")
+    heard = [item.message for item in rig.log[SAMPLES]]
+    if not report.expect("takes samples", len(heard) > 20, "many", len(heard)):
+        return
+    p = np.array([(m.position.x, m.position.y, m.position.z) for m in heard])
+    off = float(np.max(np.abs(p[:, 2] - shapes.height(p[:, 0], p[:, 1]))))
+    report.expect("on the surface, in the abdomen's frame", off < 0.003, "within 3 mm", f"{off * 1e3:.2f} mm")
+    inside = float(np.max(np.abs(p[:, :2]))) <= half + 0.003
+    report.expect(
+        "where the indenter was", inside, f"within {half * 1e3:.0f} mm of the umbilicus", np.abs(p[:, :2]).max(axis=0).round(3)
+    )
+    force = np.array([m.normal_force for m in heard])
+    ok = bool(np.all((force > 0.5 * FORCE_N) & (force < 1.5 * CONTRAST * FORCE_N)))
+    report.expect(
+        "with the force that was measured",
+        ok,
+        f"{FORCE_N} to {CONTRAST * FORCE_N} N",
+        f"{force.min():.2f} to {force.max():.2f} N",
+    )
+
+
+def _findings(rig: Rig, play: Examination, report: Report) -> None:
+    report.section("findings")
+    waited = 0.0
+    while not rig.log[FINDINGS] and waited < ANSWER_S:
+        rig.run(0.5, {"exam/state": play.state})
+        waited += 0.5
+    final = [item.message for item in rig.log[FINDINGS] if item.message.final]
+    if not report.expect("final findings once", len(final) == 1, 1, len(final)):
+        return
+    found = final[0].findings
+    report.expect("finds the one stiff area", len(found) == 1, "1 finding", len(found))
+    if found:
+        c = found[0].centroid
+        off = float(np.hypot(c.x - STIFF_AT[0], c.y - STIFF_AT[1]))
+        report.expect("where it is", off < 0.012, "within 12 mm", f"{off * 1e3:.1f} mm")
+        ratio = found[0].stiffness_ratio
+        report.expect("stiffer than the rest", 1.5 < ratio < 2 * CONTRAST, f"about {CONTRAST:g} x", f"{ratio:.2f} x")
+        band = found[0].stiffness_ratio_lower <= ratio <= found[0].stiffness_ratio_upper
+        report.expect(
+            "with a band about its ratio",
+            band,
+            "lower <= ratio <= upper",
+            f"{found[0].stiffness_ratio_lower:.2f} to {found[0].stiffness_ratio_upper:.2f}",
+        )
+    last = rig.last(MAP)
+    if report.expect("a map comes with them", last is not None, "assessment/map", "there" if last is not None else "none"):
+        n = len(last.vertices) // 3
+        sizes = {
+            n,
+            len(last.stiffness),
+            len(last.stiffness_lower),
+            len(last.stiffness_upper),
+            len(last.force),
+            len(last.scanned),
+            len(last.finding),
+        }
+        report.expect("one value a vertex", sizes == {n}, n, sorted(sizes))
+        ordered = bool(np.all(last.stiffness_lower <= last.stiffness)) and bool(np.all(last.stiffness <= last.stiffness_upper))
+        report.expect("bands hold their value", ordered, "lower <= stiffness <= upper", "so" if ordered else "not so")

@@ -1,0 +1,144 @@
+"""Role camera: frames on request, with intrinsics; where it renders `sim/surface`, the geometry is checked on a plane."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate.check.report import Report
+from palpate.check.rig import Heard, Rig, Source
+from palpate_bus.contract import MS
+from palpate_bus.messages import CameraTrigger, SurfaceMesh
+from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_models.frames import Array
+
+IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
+FRAME = "camera_depth_optical_frame"
+FRAMES = 5
+HALF = 0.15
+"""Half the side of the plane [m]."""
+TOLERANCE_M = 0.01
+
+
+def pose_of(message: Any) -> Array | None:
+    """X_WC of the optical frame in a tf_static, shape (4, 4)."""
+    for item in message.transforms:
+        if item.child_frame_id == FRAME and item.header.frame_id == "world":
+            p, q = item.transform.translation, item.transform.rotation
+            X = np.eye(4)
+            X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            X[:3, 3] = p.x, p.y, p.z
+            return X
+    return None
+
+
+def depths(message: Any) -> Array:
+    """Depth [m], shape (height, width); NaN where invalid."""
+    rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8).reshape(message.height, message.step)
+    return rows[:, : 4 * message.width].copy().view("<f4").astype(float)
+
+
+def plane(centre: Array) -> Source:
+    """A level square about `centre`, in world."""
+    grid = np.linspace(-HALF, HALF, 31)
+    x, y = np.meshgrid(grid, grid)
+    vertices = np.column_stack((x.ravel() + centre[0], y.ravel() + centre[1], np.full(x.size, centre[2])))
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    triangles = np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d)))).astype(np.uint32)
+    flat, up = vertices.astype(np.float32).ravel(), np.tile((0.0, 0.0, 1.0), x.size).astype(np.float32)
+    return lambda t: SurfaceMesh(header(t, "world"), flat, up, triangles.ravel())
+
+
+def suite(rig: Rig, report: Report) -> None:
+    """Pose, bursts, format, geometry."""
+    report.section("pose")
+    centre = np.array(rig.settings.scenario.camera.look_at_m)
+    feed = {"sim/surface": plane(centre)}
+    silent = rig.run(0.5, feed)
+    calibrated = rig.last("tf_static")
+    X_WC = None if calibrated is None else pose_of(calibrated)
+    report.expect(
+        "tf_static has the optical frame in world",
+        X_WC is not None,
+        f"world -> {FRAME}",
+        "none" if X_WC is None else X_WC[:3, 3].round(3),
+    )
+    report.section("bursts")
+    report.expect("takes no frame unasked", not silent[IMAGE], "none", len(silent[IMAGE]))
+    burst = _burst(rig, feed)
+    images, infos = burst[IMAGE], burst[INFO]
+    report.expect("takes as many frames as asked", len(images) == FRAMES, FRAMES, len(images))
+    same = [i.message.header.stamp for i in images] == [i.message.header.stamp for i in infos]
+    report.expect("intrinsics with every image, of the same stamp", same, f"{len(images)} pairs", f"{len(infos)} camera_info")
+    period = rig.rules.topics[IMAGE].period
+    gaps = [nanoseconds(b.message.header.stamp) - nanoseconds(a.message.header.stamp) for a, b in pairwise(images)]
+    report.expect(
+        "at its rate",
+        all(abs(gap - period) <= rig.slack for gap in gaps),
+        f"{period / MS:.0f} ms apart",
+        [gap / MS for gap in gaps],
+    )
+    again = _burst(rig, feed)[IMAGE]
+    report.expect("a second burst too", len(again) == FRAMES, FRAMES, len(again))
+    if not images or not infos:
+        return
+    report.section("images")
+    depth = _format(images[-1], infos[-1], report)
+    if depth is not None and X_WC is not None:
+        _geometry(depth, infos[-1].message, X_WC, centre, rig, report)
+
+
+def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[Heard]]:
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
+    return rig.run(0.1 * FRAMES + 0.5 + rig.slack / 1e9, feed)
+
+
+def _format(image: Heard, info: Heard, report: Report) -> Array | None:
+    m, k = image.message, np.asarray(info.message.k, np.float64).reshape(3, 3)
+    report.expect("encoding", m.encoding == "32FC1" and not m.is_bigendian, "32FC1 [m], little-endian", f"{m.encoding}")
+    fits = m.step >= 4 * m.width and len(m.data) == m.step * m.height
+    report.expect("data fits the size", fits, "height x step bytes", f"{len(m.data)} bytes for {m.height} x {m.step}")
+    size = (info.message.height, info.message.width)
+    report.expect("camera_info is of that size", size == (m.height, m.width), (m.height, m.width), size)
+    good = k[0, 0] > 0 and k[1, 1] > 0 and 0 < k[0, 2] < m.width and 0 < k[1, 2] < m.height and k[2, 2] == 1
+    report.expect(
+        "intrinsics make sense", bool(good), "positive focal lengths, principal point in the image", k.round(1).tolist()
+    )
+    if m.encoding != "32FC1" or not fits:
+        return None
+    depth = depths(m)
+    valid = depth[np.isfinite(depth)]
+    ok = valid.size > 0 and bool(np.all((valid > 0) & (valid < 20)))
+    report.expect(
+        "depth is in metres, NaN where invalid",
+        ok,
+        "0 to 20 m",
+        f"{valid.size} valid, {valid.min():.3g} to {valid.max():.3g}" if valid.size else "none",
+    )
+    return depth
+
+
+def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, report: Report) -> None:
+    """Pixels that look at the plane show it where it is."""
+    if not rig.settings.motion:
+        report.skip("geometry", "a real camera does not see sim/surface; look at a board of known pose")
+        return
+    k = np.asarray(info.k, np.float64).reshape(3, 3)
+    v, u = np.indices(depth.shape)
+    rays = np.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones(depth.shape)), axis=-1) @ X_WC[:3, :3].T
+    expected = (centre[2] - X_WC[2, 3]) / rays[..., 2]
+    hit = X_WC[:3, 3] + rays * expected[..., None]
+    on = (np.abs(hit[..., 0] - centre[0]) < 0.8 * HALF) & (np.abs(hit[..., 1] - centre[1]) < 0.8 * HALF) & (expected > 0)
+    error = (depth - expected)[on & np.isfinite(depth)]
+    seen = error.size / max(int(on.sum()), 1)
+    bias = float(np.median(error)) if error.size else np.inf
+    report.expect(
+        "a level plane is where it is",
+        seen > 0.5 and abs(bias) < TOLERANCE_M,
+        f"within {TOLERANCE_M * 1e3:.0f} mm on most of its pixels",
+        f"median {bias * 1e3:.2f} mm off on {100 * seen:.0f} % of them",
+    )

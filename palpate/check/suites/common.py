@@ -1,0 +1,97 @@
+"""What every implementation owes, by the contract alone: judged over all that it sent during its suite."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from palpate.check.report import Report
+from palpate.check.rig import Heard, Rig
+from palpate_bus.contract import MS, Topic
+from palpate_bus.contract.checker import Checker
+
+RATE_TOLERANCE = 0.2
+"""Of a live implementation, over the whole check."""
+STAMP_TOLERANCE_MS = 100.0
+"""Beyond the slack."""
+LOST = 0.05
+"""Part of a live implementation's messages that may be lost on the way to this check."""
+
+
+def suite(rig: Rig, report: Report) -> None:
+    """Topics, rates, stamps and values."""
+    report.section("contract")
+    for topic in rig.rules.outputs(rig.role.name):
+        heard = rig.log[topic.name]
+        if not heard:
+            if topic.event:
+                report.skip(f"{topic.name}", "an event topic that had no reason to speak")
+            else:
+                report.expect(
+                    f"{topic.name} is sent", False, "once" if topic.latched else f"every {topic.period_ms} ms", "nothing"
+                )
+            continue
+        _values(topic, heard, report)
+        if topic.periodic:
+            _rate(rig, topic, heard, report)
+            _stamps(rig, topic, heard, report)
+        _sequence(rig, topic, heard, report)
+    if rig.live:
+        report.expect(
+            "every message can be decoded", not rig.undecodable, "valid CDR", "; ".join(rig.undecodable[:3]) or "all valid"
+        )
+
+
+def _values(topic: Topic, heard: list[Heard], report: Report) -> None:
+    checker = Checker(topic)
+    faults = [fault for item in heard for fault in checker(item.message)]
+    wanted = "frame, ranges and finite numbers as in its row"
+    got = f"{len(heard)} messages, all so"
+    if faults:
+        first = faults[0]
+        got = f"{len(faults)} faults, first: {first.field} is {first.got}, allowed {first.expected}"
+    report.expect(f"{topic.name}: values", not faults, wanted, got)
+
+
+def _rate(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
+    """In-process every tick has its message; live the mean rate is right, by the sender's own clock."""
+    wanted = f"{1000 / topic.period_ms:g} Hz"
+    if not rig.live:
+        times = [item.t for item in heard]
+        due = list(range(0, rig.t, topic.period))
+        report.expect(f"{topic.name}: rate", times == due, f"{len(due)} messages, one on each tick", f"{len(times)}")
+        return
+    seconds = (heard[-1].sent - heard[0].sent) / 1e9
+    rate = (len(heard) - 1) / seconds if seconds > 0 else 0.0
+    off = abs(rate * topic.period_ms / 1000 - 1)
+    longest = max((b.sent - a.sent for a, b in pairwise(heard)), default=0) / MS
+    report.expect(f"{topic.name}: rate", off < RATE_TOLERANCE, wanted, f"{rate:.4g} Hz, longest pause {longest:.0f} ms")
+
+
+def _stamps(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
+    checker = Checker(topic)
+    stamps = [(item.t, stamp) for item in heard if (stamp := checker.stamp(item.message)) is not None]
+    if not stamps:
+        return
+    back = [(a, b) for (_, a), (_, b) in pairwise(stamps) if b < a]
+    report.expect(
+        f"{topic.name}: stamps rise", not back, "never backwards", f"{back[0][1]} after {back[0][0]} ns" if back else "so"
+    )
+    if rig.live:
+        off = np.median([(t - stamp) / MS for t, stamp in stamps])
+        ok = bool(abs(off) < STAMP_TOLERANCE_MS + rig.settings.slack_ms)
+        report.expect(
+            f"{topic.name}: stamps", ok, "time since the common start [ns]", f"median {off:.1f} ms behind this check's clock"
+        )
+    else:
+        wrong = [(t, stamp) for t, stamp in stamps if t != stamp]
+        report.expect(f"{topic.name}: stamps", not wrong, "the tick", f"{wrong[0][1]} at {wrong[0][0]} ns" if wrong else "so")
+
+
+def _sequence(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
+    steps = np.diff([item.sequence for item in heard])
+    jumps = int(np.sum(steps != 1))
+    ok = bool(np.all(steps > 0)) and jumps <= (LOST * len(steps) if rig.live else 0)
+    got = f"{jumps} jumps among {len(heard)}" if jumps else "without a gap"
+    report.expect(f"{topic.name}: sequence", ok, "numbered 1, 2, 3, ... in the attachment", got)

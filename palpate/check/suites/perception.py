@@ -1,0 +1,132 @@
+"""Role perception: the suite shows it depth frames of a belly of known shape, and then none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate.check import shapes
+from palpate.check.report import Report
+from palpate.check.rig import Feed, Rig
+from palpate.check.suites.camera import FRAME
+from palpate_bus.messages import (
+    CameraInfo,
+    CameraTrigger,
+    Image,
+    Quaternion,
+    RegionOfInterest,
+    TFMessage,
+    Transform,
+    TransformStamped,
+    Vector3,
+)
+from palpate_bus.messages.stamps import header
+from palpate_models.frames import Array, apply, inverse, look_at
+from palpate_models.load import exam_input
+
+IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
+SURFACE, TARGETS = "perception/surface", "perception/targets"
+FRAMES = 4
+SIZE = (480, 640)
+FOCAL = 525.0
+FLOOR_M = -0.12
+ANSWER_S = 10.0
+
+
+def suite(rig: Rig, report: Report) -> None:
+    """Silence unasked, the surface of a known belly, an answer when nothing came."""
+    known = exam_input(rig.settings.scenario)
+    X_WA = np.array(known.X_WA)
+    camera = rig.settings.scenario.camera
+    X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
+    K = np.array([[FOCAL, 0.0, SIZE[1] / 2], [0.0, FOCAL, SIZE[0] / 2], [0.0, 0.0, 1.0]])
+    depth = shapes.depth_image(K, inverse(X_WA) @ X_WC, SIZE, FLOOR_M)
+    report.section("bursts")
+    rig.send("tf_static", _tf(X_WC))
+    feed = _frames(depth, K)
+    unasked = rig.run(0.5, feed)
+    report.expect("says nothing unasked", not unasked[TARGETS], "no targets before a trigger", len(unasked[TARGETS]))
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
+    answered = _answer(rig, feed)
+    if not report.expect(
+        "answers a burst", answered, f"perception/targets within {ANSWER_S:.0f} s", "so" if answered else "nothing"
+    ):
+        return
+    report.section("surface")
+    _surface(rig, X_WA, report)
+    _targets(rig, X_WA, report)
+    report.section("silence")
+    before = len(rig.log[TARGETS])
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
+    rig.run(0.1 * FRAMES + 2.0 + rig.slack / 1e9, {})
+    late = rig.log[TARGETS][before:]
+    ok = bool(late) and not len(late[-1].message.positions) and bool(late[-1].message.message)
+    got = "no answer" if not late else f"{len(late[-1].message.positions)} targets: {late[-1].message.message}"
+    report.expect("without frames it answers with no targets, and says why", ok, "an empty list with a message", got)
+
+
+def _answer(rig: Rig, feed: Feed) -> bool:
+    waited = 0.0
+    while not rig.log[TARGETS] and waited < ANSWER_S:
+        rig.run(0.5, feed)
+        waited += 0.5
+    return bool(rig.log[TARGETS])
+
+
+def _tf(X_WC: Array) -> Any:
+    x, y, z, w = map(float, Rotation.from_matrix(X_WC[:3, :3]).as_quat())
+    pose = Transform(Vector3(*map(float, X_WC[:3, 3])), Quaternion(x, y, z, w))
+    return TFMessage([TransformStamped(header(0, "world"), FRAME, pose)])
+
+
+def _frames(depth: Array, K: Array) -> Feed:
+    data = np.ascontiguousarray(depth, "<f4").view(np.uint8).reshape(-1)
+    P = np.hstack((K, np.zeros((3, 1)))).ravel()
+    whole = RegionOfInterest(0, 0, 0, 0, False)
+    height, width = depth.shape
+    return {
+        INFO: lambda t: CameraInfo(
+            header(t, FRAME), height, width, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole
+        ),
+        IMAGE: lambda t: Image(header(t, FRAME), height, width, "32FC1", 0, 4 * width, data),
+    }
+
+
+def _surface(rig: Rig, X_WA: Array, report: Report) -> None:
+    message = rig.last(SURFACE)
+    if not report.expect(
+        "perceives a surface", message is not None, "perception/surface", "there" if message is not None else "none"
+    ):
+        return
+    p_A = apply(inverse(X_WA), np.asarray(message.vertices, np.float64).reshape(-1, 3))
+    n_W = np.asarray(message.normals, np.float64).reshape(-1, 3)
+    error = np.abs(p_A[:, 2] - shapes.height(p_A[:, 0], p_A[:, 1]))
+    near = np.hypot(p_A[:, 0], p_A[:, 1]) < 0.8 * shapes.REACH
+    worst = float(np.quantile(error[near], 0.95)) if near.any() else np.inf
+    report.expect("where it is", worst < 0.003, "95 % within 3 mm", f"{worst * 1e3:.2f} mm")
+    n_A = n_W @ X_WA[:3, :3]
+    angle = np.degrees(np.arccos(np.clip(np.sum(n_A * shapes.normals(p_A[:, 0], p_A[:, 1]), axis=1), -1, 1)))
+    tilt = float(np.quantile(angle[near], 0.95)) if near.any() else np.inf
+    report.expect("with outward normals", tilt < 10, "95 % within 10 degrees", f"{tilt:.1f} degrees")
+    inside = int(np.max(message.triangles, initial=0)) < len(p_A)
+    report.expect("triangles index its vertices", inside, "indices below the number of vertices", "so" if inside else "not so")
+
+
+def _targets(rig: Rig, X_WA: Array, report: Report) -> None:
+    message = rig.last(TARGETS)
+    p_W = np.array([(p.x, p.y, p.z) for p in message.positions]).reshape(-1, 3)
+    sizes = {len(p_W), len(message.normals), len(message.lines)}
+    report.expect("targets, each with normal and line", len(sizes) == 1 and len(p_W) > 0, "some, of equal number", sorted(sizes))
+    report.expect("fused what it was sent", message.frames_fused == FRAMES, FRAMES, message.frames_fused)
+    if not len(p_W):
+        return
+    exam = rig.settings.scenario.exam
+    p_A = apply(inverse(X_WA), p_W)
+    off = np.abs(p_A[:, :2] - np.array(exam.centre_m)) - np.array(exam.region_m) / 2
+    report.expect(
+        "within the region of interest", float(off.max()) < 0.01, "inside, to 10 mm", f"{off.max() * 1e3:.1f} mm beyond"
+    )
+    height = float(np.max(np.abs(p_A[:, 2] - shapes.height(p_A[:, 0], p_A[:, 1]))))
+    report.expect("on the surface", height < 0.005, "within 5 mm", f"{height * 1e3:.2f} mm")

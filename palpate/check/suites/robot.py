@@ -1,0 +1,332 @@
+"""Role robot: a driver or plant of the arm, with its F/T sensor. The order matters: what latches is released again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate.check.report import Report
+from palpate.check.rig import Feed, Heard, Rig, Source
+from palpate_bus.contract import MS
+from palpate_bus.messages import (
+    JointTorqueCommand,
+    OperatorRequest,
+    RobotStatus,
+    SupervisorState,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+)
+from palpate_bus.messages.stamps import duration_message, header
+from palpate_models import lbr
+
+COMMAND = "control/joint_torque"
+PUSH = np.array([6.0, 6.0, 4.0, 4.0, 1.0, 0.6, 0.4])
+"""Torque that moves a joint a little in `PUSH_S` [N m]: above the friction of the simulated arm."""
+PUSH_S = 0.06
+MOVED_RAD = 2e-4
+DRIFT_RAD = 0.05
+PRESS_N = 10.0
+
+
+def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
+    """No contact, no command; a supervisor who is content, or not."""
+    zero = Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+    cause = SupervisorState.CAUSE_NONE if level == SupervisorState.LEVEL_OK else SupervisorState.CAUSE_FORCE
+
+    def supervisor(t: int) -> Any:
+        reason = "conformance check" if cause else ""
+        return SupervisorState(header(t), level, cause, reason, rig.memory.get("releases", 0), 0.0, -1.0, 0.0, 0)
+
+    return {"sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), zero), "supervisor/state": supervisor}
+
+
+def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> Feed:
+    """The same with a torque command [N m], shape (7,), on every tick."""
+    values = np.asarray(torque, dtype=float)
+    valid_ns = (rig.rules.topics[COMMAND].expiry_ms or 0) * MS
+    return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns), "")}
+
+
+def suite(rig: Rig, report: Report) -> None:
+    """Signs, gravity, holds, latches, limits."""
+    report.section("joints")
+    rest = rig.run(0.5, quiet(rig))
+    _joints(rest["joint_states"], report)
+    report.expect("starts idle, without a command", _mode(rig) == RobotStatus.MODE_IDLE, "MODE_IDLE", _mode_name(rig))
+    _description(rig, report)
+    if not rig.settings.motion:
+        report.section("commands")
+        report.skip("signs, expiry, limits, holds", "they move the arm; allow it with --motion")
+        return
+    report.section("commands")
+    _gravity(rig, report)
+    _signs(rig, report)
+    report.section("safe hold")
+    _expiry(rig, report)
+    _invalid(rig, report)
+    _stop(rig, report)
+    _emergency(rig, report)
+    report.section("sensor")
+    _force(rig, report)
+    _twist(rig, report)
+    report.section("safe hold")
+    _lost(rig, report)
+    _limits(rig, report)
+
+
+def _mode(rig: Rig) -> int:
+    status = rig.last("robot/status")
+    return -1 if status is None else int(status.mode)
+
+
+def _mode_name(rig: Rig) -> str:
+    status = rig.last("robot/status")
+    names = {0: "MODE_IDLE", 1: "MODE_ACTIVE", 2: "MODE_SAFE_HOLD"}
+    return (
+        "no robot/status"
+        if status is None
+        else f"{names.get(int(status.mode), status.mode)}, cause {status.cause}: {status.reason}"
+    )
+
+
+def _joints(heard: list[Heard], report: Report) -> None:
+    if not report.expect("joint_states come", len(heard) > 0, "messages", f"{len(heard)}"):
+        return
+    last = heard[-1].message
+    names = list(last.name)
+    report.expect("joint names, in order", names == list(lbr.JOINT_NAMES), ", ".join(lbr.JOINT_NAMES), ", ".join(names))
+    shapes = [np.shape(values) for values in (last.position, last.velocity, last.effort)]
+    report.expect("seven positions, velocities and efforts", shapes == [(7,)] * 3, "3 x (7,)", shapes)
+    q = np.array([item.message.position for item in heard if np.shape(item.message.position) == (7,)])
+    inside = bool(np.all(np.abs(q) <= lbr.POSITION_LIMIT))
+    report.expect(
+        "joints within their limits", inside, f"+-{np.rad2deg(lbr.POSITION_LIMIT).round()} deg", np.rad2deg(q[-1]).round(1)
+    )
+    drift = float(np.max(np.abs(q[-1] - q[0])))
+    report.expect(
+        "holds still when nobody commands", drift < DRIFT_RAD, f"drift below {DRIFT_RAD} rad in 0.5 s", f"{drift:.4f} rad"
+    )
+
+
+def _description(rig: Rig, report: Report) -> None:
+    described = rig.last("robot_description")
+    text = "" if described is None else str(described.data)
+    missing = [name for name in (*lbr.JOINT_NAMES, "indenter") if f'name="{name}"' not in text]
+    report.expect(
+        "robot_description is a URDF of the arm and tool",
+        "<robot" in text and not missing,
+        "all joints, link indenter",
+        "so" if not missing else f"without {', '.join(missing)}",
+    )
+
+
+def _gravity(rig: Rig, report: Report) -> None:
+    """Commands exclude gravity: with zero torque a compensated arm stays where it is."""
+    moved = rig.run(0.4, commanding(rig, np.zeros(7)))["joint_states"]
+    report.expect("obeys commands", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
+    drift = float(np.max(np.abs(moved[-1].message.position - moved[0].message.position))) if moved else np.inf
+    report.expect(
+        "zero torque floats: commands exclude gravity",
+        drift < DRIFT_RAD,
+        f"drift below {DRIFT_RAD} rad in 0.4 s",
+        f"{drift:.4f} rad",
+    )
+
+
+def _signs(rig: Rig, report: Report) -> None:
+    """A positive torque accelerates its joint to the positive side, and is reported as applied with that sign."""
+    wrong, unsaid = [], []
+    settle(rig)
+    for joint in range(7):
+        release(rig)
+        torque = np.zeros(7)
+        torque[joint] = PUSH[joint]
+        heard = rig.run(PUSH_S, commanding(rig, torque))["joint_states"]
+        settle(rig)
+        q = np.array([item.message.position[joint] for item in heard])
+        if len(q) < 10 or q[-5:].mean() - q[:5].mean() < MOVED_RAD:
+            wrong.append(lbr.JOINT_NAMES[joint])
+        if not any(abs(item.message.effort[joint] - torque[joint]) < 0.2 * torque[joint] for item in heard):
+            unsaid.append(lbr.JOINT_NAMES[joint])
+    report.expect(
+        "a positive torque moves its joint positively",
+        not wrong,
+        "all seven",
+        f"not {', '.join(wrong)}" if wrong else "all seven",
+    )
+    report.expect(
+        "effort reports the applied torque",
+        not unsaid,
+        "within 20 % of the command",
+        f"not {', '.join(unsaid)}" if unsaid else "all seven",
+    )
+
+
+def settle(rig: Rig) -> None:
+    """Lets the driver hold until the arm rests."""
+    rig.run(0.4, quiet(rig))
+
+
+def release(rig: Rig) -> None:
+    """A release, as the supervisor grants it."""
+    rig.run(0.02, quiet(rig))
+    rig.memory["releases"] = rig.memory.get("releases", 0) + 1
+    rig.run(0.05 + rig.slack / 1e9, quiet(rig))
+
+
+def _activate(rig: Rig) -> None:
+    release(rig)
+    rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))
+
+
+def _holds(rig: Rig, heard: list[Heard]) -> Heard | None:
+    return next((item for item in heard if item.message.mode == RobotStatus.MODE_SAFE_HOLD), None)
+
+
+def _expiry(rig: Rig, report: Report) -> None:
+    _activate(rig)
+    report.expect("a release and a command make it active", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
+    ended = rig.t
+    heard = rig.run(0.5 + rig.slack / 1e9, quiet(rig))["robot/status"]
+    hold = _holds(rig, heard)
+    expiry = rig.rules.topics[COMMAND].expiry_ms or 0
+    limit = (expiry + rig.rules.topics["robot/status"].period_ms + 2) * MS + rig.slack
+    late = None if hold is None else hold.t - ended
+    report.expect(
+        "holds safely when commands cease",
+        late is not None and late <= limit,
+        f"MODE_SAFE_HOLD within {limit / MS:.0f} ms",
+        "no hold" if late is None else f"after {late / MS:.0f} ms",
+    )
+    cause = -1 if hold is None else int(hold.message.cause)
+    causes = (RobotStatus.CAUSE_COMMAND_EXPIRED, RobotStatus.CAUSE_COMMANDER_LOST)
+    report.expect(
+        "and says why",
+        cause in causes and bool(hold and hold.message.reason),
+        "CAUSE_COMMAND_EXPIRED with a reason",
+        _mode_name(rig),
+    )
+    v = np.abs(rig.last("joint_states").velocity).max()
+    report.expect("and comes to rest", v < 0.1, "below 0.1 rad/s", f"{v:.3f} rad/s")
+    rig.run(0.3, commanding(rig, np.zeros(7)))
+    latched = _mode(rig) == RobotStatus.MODE_SAFE_HOLD
+    report.expect("the hold is latched: new commands do not end it", latched, "MODE_SAFE_HOLD", _mode_name(rig))
+
+
+def _provoke(rig: Rig, report: Report, what: str, torque: Any, cause: int) -> None:
+    _activate(rig)
+    heard = rig.run(0.1, commanding(rig, torque))["robot/status"]
+    heard += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
+    hold = _holds(rig, heard)
+    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    report.expect(
+        f"{what} makes it hold", hold is not None and hold.message.cause == cause, f"MODE_SAFE_HOLD, cause {cause}", got
+    )
+
+
+def _invalid(rig: Rig, report: Report) -> None:
+    bad = np.zeros(7)
+    bad[3] = np.nan
+    _provoke(rig, report, "a torque that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
+    huge = np.zeros(7)
+    huge[0] = 10 * lbr.TORQUE_LIMIT[0]
+    _provoke(rig, report, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
+
+
+def _stop(rig: Rig, report: Report) -> None:
+    _activate(rig)
+    rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
+    heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))["robot/status"]
+    hold = _holds(rig, heard)
+    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    ok = hold is not None and hold.message.cause == RobotStatus.CAUSE_STOP_REQUESTED
+    report.expect("an operator's stop makes it hold", ok, "MODE_SAFE_HOLD, CAUSE_STOP_REQUESTED", got)
+
+
+def _emergency(rig: Rig, report: Report) -> None:
+    _activate(rig)
+    heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
+    hold = _holds(rig, heard)
+    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    report.expect("the supervisor's emergency stop makes it hold", hold is not None, "MODE_SAFE_HOLD", got)
+
+
+def _pressing(rig: Rig, force_W: Any) -> Feed:
+    wrench = Wrench(Vector3(*map(float, force_W)), Vector3(0.0, 0.0, 0.0))
+    return {**quiet(rig), "sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), wrench)}
+
+
+def _force(rig: Rig, report: Report) -> None:
+    """`ft/wrench` is what tool and environment exert on the sensor, in its axes: a push on the tool shows with its sign."""
+    if not rig.log["sim/tool_state"]:
+        report.skip("the F/T sensor's sign", "no sim/tool_state: no simulated arm; press the tool by hand and look at ft/wrench")
+        return
+    _activate(rig)
+    rig.run(0.4, quiet(rig))
+    before = _mean_force(rig.run(0.1, quiet(rig))["ft/wrench"])
+    force_W = np.array([0.0, 0.0, PRESS_N])
+    pressed = _mean_force(rig.run(0.1, _pressing(rig, force_W))["ft/wrench"])
+    o = rig.last("sim/tool_state").pose.orientation
+    expected = Rotation.from_quat((o.x, o.y, o.z, o.w)).inv().apply(force_W)
+    got = pressed - before
+    rig.run(0.3, quiet(rig))
+    ok = bool(np.linalg.norm(got - expected) < 0.3 * PRESS_N)
+    report.expect(
+        "ft/wrench shows a push of 10 N with its sign", ok, f"{expected.round(1)} N in the sensor's axes", f"{got.round(1)} N"
+    )
+
+
+def _mean_force(heard: list[Heard]) -> np.ndarray[Any, Any]:
+    forces = [item.message.wrench.force for item in heard]
+    return np.mean([(f.x, f.y, f.z) for f in forces], axis=0) if forces else np.full(3, np.nan)
+
+
+def _twist(rig: Rig, report: Report) -> None:
+    """The twist is the pose's rate of change, over all of the check."""
+    states = [item.message for item in rig.log["sim/tool_state"]]
+    if not states:
+        report.skip("sim/tool_state: twist", "not simulated")
+        return
+    t = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in states])
+    p = np.array([(m.pose.position.x, m.pose.position.y, m.pose.position.z) for m in states])
+    v = np.array([(m.twist.linear.x, m.twist.linear.y, m.twist.linear.z) for m in states])
+    dt = t[2:] - t[:-2]
+    steady = (dt > 0) & (dt < 0.0025)  # neighbours on the grid; pauses of a live check are left out
+    error = np.linalg.norm((p[2:] - p[:-2])[steady] / dt[steady, None] - v[1:-1][steady], axis=1)
+    worst, speed = float(np.quantile(error, 0.99)), float(np.max(np.linalg.norm(v, axis=1)))
+    report.expect(
+        "sim/tool_state: twist is the rate of the pose",
+        worst < 0.02 + 0.05 * speed,
+        f"within {0.02 + 0.05 * speed:.3f} m/s",
+        f"{worst:.4f} m/s",
+    )
+
+
+def _lost(rig: Rig, report: Report) -> None:
+    _activate(rig)
+    rig.lose("control")
+    heard = rig.run(0.1 + rig.slack / 1e9, quiet(rig))["robot/status"]
+    hold = _holds(rig, heard)
+    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    causes = (RobotStatus.CAUSE_COMMANDER_LOST, RobotStatus.CAUSE_COMMAND_EXPIRED)
+    report.expect("the loss of control makes it hold", hold is not None and hold.message.cause in causes, "MODE_SAFE_HOLD", got)
+
+
+def _limits(rig: Rig, report: Report) -> None:
+    """Over all that was asked for in this check."""
+    efforts = [item.message.effort for item in rig.log["joint_states"] if np.shape(item.message.effort) == (7,)]
+    worst = np.max(np.abs(efforts), axis=0)
+    report.expect(
+        "applied torques never leave their limits",
+        bool(np.all(worst <= lbr.TORQUE_LIMIT)),
+        f"{lbr.TORQUE_LIMIT} N m",
+        worst.round(1),
+    )
+    speeds = np.max(np.abs([item.message.velocity for item in rig.log["joint_states"]]), axis=0)
+    margin = lbr.VELOCITY_LIMIT * 1.05
+    report.expect(
+        "joint speeds never leave their limits", bool(np.all(speeds <= margin)), f"{margin.round(2)} rad/s", speeds.round(2)
+    )

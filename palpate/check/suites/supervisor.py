@@ -1,0 +1,226 @@
+"""Role supervisor: the suite plays arm and planning, breaks one limit after another, and wants to be stopped for each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from palpate.check.report import Report
+from palpate.check.rig import Feed, Heard, Rig
+from palpate_bus.contract import MS
+from palpate_bus.messages import ExamState, OperatorRequest, Point, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
+from palpate_bus.messages.stamps import header
+from palpate_models import lbr
+from palpate_models.frames import Array, apply, inverse
+from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
+from palpate_models.load import exam_input
+
+STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
+GRAVITY = 9.81
+FORCE_ERROR_N = 3.0
+"""Force is untared: the sensor's bias is in it."""
+REACT_MS = 150
+"""Within this an emergency has to be seen."""
+SOFT_MS = 400
+"""A soft stop may wait until planning has reacted by itself."""
+SILENT_S = 0.6
+RISE_NPS = 10.0
+STEP_S = 0.02
+OUTSIDE = ((0.0,) * 7, (2.9, *lbr.HOME[1:]), (0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0), (1.57, 1.57, 0.0, 0.0, 0.0, 0.0, 0.0))
+"""Postures [rad] of which one is likely to be outside of the workspace."""
+STOPPED = (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.LEVEL_EMERGENCY)
+EMERGENCY = (SupervisorState.LEVEL_EMERGENCY,)
+
+
+class Arm:
+    """An arm that stands still in the ready posture, free of everything, until something is changed."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self.robot = exam_input(rig.settings.scenario).robot
+        self.calm()
+
+    def calm(self) -> None:
+        """Back to rest."""
+        self.q, self.qd = lbr.HOME.copy(), np.zeros(7)
+        self.push_N = 0.0
+        """Upward force on the tool [N]."""
+        self.mode, self.reason = RobotStatus.MODE_ACTIVE, ""
+
+    def feed(self, *without: str) -> Feed:
+        """What the supervisor hears all the time, without some of it."""
+        return {name: source for name, source in ((STATUS, self._status), (EXAM, self._exam)) if name not in without}
+
+    def _status(self, t: int) -> Any:
+        R_WS = tool_pose(np.nan_to_num(self.q), self.robot)[:3, :3]
+        force = R_WS.T @ np.array((0.0, 0.0, self.push_N - self.robot.tool_mass_kg * GRAVITY))
+        wrench = Wrench(Vector3(*force.tolist()), Vector3(0.0, 0.0, 0.0))
+        cause = RobotStatus.CAUSE_COMMAND_EXPIRED if self.reason else RobotStatus.CAUSE_NONE
+        return RobotStatus(header(t), self.mode, cause, self.reason, self.q, self.qd, wrench, np.zeros(7), 0)
+
+    def _exam(self, t: int) -> Any:
+        return ExamState(
+            header(t, "world"), ExamState.PHASE_SCAN, "conformance check", 0, 1, 0, False, False, False, False, 0.0, 0.0, 0.0,
+            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1,
+        )  # fmt: skip
+
+    def surface(self, t: int, depth: float) -> Any:
+        """A level patch below which the sphere is `depth` [m]."""
+        centre = tool_pose(self.q, self.robot)[:3, 3]
+        axis = np.linspace(-0.1, 0.1, 21)
+        x, y = (part.ravel() for part in np.meshgrid(axis, axis))
+        z = np.full_like(x, depth - self.robot.indenter_radius_m)
+        vertices = (centre + np.column_stack((x, y, z))).astype(np.float32)
+        normals = np.tile(np.array((0.0, 0.0, 1.0), np.float32), (len(x), 1))
+        index = np.arange(x.size, dtype=np.uint32).reshape(21, 21)
+        a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+        triangles = np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d))))
+        return SurfaceMesh(header(t, "world"), vertices.ravel(), normals.ravel(), triangles.ravel())
+
+
+def suite(rig: Rig, report: Report) -> None:
+    """Measures, limits one by one, the latch, an operator, silence, loss."""
+    arm = Arm(rig)
+    limits = exam_input(rig.settings.scenario).limits
+    report.section("rest")
+    rest = rig.run(2.0, arm.feed())[STATE]
+    if not report.expect("supervisor/state comes", bool(rest), "100 Hz", len(rest)):
+        return
+    report.expect("an arm at rest is not stopped", _level(rest) == SupervisorState.LEVEL_OK, "LEVEL_OK", _words(rest))
+    _measures(rig, arm, report)
+
+    report.section("limits")
+    _press(rig, arm, limits.force_soft_stop_n - 1.0)
+    arm.push_N = limits.force_soft_stop_n + 1.0
+    _stops(rig, arm, report, "a force over the soft-stop limit", STOPPED, SupervisorState.CAUSE_FORCE, SOFT_MS)
+    heard = rig.run(1.0, arm.feed())[STATE]
+    report.expect(
+        "a soft stop that does not help becomes an emergency stop", _level(heard) in EMERGENCY, "level 2", _words(heard)
+    )
+    _refuses(rig, arm, report)
+    _released(rig, arm, report, "and is released")
+    arm.push_N = limits.force_emergency_n + 10.0
+    _stops(rig, arm, report, "a force over the emergency limit", EMERGENCY, SupervisorState.CAUSE_FORCE, REACT_MS)
+    _released(rig, arm, report, "and is released after it")
+    heard = _press(rig, arm, limits.force_working_n)
+    report.expect("a steady force below the limits is not stopped", _level(heard) == SupervisorState.LEVEL_OK, "0", _words(heard))
+    rig.send(SURFACE, arm.surface(rig.t, limits.depth_m + 0.015))
+    _stops(rig, arm, report, "too deep, pressed", STOPPED, SupervisorState.CAUSE_DEPTH, SOFT_MS)
+    rig.send(SURFACE, arm.surface(rig.t, -0.05))
+    _released(rig, arm, report, "and is released above the surface")
+    arm.qd = _turning(arm, 2.0 * limits.speed_mps)
+    _stops(rig, arm, report, "a tool too fast", EMERGENCY, SupervisorState.CAUSE_SPEED, REACT_MS)
+    _released(rig, arm, report, "and is released at rest")
+    _workspace(rig, arm, report)
+
+    report.section("others")
+    arm.q = np.full(7, np.nan)
+    _stops(rig, arm, report, "positions that are no numbers", EMERGENCY, SupervisorState.CAUSE_INVALID, REACT_MS)
+    _released(rig, arm, report, "and is released with numbers")
+    arm.mode, arm.reason = RobotStatus.MODE_SAFE_HOLD, "conformance check"
+    _stops(rig, arm, report, "a driver that holds by itself", EMERGENCY, SupervisorState.CAUSE_DRIVER, REACT_MS)
+    _released(rig, arm, report, "and is released with the driver")
+    rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough"))
+    _stops(rig, arm, report, "an operator's stop", EMERGENCY, SupervisorState.CAUSE_OPERATOR, REACT_MS)
+    heard = rig.run(0.5, arm.feed())[STATE]
+    ok = _level(heard) in EMERGENCY and "enough" in heard[-1].message.reason
+    report.expect("it stays, with the operator's reason", ok, "level 2, 'enough'", _words(heard))
+    _released(rig, arm, report, "and is released by the operator")
+    for silent in (STATUS, EXAM):
+        heard = rig.run(SILENT_S, arm.feed(silent))[STATE]
+        report.expect(
+            f"stops when {silent} is silent", _level(heard) in EMERGENCY, f"level 2 within {SILENT_S:g} s", _words(heard)
+        )
+        _released(rig, arm, report, f"and is released when {silent} is back")
+    rig.lose("control")
+    _stops(rig, arm, report, "the loss of control", EMERGENCY, SupervisorState.CAUSE_LOST, REACT_MS)
+
+
+def _measures(rig: Rig, arm: Arm, report: Report) -> None:
+    """Force, speed and depth are those of the arm."""
+    report.section("measures")
+    arm.qd = _turning(arm, 0.05)
+    rig.send(SURFACE, arm.surface(rig.t, 0.004))
+    heard = _press(rig, arm, 10.0)
+    state = heard[-1].message
+    report.expect("force is what pushes the tool", abs(state.force - 10.0) < FORCE_ERROR_N, "10 N", f"{state.force:.2f} N")
+    report.expect("speed is that of the sphere", abs(state.speed - 0.05) < 0.005, "0.05 m/s", f"{state.speed:.4f} m/s")
+    report.expect("depth is below the perceived surface", abs(state.depth - 0.004) < 1e-3, "4 mm", f"{state.depth * 1e3:.2f} mm")
+    report.expect("and none of it is a reason to stop", state.level == SupervisorState.LEVEL_OK, "LEVEL_OK", _words(heard))
+    arm.calm()
+    rig.send(SURFACE, arm.surface(rig.t, -0.05))
+
+
+def _press(rig: Rig, arm: Arm, force: float) -> list[Heard]:
+    """Presses up to `force` [N] as slowly as an examination does, and keeps it for half a second."""
+    for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / RISE_NPS / STEP_S)):
+        arm.push_N = float(push)
+        rig.run(STEP_S, arm.feed())
+    return rig.run(0.5, arm.feed())[STATE]
+
+
+def _turning(arm: Arm, speed: float) -> Array:
+    """Joint velocities [rad/s], of the first joint alone, that move the tool at `speed` [m/s]."""
+    lever = float(np.linalg.norm(tool_jacobian(arm.q, arm.robot)[:3, 0]))
+    return np.array((speed / lever, *np.zeros(6)))
+
+
+def _workspace(rig: Rig, arm: Arm, report: Report) -> None:
+    known = exam_input(rig.settings.scenario)
+    low, high = np.array(known.limits.workspace_min_m), np.array(known.limits.workspace_max_m)
+    X_AW = inverse(np.array(known.X_WA))
+    for q in OUTSIDE:
+        p_A = apply(X_AW, tool_pose(np.array(q), arm.robot)[:3, 3])
+        if bool(np.any(p_A < low - 0.02) or np.any(p_A > high + 0.02)):
+            arm.q = np.array(q)
+            _stops(rig, arm, report, "a tool outside of the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE, REACT_MS)
+            _released(rig, arm, report, "and is released inside")
+            return
+    report.skip("stops for a tool outside of the workspace", "the workspace is larger than what this check tries")
+
+
+def _stops(rig: Rig, arm: Arm, report: Report, what: str, levels: tuple[int, ...], cause: int, within_ms: float) -> None:
+    """Expects a stop with the right cause and words for what was just made wrong."""
+    start = rig.t
+    heard = rig.run(0.5, arm.feed())[STATE]
+    first = next((item for item in heard if item.message.level in levels), None)
+    wanted = f"level {' or '.join(map(str, levels))}, cause {cause}, a reason"
+    if not report.expect(f"stops for {what}", first is not None, wanted, _words(heard)):
+        return
+    assert first is not None
+    state = first.message
+    report.expect(f"and says so: {what}", state.cause == cause and bool(state.reason), wanted, _words([first]))
+    after = (first.t - start - rig.slack) / MS
+    report.expect(f"soon: {what}", after <= within_ms, f"within {within_ms:.0f} ms", f"{after:.0f} ms")
+
+
+def _refuses(rig: Rig, arm: Arm, report: Report) -> None:
+    """A release while the force is still there."""
+    rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
+    heard = rig.run(0.3, arm.feed())[STATE]
+    report.expect("a release is refused while its cause stands", _level(heard) in STOPPED, "still stopped", _words(heard))
+
+
+def _released(rig: Rig, arm: Arm, report: Report, name: str) -> None:
+    """All is well again: the stop stays, and ends on release, which is counted."""
+    arm.calm()
+    heard = rig.run(0.5, arm.feed())[STATE]
+    stays = _level(heard) in STOPPED
+    before = heard[-1].message.releases if heard else 0
+    rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
+    heard = rig.run(0.5, arm.feed())[STATE]
+    ok = stays and _level(heard) == SupervisorState.LEVEL_OK and heard[-1].message.releases == before + 1
+    got = _words(heard) if stays else "the stop had gone by itself"
+    report.expect(name, ok, "stopped until released, then level 0 and one release more", got)
+
+
+def _level(heard: list[Heard]) -> int | None:
+    return int(heard[-1].message.level) if heard else None
+
+
+def _words(heard: list[Heard]) -> str:
+    if not heard:
+        return "nothing"
+    state = heard[-1].message
+    return f"level {state.level}, cause {state.cause}{f': {state.reason}' if state.reason else ''}"

@@ -1,0 +1,197 @@
+"""Role tissue: the suite moves an indenter over it: above, pressed in, sliding, out again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate.check.report import Report
+from palpate.check.rig import Feed, Heard, Rig
+from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
+from palpate_bus.messages.stamps import header
+from palpate_models.frames import Array
+
+WRENCH = "sim/contact_wrench"
+TRUTH = "truth/indentation"
+SPEED = 0.02
+DEPTH = 0.008
+CLEARANCE = 0.01
+
+
+class Tool:
+    """An indenter that is led along straight legs; poses in world."""
+
+    def __init__(self, p: Array, radius: float) -> None:
+        self.p, self.v, self.radius = p.astype(float), np.zeros(3), radius
+        self._since = 0
+
+    def lead(self, rig: Rig, to: Array, seconds: float) -> list[Heard]:
+        """Moves to `to` [m] in `seconds`; returns the contact wrenches meanwhile."""
+        start, t0 = self.p.copy(), rig.t
+        self.v = (to - start) / seconds
+
+        def source(t: int) -> Any:
+            self.p = start + self.v * min((t - t0) / 1e9, seconds)
+            return _state(t, self.p, self.v, self.radius)
+
+        return rig.run(seconds, {"sim/tool_state": source})[WRENCH]
+
+    def rest(self, rig: Rig, seconds: float) -> list[Heard]:
+        """Stays."""
+        return self.lead(rig, self.p.copy(), seconds)
+
+
+def _state(t: int, p: Array, v: Array, radius: float) -> Any:
+    pose = Pose(Point(*map(float, p)), Quaternion(1.0, 0.0, 0.0, 0.0))
+    twist = Twist(Vector3(*map(float, v)), Vector3(0.0, 0.0, 0.0))
+    return ToolState(header(t, "world"), pose, twist, radius)
+
+
+def force(item: Heard) -> Array:
+    """The force of a wrench [N], shape (3,)."""
+    f = item.message.wrench.force
+    return np.array((f.x, f.y, f.z))
+
+
+def suite(rig: Rig, report: Report) -> None:
+    """Truth, contact, friction, energy, silence."""
+    report.section("truth")
+    rig.run(0.05, {})
+    truth = rig.last("truth/phantom")
+    if not report.expect(
+        "truth/phantom is there from the start", truth is not None, "a latched message", "there" if truth is not None else "none"
+    ):
+        return
+    p_W, n_W = _spot(truth, report)
+    radius = rig.settings.scenario.robot.indenter_radius_m
+    report.section("contact")
+    touch = p_W + n_W * radius
+    tool = Tool(touch + n_W * CLEARANCE, radius)
+    above = tool.rest(rig, 0.2)
+    _check_free(above, report, "no force out of contact")
+    legs: list[tuple[list[Heard], Array]] = []
+    down = tool.lead(rig, touch - n_W * DEPTH, (CLEARANCE + DEPTH) / SPEED)
+    legs.append((down, tool.v.copy()))
+    _check_press(rig, down, n_W, report)
+    legs.append((tool.rest(rig, 0.3), np.zeros(3)))
+    tangent = np.cross(n_W, (0.0, 1.0, 0.0))
+    tangent /= np.linalg.norm(tangent)
+    slide = tool.lead(rig, tool.p + tangent * 0.01, 0.01 / SPEED)
+    legs.append((slide, tool.v.copy()))
+    _check_slide(slide, tangent, n_W, report)
+    _check_truth(rig, n_W, report)
+    up = tool.lead(rig, tool.p + n_W * (DEPTH + 2 * CLEARANCE), (DEPTH + 2 * CLEARANCE) / SPEED)
+    legs.append((up, tool.v.copy()))
+    _check_free(tool.rest(rig, 0.2), report, "no force after it has left")
+    _check_energy(legs, report)
+    _surface(rig, report)
+    report.section("silence")
+    silent: Feed = {}
+    heard = rig.run(0.3, silent)[WRENCH]
+    ok = bool(heard) and all(np.all(np.isfinite(force(item))) for item in heard)
+    report.expect("goes on without tool states", ok, "a wrench a tick", f"{len(heard)} messages")
+
+
+def _spot(truth: Any, report: Report) -> tuple[Array, Array]:
+    """A point near the umbilicus and the outward normal there, in world."""
+    vertices = np.asarray(truth.surface.vertices, np.float64).reshape(-1, 3)
+    normals = np.asarray(truth.surface.normals, np.float64).reshape(-1, 3)
+    sizes = {len(vertices), len(normals), len(truth.stiffness), len(truth.background), len(truth.lesion)}
+    report.expect("one normal and stiffness a vertex", len(sizes) == 1, "equal lengths", sorted(sizes))
+    unit = np.abs(np.linalg.norm(normals, axis=1) - 1).max() if len(normals) else np.inf
+    report.expect(
+        "normals are unit vectors, outward",
+        unit < 1e-3 and normals[:, 2].mean() > 0,
+        "length 1, z up in the abdomen's frame",
+        f"{unit:.2g} off",
+    )
+    o, p = truth.pose.orientation, truth.pose.position
+    R_WA, p_WA = Rotation.from_quat((o.x, o.y, o.z, o.w)), np.array((p.x, p.y, p.z))
+    top = np.argmin(np.hypot(vertices[:, 0], vertices[:, 1]) - 1e-3 * vertices[:, 2])
+    return R_WA.apply(vertices[top]) + p_WA, R_WA.apply(normals[top])
+
+
+def _check_free(heard: list[Heard], report: Report, name: str) -> None:
+    worst = max((float(np.linalg.norm(force(item))) for item in heard[len(heard) // 2 :]), default=np.inf)
+    report.expect(name, worst < 1e-6, "0 N", f"{worst:.3g} N")
+
+
+def _check_press(rig: Rig, heard: list[Heard], n_W: Array, report: Report) -> None:
+    normal = np.array([force(item) @ n_W for item in heard])
+    report.expect(
+        "a pressed surface pushes back, outward",
+        normal[-1] > 0.05 and normal.min() > -1e-6,
+        "a positive force along the normal",
+        f"{normal[-1]:.2f} N at {DEPTH * 1e3:.0f} mm, least {normal.min():.3f} N",
+    )
+    tenths = normal[normal > 0][:: max(1, int((normal > 0).sum()) // 10)]
+    rising = bool(np.all(np.diff(tenths) > -0.02 * max(normal.max(), 1e-9)))
+    report.expect("the deeper, the more", rising, "rising", tenths.round(2))
+    last = force(heard[-1])
+    side = float(np.linalg.norm(last - normal[-1] * n_W))
+    report.expect("pressed straight, it pushes straight", side < 0.2 * normal[-1], "tangential below 20 %", f"{side:.3f} N")
+
+
+def _check_slide(heard: list[Heard], tangent: Array, n_W: Array, report: Report) -> None:
+    tail = heard[len(heard) // 2 :]
+    along = float(np.mean([force(item) @ tangent for item in tail]))
+    normal = float(np.mean([force(item) @ n_W for item in tail]))
+    report.expect(
+        "friction opposes sliding", along < 0.3 * normal, "not with the motion", f"{along:.2f} N along, {normal:.2f} N normal"
+    )
+    report.expect(
+        "and is less than the normal force", abs(along) < normal, "a coefficient below 1", f"{abs(along) / max(normal, 1e-9):.2f}"
+    )
+
+
+def _check_truth(rig: Rig, n_W: Array, report: Report) -> None:
+    truth, wrench = rig.last(TRUTH), rig.log[WRENCH][-1]
+    if truth is None:
+        return
+    normal = float(force(wrench) @ n_W)
+    report.expect(
+        "truth/indentation: depth is positive in contact",
+        truth.depth > 0,
+        f"about {DEPTH * 1e3:.0f} mm",
+        f"{truth.depth * 1e3:.1f} mm",
+    )
+    near = abs(truth.normal_force - normal) < 0.1 * abs(normal) + 0.1
+    report.expect("truth/indentation: the force is that of the wrench", near, f"{normal:.2f} N", f"{truth.normal_force:.2f} N")
+
+
+def _check_energy(legs: list[tuple[list[Heard], Array]], report: Report) -> None:
+    """Over a closed loop a passive tissue gives nothing back: the work that it does on the tool is not positive."""
+    work = 0.0
+    stored = 0.0
+    for heard, v in legs:
+        for item in heard:
+            work += float(force(item) @ v) * 1e-3
+            stored = min(stored, work)
+    report.expect(
+        "is passive: a loop of contact costs energy",
+        work <= 1e-5 + 0.02 * abs(stored),
+        "work on the tool at most 0 J",
+        f"{work * 1e3:.3f} mJ of {abs(stored) * 1e3:.2f} mJ that were put in",
+    )
+
+
+def _surface(rig: Rig, report: Report) -> None:
+    meshes = [item.message for item in rig.log["sim/surface"]]
+    if not meshes:
+        return
+    sizes = {(len(m.vertices), len(m.triangles)) for m in meshes}
+    report.expect("sim/surface: one mesh throughout", len(sizes) == 1, "constant topology", sorted(sizes))
+    inside = all(int(np.max(m.triangles, initial=0)) < len(m.vertices) // 3 for m in meshes)
+    report.expect(
+        "sim/surface: triangles index its vertices", inside, "indices below the number of vertices", "so" if inside else "not so"
+    )
+    first = np.asarray(meshes[0].vertices).reshape(-1, 3)
+    dent = max(float(np.max(np.linalg.norm(np.asarray(m.vertices).reshape(-1, 3) - first, axis=1))) for m in meshes)
+    report.expect(
+        "sim/surface: shows the indentation",
+        0.3 * DEPTH < dent < 3 * DEPTH,
+        f"about {DEPTH * 1e3:.0f} mm",
+        f"{dent * 1e3:.1f} mm",
+    )

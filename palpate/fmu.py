@@ -1,0 +1,139 @@
+"""`palpate fmu`: build, look at and simulate FMUs."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from palpate_fmu.compiling import PLATFORMS, CompileError, native, platforms
+from palpate_fmu.export import build_scenario_fmu
+from palpate_fmu.instance import FmuError, FmuInstance, read_variables
+from palpate_fmu.phantom_file import ExportError
+from palpate_fmu.probing import plot_probing, probe, write_csv
+from palpate_fmu.running import run_and_plot
+from palpate_models.load import ScenarioError, load_scenario
+from palpate_models.phantom import MeshError
+from palpate_models.scenario import Phantom, Scenario
+
+EXIT_BAD_INPUT = 2
+NAMES_CHECKED = 1000
+"""More variables than this are not held to the naming convention: FMPy takes milliseconds a name."""
+MESHES = (".obj", ".stl", ".ply")
+
+app = typer.Typer(name="fmu", help="The abdomen as an FMU; FMUs of any kind looked at.", no_args_is_help=True)
+
+
+def _fail(console: Console, message: str) -> NoReturn:
+    console.print(f"[bold red]palpate:[/] {escape(message)}", highlight=False, soft_wrap=True)
+    raise typer.Exit(EXIT_BAD_INPUT)
+
+
+def _scenario(name: str, settings: list[str]) -> Scenario:
+    """A scenario by name or file, or the default one with a mesh as its phantom."""
+    if Path(name).suffix.lower() in MESHES:
+        return Scenario(name=Path(name).stem, phantom=Phantom(kind="mesh", mesh=name))
+    return load_scenario(name, settings)
+
+
+@app.command()
+def build(
+    phantom: Annotated[str, typer.Argument(help="Name or file of a scenario, or a mesh (OBJ, STL, PLY).")] = "rlq_guarding",
+    out: Annotated[Path, typer.Option("--out", "-o", help="The FMU to write.")] = Path("abdomen.fmu"),
+    fmi: Annotated[int, typer.Option(min=2, max=3, help="FMI version; 2 shows a sample of the surface only.")] = 3,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--platform", metavar="NAME", help=f"Binaries for: {', '.join(p.tuple_3 for p in PLATFORMS)}. All by default."
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a scenario's field; may be repeated.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+) -> None:
+    """Write the abdomen as an FMU: sources, and binaries cross-compiled on this machine."""
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    try:
+        chosen = platforms(fmi, only)
+        names = [platform.tuple_3 for platform in chosen]
+        scenario = _scenario(phantom, settings or [])
+        with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
+            task = bar.add_task("reading the phantom", total=len(names))
+            build_scenario_fmu(
+                scenario,
+                out,
+                fmi,
+                names,
+                compiling=lambda name: bar.update(task, description=f"compiling for {name} (a minute, the first time)"),
+                compiled=lambda _: bar.advance(task),
+            )
+    except (ScenarioError, MeshError, ExportError, CompileError, ValueError, OSError) as error:
+        _fail(console, str(error))
+    if not quiet:
+        places = ", ".join(names)
+        console.print(f"{out}: FMI {fmi}.0, {out.stat().st_size / 1e6:.1f} MB, for {places}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
+    """Show an FMU's interface, variables and platforms."""
+    import fmpy  # noqa: PLC0415  (slow to import)
+    from fmpy.model_description import ValidationError  # noqa: PLC0415
+
+    console = Console()
+    try:
+        description = fmpy.read_model_description(str(file))
+        with zipfile.ZipFile(file) as archive:
+            places = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")})
+    except Exception as error:
+        _fail(Console(stderr=True), f"{file}: not an FMU: {error}")
+    kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
+    console.print(f"[bold]{description.modelName}[/] FMI {description.fmiVersion}, {', '.join(kinds)}", highlight=False)
+    console.print(f"{description.description or ''}\nplatforms: {', '.join(places) or 'none (sources only)'}", highlight=False)
+    table = Table("variable", "shape", "type", "causality", "unit", "range", "description", box=None)
+    for v in read_variables(description).values():
+        bounds = "" if v.low is None and v.high is None else f"{v.low or ''} .. {v.high or ''}"
+        shape = " x ".join(map(str, v.shape))
+        table.add_row(v.name, shape, v.type, f"{v.causality} ({v.variability})", v.unit or "", bounds, v.doc or "")
+    Console(width=max(150, console.width)).print(table)
+    names = len(description.modelVariables) <= NAMES_CHECKED
+    try:
+        fmpy.read_model_description(str(file), validate_variable_names=names, validate_model_structure=True)
+        verdict = "valid" if names else f"valid ({len(description.modelVariables)} names not parsed)"
+    except ValidationError as error:
+        verdict = "\n".join(error.problems)
+    console.print(verdict, highlight=False)
+
+
+@app.command()
+def simulate(
+    file: Annotated[Path, typer.Argument(help="An FMU; an abdomen is probed, any other one run as it is.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="PNG to write; a CSV is written next to it.")] = Path("probing.png"),
+    at: Annotated[tuple[float, float], typer.Option(help="Where to press, x and y in the abdomen frame [m].")] = (0.0, 0.05),
+    depth: Annotated[float, typer.Option(min=0.001, max=0.03, help="How deep [m].")] = 0.010,
+    speed: Annotated[float, typer.Option(min=0.001, max=0.2, help="How fast [m/s].")] = 0.02,
+    hold: Annotated[float, typer.Option(min=0, max=60, help="How long it is held [s].")] = 1.0,
+) -> None:
+    """Press into an abdomen, hold and withdraw, and plot the force against the depth; run any other FMU and plot its outputs."""
+    console = Console(stderr=True)
+    try:
+        with FmuInstance(file) as fmu:
+            abdomen = {"indenter_position", "indentation_depth", "normal_force"} <= fmu.variables.keys()
+            probing = probe(fmu, at, depth, speed, hold) if abdomen else None
+        names = () if probing else run_and_plot(file, out)
+    except FmuError as error:
+        _fail(console, f"{error} (this machine is {native()})")
+    if probing is None:
+        console.print(f"{out}: {', '.join(names)}", highlight=False)
+        return
+    write_csv(probing, out.with_suffix(".csv"))
+    plot_probing(probing, out, f"{file.name} at ({1e3 * at[0]:.0f}, {1e3 * at[1]:.0f}) mm")
+    console.print(f"{out}: greatest force {probing.force.max():.2f} N at {1e3 * probing.depth.max():.1f} mm", highlight=False)

@@ -1,0 +1,208 @@
+"""What is fuzzed: everything of the bus that takes bytes or words from others, with what must hold for any of them.
+
+A target is a callable on bytes. It returns quietly when the input was refused with the error that is documented, or accepted
+consistently; anything else that it raises is a find. `seeds()` gives valid inputs to start from.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
+from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.security.denials import DenialReader
+from palpate_bus.wire.liveliness import parse_token
+from palpate_bus.wire.rmw import ATTACHMENT_SIZE, AttachmentWriter, WireError, parse_key, topic_key, unpack
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
+
+
+@dataclass(frozen=True)
+class Target:
+    """A function under test and valid inputs of it."""
+
+    name: str
+    check: Callable[[bytes], None]
+    seeds: Callable[[random.Random], Sequence[bytes]]
+
+
+class Broken(AssertionError):
+    """A property does not hold for an input that was accepted."""
+
+
+def targets() -> list[Target]:
+    """All targets of the bus."""
+    return [*_codecs(), ATTACHMENT, KEY, TOKEN, CHUNK, OPTIONS, DENIAL_LOG]
+
+
+# -- messages
+
+
+def _codecs() -> Iterator[Target]:
+    rules = contract()
+    names = sorted({row.type for row in rules.topics.values()} | {row.type for row in rules.internal.values()})
+    for name in names:
+        yield Target(f"codec:{name}", _codec_check(name), partial(_payloads, name))
+
+
+def _codec_check(name: str) -> Callable[[bytes], None]:
+    decode, encode = codec.decoder(name), codec.encoder(name)
+
+    def check(data: bytes) -> None:
+        """Refused with CodecError, or its canonical bytes are a fixed point, and rosbags agrees on them."""
+        try:
+            message = decode(data)
+        except codec.CodecError:
+            return
+        canonical = encode(message)
+        if encode(decode(canonical)) != canonical:
+            raise Broken(f"{name}: encoding what was decoded changes it")
+        if bytes(codec.store.serialize_cdr(codec.store.deserialize_cdr(canonical, name), name)) != canonical:
+            raise Broken(f"{name}: rosbags has other bytes")
+
+    return check
+
+
+def _payloads(name: str, rng: random.Random) -> list[bytes]:
+    return [random_payload(name, rng) for _ in range(8)]
+
+
+def random_payload(name: str, rng: random.Random) -> bytes:
+    """A valid message of a type with random content, in CDR."""
+    return codec.encode(_message(name, rng), name)
+
+
+def _message(name: str, rng: random.Random) -> Any:
+    definition = codec.store.get_msgdef(name)
+    return definition.cls(**{field: _field(description, rng) for field, description in definition.fields})
+
+
+def _field(description: Any, rng: random.Random) -> Any:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return _message(detail, rng)
+    if kind == Nodetype.BASE:
+        return _scalar(detail[0], rng)
+    size = detail[1] if kind == Nodetype.ARRAY else rng.randrange(4)
+    item_kind, item = detail[0]
+    if item_kind == Nodetype.BASE and item[0] != "string":
+        dtype = np.dtype({"bool": "?", "byte": "i1", "char": "u1"}.get(item[0], item[0]))
+        if item[0] == "bool":
+            return np.array([rng.random() < 0.5 for _ in range(size)], dtype)
+        return np.frombuffer(rng.randbytes(size * dtype.itemsize), dtype)
+    return [_field(detail[0], rng) for _ in range(size)]
+
+
+def _scalar(base: str, rng: random.Random) -> Any:
+    if base == "string":
+        return "".join(rng.choice("aZ09/_ -.äß€") for _ in range(rng.randrange(9)))
+    if base == "bool":
+        return rng.random() < 0.5
+    if base in ("float32", "float64"):
+        code = "<f" if base == "float32" else "<d"
+        return float(struct.unpack(code, rng.randbytes(struct.calcsize(code)))[0])
+    limits = np.iinfo({"byte": "int8", "char": "uint8"}.get(base, base))
+    return rng.randint(int(limits.min), int(limits.max))
+
+
+# -- attachment, keys, tokens, chunks, options, the router's log
+
+
+def _attachment(data: bytes) -> None:
+    try:
+        sequence, sent, gid = unpack(data)
+    except WireError:
+        return
+    if len(data) != ATTACHMENT_SIZE or AttachmentWriter(gid).pack(sequence, sent) != data:
+        raise Broken("attachment: packing what was unpacked changes it")
+
+
+ATTACHMENT = Target(
+    "attachment", _attachment, lambda rng: [AttachmentWriter(rng.randbytes(16)).pack(rng.randrange(2**62), rng.randrange(2**62))]
+)
+
+
+def _key(data: bytes) -> None:
+    text = data.decode("utf-8", "surrogateescape")
+    try:
+        key = parse_key(text)
+    except WireError:
+        return
+    if parse_key(str(key)) != key:
+        raise Broken("key: parsing what was written changes it")
+
+
+KEY = Target("key", _key, lambda _: [topic_key(topic, 3).encode() for topic in contract().topics.values()])
+
+
+def _token(data: bytes) -> None:
+    try:
+        entity = parse_token(data.decode("utf-8", "surrogateescape"))
+    except WireError:
+        return
+    if parse_token(entity.token) != entity:
+        raise Broken("token: parsing what was written changes it")
+
+
+_ENDPOINT = (
+    "@ros2_lv/0/a1b2/0/3/MP/%/%/robot/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_" + 64 * "a" + "/::,1:,:,:,,"
+)
+TOKEN = Target("token", _token, lambda _: [b"@ros2_lv/0/a1b2/0/0/NN/%/%/robot", _ENDPOINT.encode()])
+
+
+def _chunk(data: bytes) -> None:
+    try:
+        _, messages = unpack_chunk(data)
+        list(messages)
+    except codec.CodecError:
+        return
+
+
+CHUNK = Target("chunk", _chunk, lambda rng: [random_payload(CHUNK_TYPE, rng) for _ in range(4)])
+
+
+_VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MODE", "PALPATE_LOWLATENCY", "PALPATE_TLS")
+
+
+def _options(data: bytes) -> None:
+    words = data.decode("utf-8", "surrogateescape").split("\n")
+    try:
+        options = BusOptions.from_env(dict(zip(_VARIABLES, words, strict=False)))
+    except BusConfigError:
+        return
+    if BusOptions.from_env(options.to_env()) != options:
+        raise Broken("options: the environment that they make gives others")
+
+
+OPTIONS = Target(
+    "options",
+    _options,
+    lambda _: [b"tcp/127.0.0.1:7501,unixsock-stream//run/a.sock\ntcp/a:1\ntcp/host:7447\npeer\n1", b"\n\ntls/h:1\nclient\n0\n/k"],
+)
+
+
+def _denial_log(data: bytes) -> None:
+    whole, pieces = DenialReader(), DenialReader()
+    list(whole.feed(data + b"\n"))
+    for index in range(0, len(data), 7):
+        list(pieces.feed(data[index : index + 7]))
+    list(pieces.feed(b"\n"))
+    if [d.sentence for d in whole.denials.values()] != [d.sentence for d in pieces.denials.values()]:
+        raise Broken("denials: a log read in pieces says something else")
+
+
+_LOG = (
+    b"t TRACE rx-0 ThreadId(8) zenoh::net::routing::interceptor::access_control: ab on Interface(lo)+CertCommonName(camera)+ab "
+    b"is unauthorized to Put (ingress) on 0/a/b::msg::dds_::C_/RIHS01_x\n"
+    b"t TRACE rx-0 ThreadId(8) zenoh::net::routing::interceptor: Msg intercepted!\n"
+    b"t  WARN acc-0 ThreadId(5) zenoh_link_tls::unicast: peer sent no certificates. Hint: more.\n"
+)
+DENIAL_LOG = Target("denials", _denial_log, lambda _: [_LOG])

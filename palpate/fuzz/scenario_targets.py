@@ -1,0 +1,60 @@
+"""The scenario reader under fuzzing, for `palpate fuzz` (entry-point group `palpate.fuzz`)."""
+
+from __future__ import annotations
+
+import random
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+from palpate_models.load import ScenarioError, dump_scenario, load_scenario, scenario_names
+
+
+@dataclass(frozen=True)
+class Target:
+    """What `palpate.fuzz.bus_targets.Target` is; the models know no bus."""
+
+    name: str
+    check: Callable[[bytes], None]
+    seeds: Callable[[random.Random], Sequence[bytes]]
+
+
+_FOLDER = tempfile.TemporaryDirectory(prefix="palpate-fuzz-")
+
+
+def _texts(_: random.Random) -> list[bytes]:
+    folder = resources.files("palpate_models").joinpath("scenarios")
+    return [folder.joinpath(f"{name}.yaml").read_bytes() for name in scenario_names()]
+
+
+def _scenario(data: bytes) -> None:
+    """Refused with ScenarioError, or written and read again the same."""
+    file = Path(_FOLDER.name) / "fuzz.yaml"
+    file.write_bytes(data)
+    try:
+        scenario = load_scenario(str(file))
+    except ScenarioError:
+        return
+    file.write_text(dump_scenario(scenario), encoding="utf-8")
+    if load_scenario(str(file)) != scenario:
+        raise AssertionError("scenario: reading what was written changes it")
+
+
+def _setting(data: bytes) -> None:
+    try:
+        load_scenario("healthy", data.decode("utf-8", "replace").split("\n"))
+    except ScenarioError:
+        return
+
+
+_SETTINGS = (
+    b"exam.depth_m=0.008", b"exam.region_m=[0.06, 0.06]", b"phantom.lesions=[{centre_m: [0, 0], radii_m: [0.02, 0.02]}]",
+    b"phantom.lesions.0.contrast=3", b"exam.region_m.1=0.1\nseed=4", b"camera.frames=10", b"phantom.pose.true.position_m=[0,0,0]",
+)  # fmt: skip
+
+
+def targets() -> list[Target]:
+    """Scenario files, and `--set` words."""
+    return [Target("scenario", _scenario, _texts), Target("setting", _setting, lambda _: _SETTINGS)]

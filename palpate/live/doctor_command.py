@@ -1,0 +1,106 @@
+"""`palpate doctor`: is this bus well, and if not, who is to blame."""
+
+from __future__ import annotations
+
+from time import monotonic, sleep
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from palpate.live.console import EXIT_TROUBLE, bandwidth, command, console, number, print_json, print_line, table
+from palpate.live.doctor import POLL_S, Diagnosis, Level, examine
+from palpate.live.joining import AsJson, ChosenRun, Connect, Domain, joined
+from palpate_bus.contract import contract
+from palpate_bus.monitor.health import TopicHealth, Violation
+from palpate_bus.monitor.live import LiveMonitor
+
+_COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.BAD: "bold red"}
+
+
+def doctor(
+    connect: Connect = None,
+    run: ChosenRun = None,
+    domain: Domain = None,
+    as_json: AsJson = False,
+    seconds: Annotated[float, typer.Option(help="How long to listen.")] = 3.0,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on, and print every violation as it comes, until Ctrl-C.")] = False,
+) -> None:
+    """Examine a live bus: versions, endpoints, shared memory, clocks, who is missing, and every topic against the contract.
+
+    Leaves with status 0 when all is well, 1 when something is in trouble, 2 when there is no bus.
+    """
+    with command(), joined(connect, run, domain) as bus:
+        rules = contract()
+        if watch:
+            wallclock = bus.target.run is not None and bus.target.run.runtime == "wallclock"
+            _watch(LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), wallclock), as_json)
+            return
+        diagnosis = examine(bus, rules, seconds)
+    if as_json:
+        print_json(diagnosis.as_json())
+    else:
+        _print(diagnosis)
+    if not diagnosis.healthy:
+        raise typer.Exit(EXIT_TROUBLE)
+
+
+def _watch(live: LiveMonitor, as_json: bool) -> None:
+    began = monotonic()
+    try:
+        while True:
+            for violation in live.poll():
+                if as_json:
+                    print_line({"after_s": round(monotonic() - began, 3), **_facts(violation)})
+                else:
+                    console().print(f"[dim]{monotonic() - began:8.2f} s[/]  [red]{escape(str(violation))}[/]", soft_wrap=True)
+            sleep(POLL_S)
+    finally:
+        live.close()
+
+
+def _facts(violation: Violation) -> dict[str, str]:
+    return {
+        "topic": violation.topic, "sender": violation.sender, "kind": str(violation.kind), "field": violation.field,
+        "expected": violation.expected, "got": violation.got,
+    }  # fmt: skip
+
+
+def _print(diagnosis: Diagnosis) -> None:
+    out = console()
+    listed = table("", "", "")
+    said = ""
+    for finding in diagnosis.findings:
+        about = "" if finding.about == said else finding.about
+        said = finding.about
+        listed.add_row(f"[bold]{about}[/]", f"[{_COLOURS[finding.level]}]{finding.level}[/]", escape(finding.text))
+    listed.show_header = False
+    out.print(listed)
+    out.print()
+    rows = table("topic", "from", "state", ">Hz", ">by the bus's time", ">contract", ">age", ">load", ">messages", ">missing")
+    for health in diagnosis.topics:
+        rows.add_row(*_row(health))
+    out.print(rows)
+    out.print()
+    for violation, count in diagnosis.violations:
+        times = f" ({count} times)" if count > 1 else ""
+        out.print(f"[bold red]violation[/]  {escape(str(violation))}{times}", soft_wrap=True)
+    if not diagnosis.violations:
+        out.print("[green]no violation of the contract[/]")
+
+
+def _row(health: TopicHealth) -> tuple[str, ...]:
+    topic = health.topic
+    state = {None: "[dim]rests[/]", True: "[green]alive[/]", False: "[red]silent[/]"}[health.alive]
+    if health.violations:
+        state = "[bold red]violates[/]"
+    elif not health.senders:
+        state = "[dim]nobody[/]"
+    wanted = "latched" if topic.latched else "event" if topic.event else f"{1000 / topic.period_ms:g}"
+    periodic = topic.periodic and health.messages
+    return (
+        topic.name, ", ".join(health.senders), state, number(health.rate_hz) if periodic else "",
+        number(health.bus_rate_hz) if periodic and health.bus_rate_hz is not None else "", wanted,
+        number(health.age_ms, "ms", 2) if periodic else "", bandwidth(health.bytes_per_s) if health.bytes_per_s else "",
+        str(health.messages) if health.messages else "", str(health.missing) if health.missing else "",
+    )  # fmt: skip

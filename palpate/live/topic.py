@@ -1,0 +1,274 @@
+"""`palpate topic list|info|echo|hz|bw`: topics on a live bus."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from time import monotonic
+from typing import Annotated, Any
+
+import typer
+import yaml
+from rich.console import Console
+
+from palpate.live import graph
+from palpate.live.console import bandwidth, command, console, print_json, print_line, table
+from palpate.live.joining import AsJson, ChosenRun, Connect, Domain, Joined, joined
+from palpate.live.listening import Heard, Listener, plain
+from palpate.live.statistics import Spacing
+from palpate_bus.contract import Topic, contract
+from palpate_bus.messages import codec
+from palpate_bus.runs.joining import NoBus
+
+app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
+
+Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
+Seconds = Annotated[float | None, typer.Option("--seconds", help="Stop after this long; by default Ctrl-C ends it.")]
+EVERY_S = 1.0
+
+
+@app.command("list")
+def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
+    """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
+    with command(), joined(connect, run, domain) as bus:
+        found = graph.topics(graph.present(bus))
+        rules = contract().topics
+        if as_json:
+            print_json([_topic_facts(topic) for topic in found.values()])
+            return
+        out = table("topic", "type", "published by", "subscribed by", "in the contract")
+        for topic in found.values():
+            row = rules.get(topic.name)
+            known = "[yellow]no[/]" if row is None else _period(row)
+            if row is not None and {(row.type, row.type_hash)} != topic.types:
+                known = "[bold red]other type or hash[/]"
+            types = ", ".join(sorted(name.replace("/msg/", "/") for name, _ in topic.types))
+            who = ", ".join(sorted(topic.publishers)) or "[yellow]nobody[/]"
+            out.add_row(topic.name, types, who, ", ".join(sorted(topic.subscribers)), known)
+        console().print(out)
+
+
+@app.command()
+def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
+    """Show a topic: its row of the contract, and who publishes and subscribes on the bus with which type hash."""
+    with command(), joined(connect, run, domain) as bus:
+        name = name.strip("/")
+        found = [e for e in graph.present(bus) if e.endpoint is not None and e.endpoint.topic == name]
+        row = contract().topics.get(name)
+        if not found and row is None:
+            raise NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
+        if as_json:
+            ends = [
+                {
+                    "node": e.node,
+                    "kind": e.kind.name.lower(),
+                    "type": e.endpoint.type,
+                    "hash": e.endpoint.type_hash,
+                    "qos": e.endpoint.qos,
+                }
+                for e in found
+                if e.endpoint is not None
+            ]
+            print_json({"topic": name, "contract": None if row is None else row.model_dump(mode="json"), "endpoints": ends})
+            return
+        out = table("", "")
+        out.show_header = False
+        for key, value in _facts(row):
+            out.add_row(f"[bold]{key}[/]", value)
+        console().print(out)
+        ends_table = table("node", "", "type", "hash")
+        for entity in found:
+            end = entity.endpoint
+            if end is not None:
+                same = row is None or (end.type, end.type_hash) == (row.type, row.type_hash)
+                shown = end.type_hash[:24] + "…" if same else f"[bold red]{end.type_hash[:24]}… differs[/]"
+                ends_table.add_row(entity.node, f"{entity.kind.name.lower()}", end.type, shown)
+        console().print()
+        console().print(ends_table)
+
+
+@app.command()
+def echo(
+    name: Name,
+    connect: Connect = None,
+    run: ChosenRun = None,
+    domain: Domain = None,
+    as_json: AsJson = False,
+    field: Annotated[str | None, typer.Option(help="Only this field, e.g. wrench.force.")] = None,
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Long arrays in full.")] = False,
+    seconds: Seconds = None,
+) -> None:
+    """Print the messages of a topic as they come."""
+    left = 1 if once else count
+    with command(), _listening(name, connect, run, domain) as (_, topic, listener):
+        for heard in _until(listener, seconds):
+            message = _message(heard, topic)
+            value = plain(message, full=full or as_json, path=field)
+            if as_json:
+                print_line({"topic": topic.name, "sequence": heard.sequence, "sent_ns": heard.sent, "message": value})
+            else:
+                print(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=120), end="---\n", flush=True)
+            left = None if left is None else left - 1
+            if left == 0:
+                return
+
+
+@app.command()
+def hz(
+    name: Name,
+    connect: Connect = None,
+    run: ChosenRun = None,
+    domain: Domain = None,
+    as_json: AsJson = False,
+    seconds: Seconds = None,
+) -> None:
+    """Measure a topic's rate, once a second: messages a wall second and a second of simulated time, and their spacing."""
+    with command(), _listening(name, connect, run, domain) as (_, topic, listener):
+        spacing = Spacing()
+        report = monotonic() + EVERY_S
+        for heard in _until(listener, seconds, tick=0.1):
+            if heard is not None:
+                spacing.add(heard.sent, _stamp(heard, topic))
+            if monotonic() >= report:
+                report += EVERY_S
+                _say_rate(spacing, topic, as_json)
+        if spacing.messages > 1:
+            _say_rate(spacing, topic, as_json, whole=True)
+
+
+@app.command()
+def bw(
+    name: Name,
+    connect: Connect = None,
+    run: ChosenRun = None,
+    domain: Domain = None,
+    as_json: AsJson = False,
+    seconds: Seconds = None,
+) -> None:
+    """Measure a topic's bandwidth, once a second: bytes a wall second and bytes a message, payload only."""
+    with command(), _listening(name, connect, run, domain) as (_, topic, listener):
+        window: deque[tuple[float, int]] = deque()
+        report = monotonic() + EVERY_S
+        for heard in _until(listener, seconds, tick=0.1):
+            now = monotonic()
+            if heard is not None:
+                window.append((now, len(heard.payload)))
+            if now >= report:
+                report += EVERY_S
+                while window and window[0][0] < now - 5 * EVERY_S:
+                    window.popleft()
+                _say_bandwidth(window, topic, as_json)
+
+
+@contextmanager
+def _listening(
+    name: str, connect: list[str] | None, run: str | None, domain: int | None
+) -> Iterator[tuple[Joined, Topic, Listener]]:
+    """Joins the bus and listens to a topic: the contract's, or any that is there with a message type that we know."""
+    with joined(connect, run, domain) as bus:
+        name = name.strip("/")
+        row = contract().topics.get(name)
+        if row is None:
+            live = graph.topics(graph.present(bus)).get(name)
+            if live is None:
+                raise NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
+            types = sorted(kind for kind, _ in live.types)
+            try:
+                codec.message_type(types[0])
+            except codec.CodecError as error:
+                raise NoBus(f"topic {name}: {error}") from error
+            row = Topic(name=name, type=types[0], producer="", readers={}, qos="event", event=True, doc="")
+        listener = Listener(bus.session, row, bus.domain)
+        try:
+            yield bus, row, listener
+        finally:
+            listener.close()
+
+
+def _until(listener: Listener, seconds: float | None, tick: float | None = None) -> Iterator[Any]:
+    """Messages until the time is over; with `tick` also None, at least that often [s]."""
+    end = None if seconds is None else monotonic() + seconds
+    while end is None or monotonic() < end:
+        heard = listener.get(0.1 if tick is None else tick)
+        if heard is not None or tick is not None:
+            yield heard
+
+
+def _message(heard: Heard, topic: Topic) -> Any:
+    try:
+        return codec.decode(heard.payload, topic.type)
+    except codec.CodecError as error:
+        raise NoBus(f"{topic.name}: a message of {len(heard.payload)} bytes is not {topic.type}: {error}") from error
+
+
+def _stamp(heard: Heard, topic: Topic) -> int | None:
+    header = getattr(_message(heard, topic), "header", None)
+    return None if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def _say_rate(spacing: Spacing, topic: Topic, as_json: bool, whole: bool = False) -> None:
+    facts = spacing.summary(whole)
+    wanted = None if topic.latched or topic.event else 1000 / topic.period_ms
+    if as_json:
+        print_line({"topic": topic.name, "contract_hz": wanted, **facts})
+        return
+    if facts["messages"] < 2:
+        Console(highlight=False).print("[dim]no messages[/]")
+        return
+    simulated = "" if facts["simulated_hz"] is None else f", {facts['simulated_hz']:.4g} Hz of simulated time"
+    text = f"{facts['wall_hz']:.4g} Hz{simulated}"
+    text += f" (contract {wanted:g} Hz)" if wanted else ""
+    text += (
+        f"; spacing {facts['mean_ms']:.3g} ms mean, {facts['least_ms']:.3g} to {facts['most_ms']:.3g}, std {facts['std_ms']:.2g}"
+    )
+    print(("in all: " if whole else "") + text + f"; {facts['messages']} messages", flush=True)
+
+
+def _say_bandwidth(window: deque[tuple[float, int]], topic: Topic, as_json: bool) -> None:
+    sizes = [size for _, size in window]
+    seconds = window[-1][0] - window[0][0] if len(window) > 1 else 0.0
+    rate = sum(sizes[1:]) / seconds if seconds else 0.0
+    if as_json:
+        print_line(
+            {"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": sum(sizes) / max(len(sizes), 1)}
+        )
+    elif not sizes:
+        Console(highlight=False).print("[dim]no messages[/]")
+    else:
+        mean = sum(sizes) / len(sizes)
+        print(f"{bandwidth(rate)}; {mean:.0f} B a message, {min(sizes)} to {max(sizes)}; {len(sizes)} messages", flush=True)
+
+
+def _period(row: Topic) -> str:
+    return "latched" if row.latched else f"{row.period_ms} ms{' event' if row.event else ''}"
+
+
+def _facts(row: Topic | None) -> list[tuple[str, str]]:
+    if row is None:
+        return [("contract", "does not have it")]
+    facts = [("topic", row.name), ("", row.doc), ("type", row.type), ("hash", row.type_hash), ("producer", row.producer)]
+    facts += [("sent", _period(row)), ("QoS", row.qos), ("may be known to", str(row.visibility))]
+    facts += [("frame", row.frame)] if row.frame else []
+    for path in dict.fromkeys([*row.units, *row.ranges]):
+        least, most = row.ranges.get(path, (None, None))
+        facts.append(
+            (path, f"[{row.units.get(path, '1')}]".replace("[", r"\[") + ("" if least is None else f" {least:g} .. {most:g}"))
+        )
+    facts += [("stale after", f"{row.max_age_ms} ms")] if row.max_age_ms else []
+    facts += [("expires after", f"{row.expiry_ms} ms")] if row.expiry_ms else []
+    return facts
+
+
+def _topic_facts(topic: graph.LiveTopic) -> dict[str, Any]:
+    row = contract().topics.get(topic.name)
+    return {
+        "topic": topic.name,
+        "types": [{"type": name, "hash": digest} for name, digest in sorted(topic.types)],
+        "publishers": sorted(topic.publishers),
+        "subscribers": sorted(topic.subscribers),
+        "in_contract": row is not None,
+        "matches_contract": row is not None and {(row.type, row.type_hash)} == topic.types,
+    }

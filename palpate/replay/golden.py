@@ -1,0 +1,116 @@
+"""Golden replay: a recording, a service, and whether it still sends what was recorded."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from palpate.replay.compare import Tolerance, TopicResult, compare
+from palpate.replay.reference import cut, rounded, write_reference
+from palpate.replay.rerun import rerun
+from palpate.replay.services import factory
+from palpate_bus.contract import MS, Contract, contract
+from palpate_bus.recordings import Recorded, Recording, RecordingError, open_recording
+from palpate_bus.service import Service
+from palpate_models.load import load_scenario
+from palpate_models.scenario import Scenario
+
+KNOWS_PHANTOM = "tissue"
+"""The one role that is given the whole scenario; the others get exam.yaml, as in a run."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One service against one recording."""
+
+    recording: Recording
+    role: str
+    service: Service
+    scenario: str
+    """As YAML."""
+    rules: Contract
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Topics that the service reads and the recording has."""
+        return tuple(topic.name for topic, _ in self.rules.inputs(self.role) if topic.name in self.recording.types)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Topics that the service writes and the recording has."""
+        return tuple(topic.name for topic in self.rules.outputs(self.role) if topic.name in self.recording.types)
+
+    @property
+    def end(self) -> int:
+        """Last tick of the role in the recording [ns]: of its periodic outputs, or else the recording's last stamp."""
+        period = self.rules.roles[self.role].period
+        periodic = [t for t in self.outputs if self.rules.topics[t].periodic and self.recording.counts[t]]
+        if periodic:
+            return max((self.recording.counts[t] - 1) * self.rules.topics[t].period for t in periodic)
+        return self.recording.last - self.recording.last % period
+
+
+def prepare(path: Path, choice: str, scenario: Path | None = None) -> Case:
+    """Opens a recording and makes the service `choice` (see `services.factory`).
+
+    The scenario is `scenario`, else the recording's own, else the one beside it. Raises RecordingError, ChoiceError or
+    ScenarioError.
+    """
+    rules = contract()
+    role, create = factory(choice, rules)
+    recording = open_recording(path)
+    text = scenario.read_text(encoding="utf-8") if scenario else recording.scenario or _beside(path, role)
+    topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]
+    recording.check(rules, topics)
+    if not any(recording.counts.get(topic.name) for topic in rules.outputs(role)):
+        raise RecordingError(f"{path}: has nothing that {role} sent, so there is nothing to compare with")
+    loaded = load_text(text)
+    if loaded.tissue.fmu is not None:
+        os.environ["PALPATE_FMU"] = loaded.tissue.fmu
+    return Case(recording, role, create(loaded), text, rules)
+
+
+def load_text(text: str) -> Scenario:
+    """A scenario from YAML text. Raises ScenarioError."""
+    with tempfile.TemporaryDirectory(prefix="palpate-replay-") as folder:
+        file = Path(folder) / "recorded.yaml"
+        file.write_text(text, encoding="utf-8")
+        return load_scenario(str(file))
+
+
+def _beside(path: Path, role: str) -> str:
+    name = "scenario.yaml" if role == KNOWS_PHANTOM else "exam.yaml"
+    for folder in (path, *path.resolve().parents[:2]):
+        if (folder / name).is_file():
+            return (folder / name).read_text(encoding="utf-8")
+    raise RecordingError(f"{path}: no {name} in it or beside it; {role} needs the scenario of the run: --scenario FILE")
+
+
+def replay_service(case: Case, tolerance: Tolerance) -> dict[str, TopicResult]:
+    """Re-runs the service and compares all that it sends."""
+    expected = case.recording.messages(case.outputs, end=case.end)
+    sent = rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end)
+    results = compare(expected, sent, case.rules, tolerance, case.outputs)
+    facts = case.service.finish()
+    del facts
+    return results
+
+
+def make_reference(case: Case, path: Path, begin: int, end: int) -> None:
+    """Writes what the service gets from `begin` to `end` [ns], and what it answers, as a reference."""
+    period = case.rules.roles[case.role].period
+    begin -= begin % max(period, 100 * MS)  # a tick of every role
+    end = min(end, case.end)
+    given = list(cut(case.recording, case.rules, case.inputs, begin, end))
+    last = (end - begin) // period * period
+    answered = rerun(case.service, case.rules, iter(given), last)
+    write_reference(path, case.rules, chain(given, _rounded(answered, case.rules)), case.scenario)
+
+
+def _rounded(messages: Iterator[Recorded], rules: Contract) -> Iterator[Recorded]:
+    for message in messages:
+        yield message._replace(payload=rounded(rules.topics[message.topic], message.payload))

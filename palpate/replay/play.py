@@ -1,0 +1,174 @@
+"""A recording on the bus again: the same keys, bytes and sequence numbers, paced by the wall clock."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from time import monotonic_ns, sleep
+from types import TracebackType
+from typing import Self
+
+from palpate_bus.contract import MS, Contract, contract
+from palpate_bus.messages import Clock, codec
+from palpate_bus.messages.stamps import NS, time_message
+from palpate_bus.recordings import Recording
+from palpate_bus.runtime.member import Member
+from palpate_bus.wire.liveliness import GraphWatch, Kind
+from palpate_bus.wire.transport import Publisher
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, domain_from_env, open_session
+
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+"""Where a replay is to be found when the environment names no endpoint: where ROS 2's rmw_zenoh looks for its router."""
+LOOK_NS = NS
+"""How long the bus is looked at before anything is played, and how often while it plays."""
+CLOCK = "clock"
+CLOCK_PERIOD = 10 * MS
+
+
+class PlayError(ValueError):
+    """A recording that must not or cannot be played on this bus."""
+
+
+class Player:
+    """Plays a recording. Every role that it speaks for shows in the ROS graph; use it as a context manager."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        rate: float = 1.0,
+        topics: Collection[str] | None = None,
+        listen: str | None = None,
+        drive: bool = False,
+    ) -> None:
+        """Joins the bus.
+
+        Raises PlayError when a living service sends what would be played, or would act on it without `drive`.
+        """
+        self._recording = recording
+        self._rate = rate
+        self._drive = drive
+        self._looked = 0
+        rules = contract()
+        self.topics = _chosen(recording, rules, topics)
+        recording.check(rules, self.topics)
+        options = _options(listen)
+        self.where = f"on {', '.join(options.listen)}" if options.listen else "on the bus of the environment"
+        self._session = open_session(options)
+        try:
+            domain = domain_from_env()
+            self._graph = GraphWatch(self._session, domain)
+            begin = monotonic_ns()
+            while monotonic_ns() - begin < LOOK_NS:  # peers that are there find us within retries of a tenth of a second
+                self._look()
+                sleep(0.05)
+            clock = [CLOCK] if CLOCK not in recording.types and topics is None else []
+            members: dict[str, Member] = {}
+            self._members = members  # a member that is let go takes its tokens along
+            self._publishers: dict[str, Publisher] = {}
+            for name in (*self.topics, *clock):
+                row = rules.topics[name]
+                if row.producer not in members:
+                    members[row.producer] = Member(self._session, row.producer, rules, domain)
+                self._publishers[name] = members[row.producer].publisher(row)
+        except BaseException:
+            close_session(self._session)
+            raise
+        self._own_clock = bool(clock)
+        self._encode_clock = codec.encoder(rules.topics[CLOCK].type)
+        self._next_clock = 0
+        self.now = 0
+        """Simulated time reached [ns]."""
+        self.sent = 0
+        self.lag_ms = 0.0
+        """How late a message left, at worst."""
+
+    def _look(self) -> None:
+        """Raises PlayError when a living service of someone else forbids what is played."""
+        self._graph.changes()
+        own = str(self._session.zid())
+        alive = {e.node for e in self._graph.alive.values() if e.kind is Kind.NODE and e.zid != own}
+        rules = contract()
+        for name in self.topics if alive else ():
+            row = rules.topics[name]
+            if row.producer in alive:
+                raise PlayError(
+                    f"{row.producer} lives on this bus and sends {name} itself; play on another bus (--listen) or other topics"
+                )
+            acting = sorted(role for role in row.readers if role in alive and not rules.roles[role].observer)
+            if acting and not self._drive:
+                raise PlayError(f"{', '.join(acting)} would act on {name}; --drive if that is meant")
+
+    def play(self, start: int = 0, until: int | None = None) -> None:
+        """Plays from `start` to `until` [ns]. Latched messages and what was last said before `start` come first.
+
+        Raises PlayError when a service comes alive that must not meet what is played.
+        """
+        self.now = start
+        self._next_clock = start
+        if start > 0:
+            self._prelude(start)
+        epoch = 0
+        for message in self._recording.messages(self.topics, start, until):
+            epoch = epoch or monotonic_ns()  # not before the first chunk is unpacked
+            while self._own_clock and self._next_clock <= message.stamp:
+                self._wait(epoch + round((self._next_clock - start) / self._rate))
+                self._tick()
+            self._wait(epoch + round((message.stamp - start) / self._rate))
+            self.now = message.stamp
+            self._publishers[message.topic].put(message.payload, max(message.sequence, 1))
+            self.sent += 1
+
+    def _prelude(self, start: int) -> None:
+        """What a late joiner would know at `start`: the last message of each topic that is not periodic."""
+        rules = contract()
+        quiet = [name for name in self.topics if not rules.topics[name].periodic]
+        last = {message.topic: message for message in self._recording.messages(quiet, end=start - 1)}
+        for message in last.values():
+            self._publishers[message.topic].put(message.payload, max(message.sequence, 1))
+            self.sent += 1
+
+    def _tick(self) -> None:
+        message = Clock(time_message(self._next_clock))
+        self._publishers[CLOCK].put(self._encode_clock(message), self._next_clock // CLOCK_PERIOD + 1)
+        self._next_clock += CLOCK_PERIOD
+
+    def _wait(self, due: int) -> None:
+        now = monotonic_ns()
+        if now - self._looked > LOOK_NS:
+            self._looked = now
+            self._look()
+        left = due - now
+        if left > 0:
+            sleep(left / NS)
+        else:
+            self.lag_ms = max(self.lag_ms, -left / 1e6)
+
+    def hold(self) -> None:
+        """Stays on the bus, for late joiners of latched topics, until interrupted."""
+        while True:
+            sleep(1.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        close_session(self._session)
+
+
+def _chosen(recording: Recording, rules: Contract, topics: Collection[str] | None) -> tuple[str, ...]:
+    for name in topics or ():
+        if name.strip("/") not in recording.types:
+            raise PlayError(f"--topic {name}: {recording.path} has {', '.join(sorted(recording.types))}")
+    wanted = [name.strip("/") for name in topics] if topics else list(recording.types)
+    unknown = [name for name in wanted if name not in rules.topics]
+    if unknown and topics:
+        raise PlayError(f"--topic {', '.join(unknown)}: not in the contract")
+    return tuple(name for name in wanted if name in rules.topics and recording.counts.get(name))
+
+
+def _options(listen: str | None) -> BusOptions:
+    options = BusOptions.from_env()
+    if listen:
+        return BusOptions(listen=(listen,), connect=options.connect, router=options.router)
+    if not (options.listen or options.connect or options.router or options.file):
+        return BusOptions(listen=(DEFAULT_LISTEN,))
+    return options

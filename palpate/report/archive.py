@@ -1,0 +1,168 @@
+"""evidence.npz: what a report needs of a run, so that it can be made again from the folder without simulating it again.
+
+Columns over time are arrays in SI units. The final map, findings and phantom are kept as they were on the bus, in CDR.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_bus.messages import codec
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_conductor.collector import Collected
+
+FILE: Final = "evidence.npz"
+_MESSAGES: Final = {
+    "stiffness_map": "palpation_msgs/msg/StiffnessMap",
+    "findings": "palpation_msgs/msg/Findings",
+    "phantom": "palpation_msgs/msg/PhantomTruth",
+    "targets": "palpation_msgs/msg/PalpationTargets",
+}
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class EvidenceError(ValueError):
+    """A folder without readable evidence. Names the file and what to do."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that a reader of the report should know of."""
+
+    time_s: float
+    """Simulated."""
+    source: str
+    """exam or driver."""
+    words: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A run as its report sees it; n exam states and m true contacts, in order of time."""
+
+    time: Array
+    """Of the exam states [s], shape (n,)."""
+    phase: NDArray[np.uint8]
+    """ExamState.PHASE_*, shape (n,)."""
+    depth: Array
+    """Measured [m], along the inward normal from the perceived rest surface; negative before contact."""
+    setpoint: Array
+    """[m]"""
+    force: Array
+    """Measured normal force, tared [N]."""
+    in_contact: Mask
+    steady: Mask
+    force_limited: Mask
+    visited: NDArray[np.uint32]
+    """Targets reached so far."""
+    skipped: NDArray[np.uint32]
+    """Targets given up so far."""
+    target_count: int
+    true_time: Array
+    """Of the true contact [s], shape (m,)."""
+    true_depth: Array
+    """[m]"""
+    true_force: Array
+    """Normal force [N]."""
+    events: tuple[Event, ...]
+    stiffness_map: Any | None
+    findings: Any | None
+    phantom: Any | None
+    targets: Any | None
+
+    def phases(self) -> list[tuple[int, float, float]]:
+        """Phase, begin and end [s], in order."""
+        starts = [0, *(np.flatnonzero(np.diff(self.phase.astype(int))) + 1), len(self.phase)]
+        return [(int(self.phase[a]), float(self.time[a]), float(self.time[b - 1])) for a, b in pairwise(starts) if b > a]
+
+
+def _events(collected: Collected) -> list[Event]:
+    """Every new sentence of the examination, and every change of the driver."""
+    events = []
+    before = ""
+    for state in collected.exam_states:
+        if state.message and state.message != before:
+            before = state.message
+            events.append(Event(nanoseconds(state.header.stamp) / NS, "exam", state.message))
+    for status in collected.status_changes:
+        words = status.reason or ("idle", "follows commands", "safe hold")[status.mode]
+        events.append(Event(nanoseconds(status.header.stamp) / NS, "driver", words))
+    return sorted(events, key=lambda event: event.time_s)
+
+
+def write_evidence(path: Path, c: Collected) -> None:
+    """Writes what was collected of a run, complete or not."""
+    states, contacts = c.exam_states, c.indentation
+    events = _events(c)
+    columns: dict[str, Any] = {
+        "time": np.array([nanoseconds(s.header.stamp) / NS for s in states]),
+        "phase": np.array([s.phase for s in states], dtype=np.uint8),
+        **{name: np.array([getattr(s, field) for s in states], dtype=np.float32) for name, field in _FLOATS.items()},
+        **{name: np.array([getattr(s, name) for s in states], dtype=bool) for name in _FLAGS},
+        "visited": np.array([s.target_index for s in states], dtype=np.uint32),
+        "skipped": np.array([s.targets_skipped for s in states], dtype=np.uint32),
+        "target_count": np.array(max((s.target_count for s in states), default=0)),
+        "true_time": np.array([nanoseconds(m.header.stamp) / NS for m in contacts]),
+        "true_depth": np.array([m.depth for m in contacts], dtype=np.float32),
+        "true_force": np.array([m.normal_force for m in contacts], dtype=np.float32),
+        "event_time": np.array([event.time_s for event in events]),
+        "event_source": np.array([event.source for event in events], dtype=np.str_),
+        "event_words": np.array([event.words for event in events], dtype=np.str_),
+    }
+    for name, kind in _MESSAGES.items():
+        message = getattr(c, name)
+        if message is not None:
+            columns[name] = np.frombuffer(codec.encode(message, kind), dtype=np.uint8)
+    np.savez_compressed(path, **columns)
+
+
+_FLOATS: Final = {"depth": "depth", "setpoint": "depth_setpoint", "force": "normal_force"}
+_FLAGS: Final = ("in_contact", "steady", "force_limited")
+
+
+def read_figures(folder: Path) -> dict[str, Any]:
+    """report.json of the run in `folder`, as it stands. Raises OSError or ValueError."""
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    return report
+
+
+def completed(folder: Path) -> dict[str, Any] | None:
+    """report.json of a completed run with its evidence; None where there is none."""
+    with suppress(OSError, ValueError):
+        report = read_figures(folder)
+        return report if report["failure"] is None and (folder / FILE).is_file() else None
+    return None
+
+
+def read_evidence(folder: Path) -> Evidence:
+    """The evidence of the run in `folder`. Raises EvidenceError."""
+    path = folder / FILE
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            held = {name: stored[name] for name in stored.files}
+    except FileNotFoundError as error:
+        raise EvidenceError(f"{path} is not there: give the results folder of a run") from error
+    except (OSError, ValueError, BadZipFile) as error:
+        raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
+    try:
+        times, sources, words = (held.pop(f"event_{name}").tolist() for name in ("time", "source", "words"))
+        events = tuple(map(Event, times, sources, words))
+        messages: dict[str, Any] = {
+            name: codec.decode(held.pop(name).tobytes(), kind) if name in held else None for name, kind in _MESSAGES.items()
+        }
+        columns: dict[str, Any] = {k: v.astype(np.float64) if v.dtype == np.float32 else v for k, v in held.items()}
+        count = int(columns.pop("target_count"))
+        return Evidence(**columns, target_count=count, events=events, **messages)
+    except (KeyError, TypeError, ValueError) as error:
+        raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error

@@ -1,0 +1,139 @@
+"""Collected messages as arrays, for scores, report and figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from palpate.report.scoring import Map, Truth
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_models.frames import apply, inverse
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of a run, in A; m of them."""
+
+    time: Array
+    """[s], shape (m,)."""
+    position: Array
+    """[m], shape (m, 3)."""
+    normal: Array
+    """Shape (m, 3)."""
+    depth: Array
+    """[m]"""
+    force: Array
+    """[N]"""
+    speed: Array
+    """[m/s]"""
+    time_in_contact: Array
+    """[s]"""
+    force_limited: Mask
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Measured and true contact at equal stamps while the examination says it is steady; m instants."""
+
+    measured: Array
+    """Depth as the examination measures it [m]."""
+    true: Array
+    """True depth [m]."""
+    wanted: Array
+    """Depth set-point [m]."""
+    force: Array
+    """Measured normal force [N]."""
+    position: Array
+    """True rest surface point under the indenter [m], shape (m, 3), in A."""
+    limited: Mask
+    """Depth yields to the force limit."""
+
+
+def points(message: Any, field: str = "vertices") -> Array:
+    """A flat array of a message as points, shape (n, 3)."""
+    return np.asarray(getattr(message, field), dtype=np.float64).reshape(-1, 3)
+
+
+def pose_matrix(pose: Any) -> Array:
+    """Homogeneous matrix, shape (4, 4), of a geometry_msgs/Pose."""
+    X = np.eye(4)
+    q, p = pose.orientation, pose.position
+    X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+    X[:3, 3] = p.x, p.y, p.z
+    return X
+
+
+def truth_of(message: Any) -> Truth:
+    """`palpation_msgs/PhantomTruth`."""
+    return Truth(
+        vertices=points(message.surface),
+        triangles=np.asarray(message.surface.triangles, dtype=np.int32).reshape(-1, 3),
+        stiffness=np.asarray(message.stiffness, dtype=np.float64),
+        background=np.asarray(message.background, dtype=np.float64),
+        lesion=np.asarray(message.lesion, dtype=np.int32),
+        X_WA=pose_matrix(message.pose),
+    )
+
+
+def map_of(message: Any) -> Map:
+    """`palpation_msgs/StiffnessMap`."""
+    return Map(
+        vertices=points(message),
+        stiffness=np.asarray(message.stiffness, dtype=np.float64),
+        lower=np.asarray(message.stiffness_lower, dtype=np.float64),
+        upper=np.asarray(message.stiffness_upper, dtype=np.float64),
+        scanned=np.asarray(message.scanned, dtype=bool),
+        finding=np.asarray(message.finding, dtype=np.int32),
+    )
+
+
+def samples_of(messages: list[Any]) -> Samples:
+    """`palpation_msgs/PalpationSample`, in order."""
+
+    def column(values: list[Any], width: int = 0) -> Array:
+        return np.array(values, dtype=np.float64).reshape((-1, width) if width else -1)
+
+    return Samples(
+        time=column([nanoseconds(m.header.stamp) / NS for m in messages]),
+        position=column([(m.position.x, m.position.y, m.position.z) for m in messages], 3),
+        normal=column([(m.normal.x, m.normal.y, m.normal.z) for m in messages], 3),
+        depth=column([m.depth for m in messages]),
+        force=column([m.normal_force for m in messages]),
+        speed=column([m.tangential_speed for m in messages]),
+        time_in_contact=column([m.time_in_contact for m in messages]),
+        force_limited=np.array([m.force_limited for m in messages], dtype=bool),
+    )
+
+
+def peak_force(message: Any) -> float:
+    """Greatest contact force [N] since the `palpation_msgs/IndentationTruth` before, at least that of its own moment."""
+    return max(float(message.peak_force), hypot(message.normal_force, message.tangential_force))
+
+
+def centroids_of(findings: Any | None) -> Array:
+    """Centroids of `palpation_msgs/Findings` [m], shape (k, 3)."""
+    found = [] if findings is None else findings.findings
+    return np.array([(f.centroid.x, f.centroid.y, f.centroid.z) for f in found], dtype=np.float64).reshape(-1, 3)
+
+
+def steady_contact(exam_states: list[Any], indentation: list[Any], X_WA: Array) -> Contact:
+    """Exam states that count, with the true contact at the same stamp. `X_WA`: true pose of A in world."""
+    true = {nanoseconds(m.header.stamp): m for m in indentation}
+    pairs = [(s, true[t]) for s in exam_states if s.steady and (t := nanoseconds(s.header.stamp)) in true]
+    place = [(m.surface_point.x, m.surface_point.y, m.surface_point.z) for _, m in pairs]
+    return Contact(
+        measured=np.array([s.depth for s, _ in pairs]),
+        true=np.array([m.depth for _, m in pairs]),
+        wanted=np.array([s.depth_setpoint for s, _ in pairs]),
+        force=np.array([s.normal_force for s, _ in pairs]),
+        position=apply(inverse(X_WA), np.array(place, dtype=np.float64).reshape(-1, 3)),
+        limited=np.array([s.force_limited for s, _ in pairs], dtype=bool),
+    )

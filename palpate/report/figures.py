@@ -1,0 +1,252 @@
+"""map.png: what the examination felt and what it concludes, next to the truth (figures 7 and 8 of the paper).
+
+Seen from the front, the patient's head up: the patient's right is on the viewer's left, as in every clinical drawing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from palpate.report.evidence import Samples, map_of
+from palpate.report.scoring import Map, TrueSurface, Truth
+from palpate_models.band import half_width
+
+Array = NDArray[np.float64]
+
+INK = "#1b2a33"
+QUIET = "#6b7a83"
+FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS = "viridis", "inferno", "cividis"
+_FINDING, _TRUE = "#18e0d0", "#ffffff"
+_SMALL = 8.5
+_LOG_TICKS = [m * 10.0**e for e in range(4) for m in (1, 1.5, 2, 3, 4, 5, 7)]
+
+
+def drawable(message: Any) -> bool:
+    """Whether a `palpation_msgs/StiffnessMap` has a scanned triangle."""
+    triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
+    return bool(np.asarray(message.scanned, dtype=bool)[triangles].all(axis=1).any())
+
+
+class Drawing:
+    """One map on its axes: triangulations of the scanned part, in millimetres."""
+
+    def __init__(self, message: Any, findings: Any | None, truth: Truth | None) -> None:
+        self.map: Map = map_of(message)
+        self.force = np.asarray(message.force, dtype=np.float64)
+        self.depth = float(message.common_depth)
+        self.background = float(message.background)
+        self.findings = [] if findings is None else list(findings.findings)
+        xyz = self.map.vertices * 1e3
+        triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
+        triangles = triangles[self.map.scanned[triangles].all(axis=1)]
+        self.xyz, self.triangles = xyz, triangles
+        self.tri = Triangulation(xyz[:, 0], xyz[:, 1], triangles)
+        self.true: Array | None = None
+        self.lesion: Array | None = None
+        if truth is not None:
+            surface = TrueSurface(truth)
+            xy = self.map.vertices[:, :2]
+            self.true = np.exp(surface.of(np.log(truth.stiffness), xy))
+            self.lesion = np.nan_to_num(surface.of((truth.lesion >= 0).astype(float), xy))
+
+    @property
+    def stiffness_norm(self) -> LogNorm:
+        """One colour scale [kN/m^3] for the estimate and the truth."""
+        shown = [self.map.stiffness[self.map.scanned]]
+        if self.true is not None:
+            shown.append(self.true[self.map.scanned & np.isfinite(self.true)])
+        values = np.concatenate(shown) * 1e-3
+        return LogNorm(float(np.quantile(values, 0.002)), float(np.quantile(values, 0.998)))
+
+    def plane(self, axes: Axes, values: Array, cmap: str, norm: Normalize) -> ScalarMappable:
+        """The map seen from the front, with quadrants and outlines."""
+        image = axes.tripcolor(self.tri, np.nan_to_num(values), cmap=cmap, norm=norm, shading="gouraud", rasterized=True)
+        low, high = self.xyz[self.triangles].reshape(-1, 3).min(axis=0), self.xyz[self.triangles].reshape(-1, 3).max(axis=0)
+        axes.axhline(0, color="white", lw=0.8, alpha=0.55)
+        axes.axvline(0, color="white", lw=0.8, alpha=0.55)
+        axes.plot(0, 0, "o", ms=5, mfc="none", mec="white", mew=1.1)
+        for name, x, y in (("RUQ", 0, 1), ("LUQ", 1, 1), ("RLQ", 0, 0), ("LLQ", 1, 0)):
+            text = axes.text(
+                0.03 + 0.94 * x, 0.03 + 0.94 * y, name, transform=axes.transAxes, color="white", fontsize=10, weight="bold"
+            )
+            text.set_horizontalalignment("right" if x else "left")
+            text.set_verticalalignment("top" if y else "bottom")
+            text.set_path_effects([withStroke(linewidth=2, foreground=INK)])
+        axes.set_aspect("equal")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        axes.set_xlabel("x, to the patient's left [mm]", fontsize=_SMALL, color=INK)
+        axes.set_ylabel("y, to the head [mm]", fontsize=_SMALL, color=INK)
+        axes.tick_params(labelsize=_SMALL, colors=INK)
+        return image
+
+    def rounded(self, member: Array) -> Array:
+        """Membership averaged over neighbours, so that its half level is an outline and not a staircase."""
+        edges = np.concatenate((self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]))
+        for _ in range(3):
+            total, count = 2.0 * member, np.full(len(member), 2.0)
+            for a, b in (edges.T, edges.T[::-1]):
+                np.add.at(total, a, member[b])
+                np.add.at(count, a, 1.0)
+            member = total / count
+        return member
+
+    def outlines(self, axes: Axes, truth: bool, labels: bool = False) -> None:
+        """Findings, and the truth's half-contrast outline when asked for and known."""
+        for i, f in enumerate(self.findings):
+            member = (self.map.finding == i).astype(float)
+            if not member.any():
+                continue
+            contour = axes.tricontour(self.tri, self.rounded(member), levels=[0.5], colors=[_FINDING], linewidths=2.0)
+            contour.set_path_effects([withStroke(linewidth=3.6, foreground=INK)])
+            x, y = f.centroid.x * 1e3, f.centroid.y * 1e3
+            axes.plot(x, y, "+", color=_FINDING, ms=9, mew=2, path_effects=[withStroke(linewidth=3.6, foreground=INK)])
+            if labels:
+                words = f"{f.stiffness_ratio:.1f} ×\n{f.area * 1e4:.0f} cm²"
+                axes.annotate(
+                    words,
+                    (x, y),
+                    xytext=(0, 12),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=9,
+                    weight="bold",
+                    color="white",
+                    path_effects=[withStroke(linewidth=2.5, foreground=INK)],
+                )
+        if truth and self.lesion is not None and self.lesion.max() > 0.5:
+            contour = axes.tricontour(
+                self.tri, self.rounded(self.lesion), levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--"
+            )
+            contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
+
+    def space(self, axes: Any, height: Array, values: Array, cmap: str, norm: Normalize, label: str) -> None:
+        """The map as a surface in space: `height` above the xy plane, coloured by `values`."""
+        z = height.copy()
+        surface = axes.plot_trisurf(Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles), z, linewidth=0)
+        surface.set_cmap(cmap)
+        surface.set_norm(norm)
+        surface.set_array(values[self.triangles].mean(axis=1))
+        surface.set_edgecolor("none")
+        surface.set_antialiased(False)
+        axes.view_init(elev=30, azim=-62)
+        axes.zaxis.set_major_locator(MaxNLocator(4))
+        axes.set_xlabel("x [mm]", fontsize=_SMALL, labelpad=-2)
+        axes.set_ylabel("y [mm]", fontsize=_SMALL, labelpad=-2)
+        axes.set_zlabel(label, fontsize=_SMALL, labelpad=0)
+        axes.tick_params(labelsize=7.5, pad=-1)
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.pane.set_facecolor("#f4f6f7")
+            axis.pane.set_edgecolor("#d5dbde")
+            axis._axinfo["grid"].update(color="#dfe5e8", linewidth=0.6)
+
+
+def draw_map(path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str) -> None:
+    """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A) with the truth, where known, into a PNG file.
+
+    Nothing is drawn of a map that is not `drawable`.
+    """
+    if not drawable(message):
+        return
+    drawing = Drawing(message, findings, truth)
+    figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)
+    grid = figure.add_gridspec(2, 3)
+    _draw_force(figure, grid, drawing, samples)
+    _draw_stiffness(figure, grid, drawing)
+    figure.suptitle(f"{title}: {_summary(drawing)}", fontsize=15, weight="bold", color=INK)
+    figure.savefig(path)
+
+
+def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -> None:
+    scanned = drawing.map.scanned
+    norm = Normalize(0.0, float(drawing.force[scanned].max()))
+    flat = figure.add_subplot(grid[0, 0])
+    image = drawing.plane(flat, drawing.force, FORCE_COLOURS, norm)
+    flat.plot(samples.position[:, 0] * 1e3, samples.position[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
+    drawing.outlines(flat, truth=False)
+    panel_title(flat, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm depth", f"{len(samples.time)} samples (dots)")
+    colour_bar(figure, image, flat, "force [N]")
+    solid = figure.add_subplot(grid[0, 1], projection="3d")
+    drawing.space(solid, drawing.force, drawing.force, FORCE_COLOURS, norm, "force [N]")
+    solid.set_box_aspect((1, 1, 0.72), zoom=1.14)
+    panel_title(solid, "b", "Normal force in 3-D", "height and colour are force")
+    spread = figure.add_subplot(grid[0, 2])
+    half = 100 * half_width(drawing.map.lower, drawing.map.upper)
+    image = drawing.plane(spread, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
+    drawing.outlines(spread, truth=False)
+    panel_title(spread, "c", "Uncertainty of the stiffness", "half width of the 90 % band")
+    colour_bar(figure, image, spread, "± [%]")
+
+
+def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
+    norm = drawing.stiffness_norm
+    estimate = drawing.map.stiffness * 1e-3
+    flat = figure.add_subplot(grid[1, 0])
+    image = drawing.plane(flat, estimate, STIFFNESS_COLOURS, norm)
+    drawing.outlines(flat, truth=False, labels=True)
+    level = drawing.background * 1e-3
+    panel_title(flat, "d", "Estimated stiffness $k_w$", f"background {level:.0f} kN/m³; finding outlined")
+    colour_bar(figure, image, flat, "$k_w$ [kN/m³]")
+    solid = figure.add_subplot(grid[1, 1], projection="3d")
+    drawing.space(solid, drawing.xyz[:, 2], estimate, STIFFNESS_COLOURS, norm, "z [mm]")
+    solid.set_box_aspect((1, 1, 0.45), zoom=1.14)
+    panel_title(solid, "e", "Estimated stiffness on the abdomen", "perceived surface")
+    true = figure.add_subplot(grid[1, 2])
+    if drawing.true is None:
+        true.set_axis_off()
+        true.text(0.5, 0.5, "truth not known", ha="center", va="center", color=QUIET, fontsize=13)
+        return
+    image = drawing.plane(true, drawing.true * 1e-3, STIFFNESS_COLOURS, norm)
+    drawing.outlines(true, truth=True)
+    panel_title(true, "f", "True stiffness $k_w$", "dashed: true half contrast; solid: finding")
+    colour_bar(figure, image, true, "$k_w$ [kN/m³]")
+
+
+def panel_title(axes: Any, letter: str, words: str, small: str) -> None:
+    """The heading of a panel: what it shows, and under it in small what to know of it."""
+    axes.set_title(f"({letter}) {words}\n", fontsize=12, weight="bold", color=INK, loc="left")
+    place = axes.text2D if hasattr(axes, "text2D") else axes.text
+    place(0.0, 1.02, small, transform=axes.transAxes, fontsize=9, color=QUIET)
+
+
+def colour_bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
+    """A colour bar beside `axes`; on a logarithmic scale with round numbers."""
+    bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02)
+    bar.set_label(label, fontsize=_SMALL, color=INK)
+    if isinstance(image.norm, LogNorm):
+        low, high = image.get_clim()
+        ticks = [t for t in _LOG_TICKS if (low or 0.0) <= t <= (high or 0.0)]
+        bar.ax.yaxis.set_major_locator(FixedLocator(ticks))
+        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        bar.ax.yaxis.set_minor_locator(NullLocator())
+        bar.ax.yaxis.set_minor_formatter(NullFormatter())
+    bar.ax.tick_params(labelsize=_SMALL, colors=INK)
+    bar.outline.set_visible(False)
+
+
+def _percent(confidence: float) -> str:
+    return f"{100 * confidence:.0f} %" if confidence < 0.99 else "over 99 %"
+
+
+def _summary(drawing: Drawing) -> str:
+    if not drawing.findings:
+        return "no finding"
+    return "; ".join(
+        f"{f.quadrant}, {f.stiffness_ratio:.1f} times stiffer "
+        f"({f.stiffness_ratio_lower:.1f} to {f.stiffness_ratio_upper:.1f}), confidence {_percent(f.confidence)}"
+        for f in drawing.findings
+    )

@@ -1,0 +1,162 @@
+"""report.html: one page without references to anything outside, for a clinician or an engineer. Made from a run's folder.
+
+What the examination found stands first; what the simulation knows of the truth stands apart, at the end.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from palpate.report import page_figures, page_surface
+from palpate.report.archive import Evidence, EvidenceError, read_evidence
+from palpate.report.results import FindingRow, Report
+from palpate_models.frames import apply, inverse
+from palpate_models.load import ScenarioError, exam_input, load_scenario
+from palpate_models.phantom import quadrant
+from palpate_models.scenario import Scenario
+
+FILE: Final = "report.html"
+QUADRANTS: Final = {
+    "RUQ": "right upper quadrant",
+    "LUQ": "left upper quadrant",
+    "RLQ": "right lower quadrant",
+    "LLQ": "left lower quadrant",
+}
+_PERCENT: Final = 100.0
+
+Array = NDArray[np.float64]
+
+
+def read_report(folder: Path) -> Report:
+    """report.json of the run in `folder`. Raises EvidenceError that says what is wrong with it."""
+    path = folder / "report.json"
+    try:
+        return Report.model_validate_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise EvidenceError(f"{path} is not there: give the results folder of a run") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise EvidenceError(f"{path} cannot be read: {error}") from error
+    except ValidationError as error:
+        wrong = (f"{'.'.join(map(str, item['loc'])) or 'the file'}: {item['msg']}" for item in error.errors())
+        raise EvidenceError(f"{path} is no report of this version: {'; '.join(wrong)}") from error
+
+
+def write_page(folder: Path) -> Path:
+    """Writes report.html into the results folder of a run; returns its path. Raises EvidenceError."""
+    report, evidence = read_report(folder), read_evidence(folder)
+    try:
+        scenario = load_scenario(str(folder / "scenario.yaml"))
+    except ScenarioError as error:
+        raise EvidenceError(str(error)) from error
+    path = folder / FILE
+    path.write_text(render(scenario, report, evidence, sample_places(folder)), encoding="utf-8")
+    return path
+
+
+def sample_places(folder: Path) -> Array:
+    """Where samples were taken, xy of A [m], shape (n, 2), from samples.csv. Raises EvidenceError."""
+    path = folder / "samples.csv"
+    try:
+        _, *rows = path.read_text(encoding="utf-8").splitlines()
+        return np.loadtxt(rows, delimiter=",", usecols=(1, 2), ndmin=2) if rows else np.empty((0, 2))
+    except (OSError, ValueError) as error:
+        raise EvidenceError(f"{path} cannot be read: {error}") from error
+
+
+def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: Array) -> str:
+    """The page as HTML."""
+    environment = Environment(loader=PackageLoader("palpate.report"), autoescape=True, undefined=StrictUndefined)
+    environment.filters["mm"] = lambda metres, digits=0: f"{1e3 * metres:.{digits}f} mm"
+    environment.filters["plus_mm"] = lambda metres: f"{1e3 * metres:+.0f}"
+    skipped = _skipped(scenario, report, evidence)
+    places = np.array([row["place"] for row in skipped if row["place"] is not None], dtype=np.float64).reshape(-1, 2)
+    solid = None if evidence.stiffness_map is None else page_surface.surface(evidence.stiffness_map)
+    template = environment.get_template("report.html.j2")
+    return template.render(
+        scenario=scenario,
+        report=report,
+        evidence=evidence,
+        verdict=verdict(report),
+        confidence=confidence,
+        quadrants=QUADRANTS,
+        skipped=skipped,
+        safety=_safety(report, evidence),
+        targets=evidence.target_count,
+        layers=None if solid is None else solid[0],
+        surface=None if solid is None else Markup(json.dumps(solid[1])),
+        viewer=Markup((Path(__file__).parent / "templates" / "surface.js").read_text(encoding="utf-8")),
+        maps=_image(page_figures.maps(evidence, samples_xy, places)),
+        record=_image(page_figures.record(evidence, scenario.limits.force_working_n)),
+        force_depth=_image(page_figures.force_depth(evidence)),
+        truth=_image(page_figures.truth(evidence)),
+        version=version("palpate"),
+    )
+
+
+def confidence(value: float) -> str:
+    """A probability in words: no finding is certain."""
+    return "over 99 %" if value > 0.99 else f"{_PERCENT * value:.0f} %"
+
+
+def verdict(report: Report) -> str:
+    """The result in a sentence."""
+    if report.failure:
+        return f"The examination did not complete: {report.failure}."
+    if not report.assessed:
+        return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
+    if not report.findings:
+        return f"No area was found that is stiffer than healthy variation explains{_unreached(report)}."
+    return " ".join(_in_words(finding) for finding in report.findings)
+
+
+def _unreached(report: Report) -> str:
+    n = report.skipped_targets
+    return f"; {n} target{'s were' if n > 1 else ' was'} skipped, and nothing is known of what lies there" if n else ""
+
+
+def _in_words(f: FindingRow) -> str:
+    low, high = f.stiffness_ratio_90
+    where = QUADRANTS.get(f.quadrant, f.quadrant)
+    return (
+        f"A stiff area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.stiffness_ratio:.1f} times as stiff as the rest "
+        f"(90 % band {low:.1f} to {high:.1f}), confidence {confidence(f.confidence)}."
+    )
+
+
+def _image(png: bytes | None) -> str | None:
+    """A PNG as a data URL."""
+    return None if png is None else "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def _skipped(scenario: Scenario, report: Report, evidence: Evidence) -> list[dict[str, Any]]:
+    """The targets that were given up: number, reason, and where they are in A, if it is known."""
+    reasons = report.services.get("planning", {}).get("facts", {}).get("skipped_targets", {})
+    X_AW = inverse(np.array(exam_input(scenario).X_WA))
+    known = [] if evidence.targets is None else evidence.targets.positions
+    rows = []
+    for number, why in sorted(reasons.items(), key=lambda item: int(item[0])):
+        i = int(number)
+        place = None
+        if i < len(known):
+            p = known[i]
+            x, y, _ = apply(X_AW, np.array([(p.x, p.y, p.z)]))[0]
+            place = (float(x), float(y))
+        rows.append({"number": i, "why": why, "place": place, "quadrant": "" if place is None else quadrant(*place)})
+    return rows
+
+
+def _safety(report: Report, evidence: Evidence) -> list[tuple[float, str, str]]:
+    """Time [s], source and words of what a safety review wants to see: changes of the driver, losses, rejected commands."""
+    rows = [(event.time_s, event.source, event.words) for event in evidence.events if event.source == "driver"]
+    rows += [(t, role, "lost: it fell silent") for role, t in report.lost.items()]
+    return sorted(rows)

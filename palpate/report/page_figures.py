@@ -1,0 +1,190 @@
+"""The still figures of report.html, each as the bytes of a PNG. The truth is drawn by `truth` alone."""
+
+from __future__ import annotations
+
+import io
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from palpate.report.archive import Evidence
+from palpate.report.evidence import truth_of
+from palpate.report.figures import (
+    FORCE_COLOURS,
+    INK,
+    QUIET,
+    STIFFNESS_COLOURS,
+    UNCERTAINTY_COLOURS,
+    Drawing,
+    colour_bar,
+    drawable,
+    panel_title,
+)
+from palpate_bus.messages import ExamState
+from palpate_models.band import half_width
+
+Array = NDArray[np.float64]
+
+MEASURED: Final = "#c2410c"
+TRUE: Final = "#7c3aed"
+LIMIT: Final = "#b91c1c"
+_PHASE_TINTS: Final = {
+    ExamState.PHASE_LOOK: ("look", "#dbeafe"),
+    ExamState.PHASE_PLAN: ("plan", "#ede9fe"),
+    ExamState.PHASE_APPROACH: ("approach", "#e2e8f0"),
+    ExamState.PHASE_INDENT: ("indent", "#fef3c7"),
+    ExamState.PHASE_SCAN: ("scan", "#ffedd5"),
+    ExamState.PHASE_RETRACT: ("retract", "#e2e8f0"),
+    ExamState.PHASE_ASSESS: ("assess", "#dcfce7"),
+    ExamState.PHASE_ABORTED: ("aborted", "#fecaca"),
+}
+_FREE_MM: Final = -20.0
+"""Depth is not drawn where the tool is farther than this from the surface."""
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), dpi=110, facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", pil_kwargs={"optimize": True})
+    return stream.getvalue()
+
+
+def _plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
+    axes.set_ylabel(ylabel, color=INK, fontsize=9)
+    axes.set_xlabel(xlabel, color=INK, fontsize=9)
+    axes.tick_params(labelsize=8.5, colors=INK)
+    axes.grid(color="#e5e9ec", lw=0.7)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | None:
+    """Force, stiffness and uncertainty from the front; `samples_xy`, `skipped_xy`: where was pressed and where not, in A [m].
+
+    None when there is no map.
+    """
+    message = evidence.stiffness_map
+    if message is None or not drawable(message):
+        return None
+    drawing = Drawing(message, evidence.findings, None)
+    scanned = drawing.map.scanned
+    figure = _figure(15.5, 5.0)
+    left, middle, right = figure.subplots(1, 3)
+    image = drawing.plane(left, drawing.force, FORCE_COLOURS, Normalize(0.0, float(drawing.force[scanned].max())))
+    left.plot(samples_xy[:, 0] * 1e3, samples_xy[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
+    left.plot(skipped_xy[:, 0] * 1e3, skipped_xy[:, 1] * 1e3, "x", ms=6, mew=1.6, color="#f43f5e")
+    drawing.outlines(left, truth=False)
+    skipped = f", {len(skipped_xy)} targets skipped (crosses)" if len(skipped_xy) else ""
+    panel_title(left, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", f"{len(samples_xy)} samples (dots){skipped}")
+    colour_bar(figure, image, left, "force [N]")
+    image = drawing.plane(middle, drawing.map.stiffness / drawing.background, STIFFNESS_COLOURS, _ratio_norm(drawing))
+    drawing.outlines(middle, truth=False, labels=True)
+    panel_title(middle, "b", "Stiffness", "times the background; findings outlined")
+    colour_bar(figure, image, middle, "times background")
+    half = 100 * half_width(drawing.map.lower, drawing.map.upper)
+    image = drawing.plane(right, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
+    drawing.outlines(right, truth=False)
+    panel_title(right, "c", "How sure", "half width of the 90 % band of the stiffness")
+    colour_bar(figure, image, right, "± [%]")
+    return _png(figure)
+
+
+def _ratio_norm(drawing: Drawing) -> LogNorm:
+    ratio = (drawing.map.stiffness / drawing.background)[drawing.map.scanned]
+    return LogNorm(float(np.quantile(ratio, 0.002)), max(2.0, float(np.quantile(ratio, 0.998))))
+
+
+def record(evidence: Evidence, limit_n: float) -> bytes | None:
+    """Force and depth over simulated time, with the phases behind them; None when nothing happened."""
+    if not len(evidence.time):
+        return None
+    figure = _figure(15.5, 5.2)
+    force, depth = figure.subplots(2, 1, sharex=True)
+    labelled: set[str] = set()
+    for phase, begin, end in evidence.phases():
+        name, tint = _PHASE_TINTS.get(phase, ("", ""))
+        if name:
+            for axes in (force, depth):
+                axes.axvspan(begin, end, color=tint, lw=0, label="_" if name in labelled or axes is depth else name)
+            labelled.add(name)
+    force.plot(evidence.time, evidence.force, color=MEASURED, lw=0.7, label="measured force")
+    force.axhline(limit_n, color=LIMIT, lw=1, ls="--", label=f"working limit {limit_n:g} N")
+    if evidence.force_limited.any():
+        at = evidence.force_limited
+        force.plot(evidence.time[at], evidence.force[at], ".", ms=2, color=LIMIT, label="depth yields to the limit")
+    _plain(force, "normal force [N]")
+    measured = np.where(evidence.depth * 1e3 > _FREE_MM, evidence.depth * 1e3, np.nan)
+    wanted = np.where(evidence.setpoint * 1e3 > _FREE_MM, evidence.setpoint * 1e3, np.nan)
+    depth.plot(evidence.time, wanted, color=QUIET, lw=1.4, label="set-point")
+    depth.plot(evidence.time, measured, color=MEASURED, lw=0.7, label="measured depth")
+    _plain(depth, "depth [mm]", "simulated time [s]")
+    depth.set_ylim(-5, None)
+    for axes in (force, depth):
+        axes.legend(fontsize=8.5, ncols=9, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    force.set_xlim(evidence.time[0], evidence.time[-1])
+    return _png(figure)
+
+
+def force_depth(evidence: Evidence) -> bytes | None:
+    """Force against depth in contact, coloured by time; None without contact."""
+    held = evidence.in_contact
+    if not held.any():
+        return None
+    figure = _figure(5.6, 4.4)
+    axes = figure.subplots()
+    image = axes.scatter(
+        evidence.depth[held] * 1e3, evidence.force[held], c=evidence.time[held], s=2, cmap="viridis", rasterized=True
+    )
+    _plain(axes, "measured normal force [N]", "measured depth [mm]")
+    colour_bar(figure, image, axes, "simulated time [s]")
+    return _png(figure)
+
+
+def truth(evidence: Evidence) -> bytes | None:
+    """True stiffness with the findings' outlines, and the error of the depth; None when either is not known."""
+    message = evidence.stiffness_map
+    if evidence.phantom is None or message is None or not drawable(message):
+        return None
+    drawing = Drawing(message, evidence.findings, truth_of(evidence.phantom))
+    if drawing.true is None:
+        return None
+    figure = _figure(15.5, 5.0)
+    left, middle, right = figure.subplots(1, 3)
+    image = drawing.plane(left, drawing.true * 1e-3, STIFFNESS_COLOURS, drawing.stiffness_norm)
+    drawing.outlines(left, truth=True)
+    panel_title(left, "d", "True stiffness $k_w$", "dashed: true half contrast; solid: finding")
+    colour_bar(figure, image, left, "$k_w$ [kN/m³]")
+    error = 100 * (drawing.map.stiffness / drawing.true - 1)
+    reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
+    image = drawing.plane(middle, error, "RdBu_r", Normalize(-reach, reach))
+    drawing.outlines(middle, truth=True)
+    panel_title(middle, "e", "Error of the estimate", "estimated over true stiffness, less one")
+    colour_bar(figure, image, middle, "[%]")
+    _depth_errors(right, evidence)
+    return _png(figure)
+
+
+def _depth_errors(axes: Axes, evidence: Evidence) -> None:
+    true = np.interp(evidence.time, evidence.true_time, evidence.true_depth)
+    steady = evidence.steady
+    bins = np.linspace(-0.6, 0.6, 61)
+    for values, color, label in (
+        (true - evidence.setpoint, TRUE, "true depth less set-point"),
+        (evidence.depth - true, MEASURED, "measured less true depth"),
+    ):
+        axes.hist(np.clip(values[steady] * 1e3, -0.6, 0.6), bins=bins.tolist(), color=color, alpha=0.55, label=label)
+    _plain(axes, "readings in steady contact", "depth error [mm]")
+    axes.legend(fontsize=8.5, frameon=False)
+    panel_title(axes, "f", "Error of the depth", "in steady contact")

@@ -1,0 +1,110 @@
+"""The abdomen in 3-D for report.html: what the page's viewer (templates/surface.js) reads."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm, Normalize, to_hex
+from numpy.typing import NDArray
+
+from palpate.report.evidence import map_of
+from palpate.report.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS
+from palpate_models.band import half_width
+
+Array = NDArray[np.float64]
+MAX_VERTICES = 65_535
+"""The viewer's indices have 16 bits."""
+_UNKNOWN = 0.80
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One way to look at the surface."""
+
+    name: str
+    colors: tuple[str, ...]
+    """Of its scale, from low to high, as #rrggbb."""
+    ticks: tuple[str, ...]
+    """Words of the scale, evenly spaced from low to high."""
+
+
+def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
+    """Layers and data of the viewer for a `palpation_msgs/StiffnessMap`; None when there is nothing to see."""
+    mapped = map_of(message)
+    triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
+    whole = mapped.scanned[triangles].all(axis=1)
+    triangles = np.concatenate((triangles[whole], triangles[~whole]))
+    if not mapped.scanned.any() or len(mapped.vertices) > MAX_VERTICES:
+        return None
+    shape = mapped.vertices - mapped.vertices[mapped.scanned].mean(axis=0)
+    radius = 0.8 * float(np.linalg.norm(shape[:, :2], axis=1).max())
+    force = np.asarray(message.force, dtype=np.float64)
+    ratio = mapped.stiffness / float(message.background)
+    known = mapped.scanned
+    half = 100 * half_width(mapped.lower, mapped.upper)
+    low, high = float(np.quantile(ratio[known], 0.01)), max(2.0, float(np.quantile(ratio[known], 0.99)))
+    relief = np.column_stack((shape[:, :2], np.where(known, force, 0.0) * (0.7 * radius / max(force[known].max(), 1e-9))))
+    relief[:, 2] -= relief[known, 2].mean()
+    layers: list[tuple[Layer, Array, Array, bool]] = []
+
+    def add(name: str, positions: Array, values: Array, norm: Normalize, cmap: str, form: str, outlined: bool) -> None:
+        scale = colormaps[cmap]
+        colors = np.where(known[:, None], scale(norm(values))[:, :3], _UNKNOWN)
+        stops = tuple(to_hex(scale(x)) for x in np.linspace(0, 1, 9))
+        ticks = tuple(form.format(float(norm.inverse(x))) for x in np.linspace(0, 1, 5))
+        layers.append((Layer(name, stops, ticks), positions, colors, outlined))
+
+    add("stiffness on the skin", shape, ratio, LogNorm(low, high, clip=True), STIFFNESS_COLOURS, "{:.1f} ×", True)
+    force_norm = Normalize(0.0, float(force[known].max()), clip=True)
+    add("force as height", relief, force, force_norm, FORCE_COLOURS, "{:.1f} N", False)
+    top = Normalize(0.0, float(np.quantile(half[known], 0.995)), clip=True)
+    add("uncertainty on the skin", shape, half, top, UNCERTAINTY_COLOURS, "± {:.0f} %", True)
+    data = {
+        "radius": radius,
+        "triangles": _text(triangles.astype(np.uint16)),
+        "outline": _text(_outline(shape, triangles, mapped.finding >= 0)),
+        "layers": [
+            {
+                "positions": _text(positions.astype(np.float32)),
+                "normals": _text(_normals(positions, triangles[: None if outlined else whole.sum()]).astype(np.float32)),
+                "colors": _text(np.round(255 * colors).astype(np.uint8)),
+                "outlined": outlined,
+                "corners": 3 * (len(triangles) if outlined else int(whole.sum())),
+            }
+            for _, positions, colors, outlined in layers
+        ],
+    }
+    return [layer for layer, *_ in layers], data
+
+
+def _text(array: NDArray[Any]) -> str:
+    little = array.astype(array.dtype.newbyteorder("<"))
+    return base64.b64encode(np.ascontiguousarray(little).tobytes()).decode("ascii")
+
+
+def _normals(vertices: Array, triangles: NDArray[np.int64]) -> Array:
+    """Area-weighted vertex normals, not yet of unit length, shape (n, 3)."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], np.cross(b - a, c - a))
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
+
+
+def _outline(vertices: Array, triangles: NDArray[np.int64], member: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Segments between the midpoints of edges that leave a finding, a little above the surface, shape (k, 2, 3)."""
+    count = member[triangles].sum(axis=1)
+    crossed = triangles[(count == 1) | (count == 2)]
+    if not len(crossed):
+        return np.empty((0, 2, 3), dtype=np.float32)
+    flags = member[crossed]
+    alone = np.where(flags.sum(axis=1) == 1, flags.argmax(axis=1), (~flags).argmax(axis=1))
+    rows = np.arange(len(crossed))
+    tip = vertices[crossed[rows, alone]]
+    ends = [(tip + vertices[crossed[rows, (alone + step) % 3]]) / 2 for step in (1, 2)]
+    raised = np.stack(ends, axis=1) + np.array((0.0, 0.0, 0.001))
+    return np.asarray(raised, dtype=np.float32)

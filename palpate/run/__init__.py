@@ -1,0 +1,1 @@
+"""Starting and conducting a run, with its processes or in one process."""

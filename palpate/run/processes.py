@@ -1,0 +1,214 @@
+"""The process list: docker-compose.yml, read for local processes too, so that there is one list."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+from typing import IO, Any
+
+import yaml
+
+from palpate.__main__ import FIXED
+from palpate.run.forks import Child, Forks
+from palpate.run.secure import SecureBus
+from palpate_bus.runs.announcement import Announcement, Run
+from palpate_bus.wire.zenoh_config import domain_from_env, mesh
+
+COMPOSE = "docker-compose.yml"
+BARRIER = ("robot", "control", "tissue")
+"""The roles of the 1 kHz loop: they talk over zenoh's low-latency transport (see palpate_bus.wire.zenoh_config)."""
+
+
+class ProcessListError(ValueError):
+    """The compose file cannot be used. Names file, service and field."""
+
+
+@dataclass(frozen=True)
+class ServiceProcess:
+    """A service of the compose file: its role, command and environment."""
+
+    role: str
+    command: tuple[str, ...]
+    environment: Mapping[str, str]
+
+
+def override_files() -> tuple[Path, ...]:
+    """The overrides that PALPATE_COMPOSE names after the compose file, separated as in a PATH."""
+    return tuple(map(Path, os.environ.get("PALPATE_COMPOSE", "").split(os.pathsep)[1:]))
+
+
+def compose_file() -> Path:
+    """The compose file: PALPATE_COMPOSE, else in the current folder, else in the checkout that holds this package.
+
+    Raises ProcessListError when there is none.
+    """
+    named = os.environ.get("PALPATE_COMPOSE", "").partition(os.pathsep)[0]
+    candidates = [Path(named)] if named else [Path.cwd() / COMPOSE, *(p / COMPOSE for p in Path(__file__).resolve().parents)]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise ProcessListError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates[:2]))}. Set PALPATE_COMPOSE")
+
+
+def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path] = ()) -> dict[str, ServiceProcess]:
+    """The processes of `roles`, in that order, from a compose file and overrides, merged as `docker compose -f -f` merges them:
+    a later file's command stands in place of the earlier one, its environment is added.
+
+    Raises ProcessListError naming what is missing or malformed.
+    """
+    found: dict[str, ServiceProcess] = {}
+    for file in (path, *overrides):
+        services = _services(file)
+        for role in roles:
+            service = services.get(role)
+            if service is None and role not in found:
+                raise ProcessListError(f"{file}: no service {role!r}; it has {', '.join(services)}")
+            if service is not None:
+                found[role] = _merged(file, role, service, found.get(role))
+    return found
+
+
+def _services(path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ProcessListError(f"{path}: cannot be read: {error}") from error
+    services = document.get("services") if isinstance(document, dict) else None
+    if not isinstance(services, dict):
+        raise ProcessListError(f"{path}: services: want a mapping")
+    return services
+
+
+def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceProcess | None) -> ServiceProcess:
+    if not isinstance(service, dict):
+        raise ProcessListError(f"{path}: services.{role} = {service!r}: want a mapping")
+    command = service.get("command", None if earlier is None else list(earlier.command))
+    if not command or not isinstance(command, list) or not all(isinstance(word, str) for word in command):
+        raise ProcessListError(f"{path}: services.{role}.command = {command!r}: want a list of words")
+    environment = service.get("environment") or {}
+    if not isinstance(environment, dict):
+        raise ProcessListError(f"{path}: services.{role}.environment: want a mapping")
+    before = {} if earlier is None else earlier.environment
+    return ServiceProcess(role, tuple(command), {**before, **{k: str(v) for k, v in environment.items()}})
+
+
+def how(code: int, log: Path) -> str:
+    """How a process ended, in words: its signal, or its exit status `code` and the last line of its log."""
+    if code < 0:
+        return f"killed by signal {-code}"
+    lines: list[str] = []
+    with suppress(OSError):
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    hint = "" if code else ": does it call palpate_bus.run.main?"
+    said = next((line.strip() for line in reversed(lines) if line.strip()), f"it said nothing{hint}")
+    return f"left with status {code}: {said}"
+
+
+class LocalProcesses:
+    """Service processes on this machine, each with its log file; unix sockets in a folder of their own carry the bus."""
+
+    def __init__(
+        self,
+        roles: tuple[str, ...],
+        out: Path,
+        scenario_files: Mapping[str, Path],
+        extra: Mapping[str, str],
+        secure: SecureBus | None = None,
+        forks: Forks | None = None,
+    ) -> None:
+        """`scenario_files` gives the scenario that each role may see; with `secure` all are clients of its router.
+
+        `forks` starts the processes in place of a fresh interpreter each.
+        """
+        self._forks = forks
+        self._out = out
+        self._scenario_files = scenario_files
+        self._extra = dict(extra)
+        self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
+        router = secure.endpoint if secure else os.environ.get("PALPATE_ROUTER") or None
+        bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
+        self.bus = {role: replace(options, router=router) for role, options in bus.items()}
+        """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
+        endpoints = {role: options.listen[0] for role, options in bus.items()}
+        if secure is not None:
+            self.bus = {role: secure.options(role) for role in bus}
+            endpoints = dict.fromkeys(bus, secure.endpoint)
+        domain = domain_from_env()
+        (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
+        self._announcement = Announcement(
+            Run(
+                name=out.name,
+                endpoints=endpoints,
+                domain=domain,
+                runtime=self._extra.get("PALPATE_RUNTIME", "lockstep"),
+                router=router,
+                out=str(out),
+                keys=None if secure is None else str(secure.keys),
+            )
+        )
+        self._logs: list[IO[bytes]] = []
+        self.running: dict[str, Child] = {}
+        self._ends: dict[str, str] = {}
+
+    def environment(self, process: ServiceProcess) -> dict[str, str]:
+        """What a service is given beyond the environment of this process."""
+        return {
+            **{k: v for k, v in process.environment.items() if not k.startswith("PALPATE_ROUTER")},
+            **FIXED,
+            "PALPATE_SCENARIO": str(self._scenario_files[process.role]),
+            "PALPATE_OUT": str(self._out),
+            **self.bus[process.role].to_env(),
+            **self._extra,
+        }
+
+    def start(self, process: ServiceProcess) -> None:
+        """Starts a service."""
+        self._ends.pop(process.role, None)
+        environment = {**os.environ, **self.environment(process)}
+        path = self._out / "logs" / f"{process.role}.log"
+        if self._forks is not None:
+            self.running[process.role] = self._forks.start(process.command, environment, path)
+            return
+        log = path.open("wb")
+        self._logs.append(log)
+        command = [sys.executable if process.command[0] == "python" else process.command[0], *process.command[1:]]
+        self.running[process.role] = subprocess.Popen(
+            command,
+            env=environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            process_group=0,  # Ctrl-C is the conductor's to hear: it ends the run, and the recorder closes its files
+        )
+
+    def ended(self) -> dict[str, str]:
+        """How each process that has ended did so, by role: by a signal, or with a status and the last line of its log."""
+        for role, child in self.running.items():
+            if role not in self._ends and (code := child.poll()) is not None:
+                self._ends[role] = how(code, self._out / "logs" / f"{role}.log")
+        return dict(self._ends)
+
+    def stop(self, patience_s: float = 5.0) -> None:
+        """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets."""
+        for send in (None, signal.SIGTERM, signal.SIGKILL):
+            left = [child for child in self.running.values() if child.poll() is None]
+            deadline = monotonic() + patience_s
+            for child in left:
+                if send is not None:
+                    child.send_signal(send)
+            for child in left:
+                with suppress(subprocess.TimeoutExpired):
+                    child.wait(timeout=max(0.0, deadline - monotonic()))
+        for log in self._logs:
+            log.close()
+        self._announcement.withdraw()
+        shutil.rmtree(self._folder, ignore_errors=True)

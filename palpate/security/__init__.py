@@ -1,0 +1,1 @@
+"""Commands of the secure mode: certificates and the router."""

@@ -1,0 +1,56 @@
+"""`palpate keys`: certificates for the secure mode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from palpate.command_line import refuse
+from palpate_bus.security.keys import CA_KEY, DAYS, KeysError, certificates, init, members
+
+app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
+
+Folder = Annotated[Path, typer.Argument(help="Folder of the keys.")]
+DEFAULT = Path("keys")
+
+
+@app.command("init")
+def make(
+    folder: Folder = DEFAULT,
+    host: Annotated[list[str] | None, typer.Option(help="Name or address of the router; may be repeated.")] = None,
+    name: Annotated[list[str] | None, typer.Option(help="For whom; by default all roles, router, viewer and operator.")] = None,
+    days: Annotated[int, typer.Option(min=1, help="How long certificates hold.")] = DAYS,
+) -> None:
+    """Make an authority and a certificate a role; what is there and still holds is kept."""
+    console = Console(stderr=True)
+    for known in name or ():
+        if known not in members():
+            refuse(f"--name {known}: members are {', '.join(members())}")
+    try:
+        made = init(folder, name or (), host or (), days)
+    except (KeysError, OSError, ValueError) as error:
+        refuse(error)
+    console.print(
+        f"{len(made)} new in {folder}: {', '.join(c.name for c in made)}" if made else f"{folder}: all hold", highlight=False
+    )
+    console.print(
+        f"give each member its own folder only; keep {folder / CA_KEY} away from the machines of a run", highlight=False
+    )
+
+
+@app.command()
+def show(folder: Folder = DEFAULT) -> None:
+    """List the certificates of a folder, until when they hold, and their fingerprints."""
+    try:
+        found = certificates(folder)
+    except KeysError as error:
+        refuse(error)
+    table = Table("name", "holds until", "SHA-256", box=None)
+    for certificate in found:
+        until = f"{certificate.until:%Y-%m-%d}" + (" [red]expired[/]" if certificate.expired else "")
+        table.add_row(certificate.name, until, certificate.fingerprint[:32])
+    Console().print(table)

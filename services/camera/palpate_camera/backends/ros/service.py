@@ -1,0 +1,190 @@
+"""The bridge: a ROS 2 camera's depth image, camera_info and tf_static in place of the simulated camera's.
+
+| variable | default | meaning |
+|---|---|---|
+| `PALPATE_CAMERA_ROUTER` | `tcp/127.0.0.1:7447` | zenoh endpoint of the ROS side, its rmw_zenohd |
+| `PALPATE_CAMERA_DOMAIN` | 0 | its ROS domain |
+| `PALPATE_CAMERA_IMAGE` | `camera/depth/image_rect_raw` | depth, 16UC1 [mm] or 32FC1 [m]; rectified if so called (`rect`) |
+| `PALPATE_CAMERA_INFO` | `camera/depth/camera_info` | its intrinsics |
+| `PALPATE_CAMERA_FRAME` | `camera_depth_optical_frame` | its optical frame |
+| `PALPATE_CAMERA_WORLD` | `world` | the ROS frame that is our world: floor under the robot, z up, x to the table |
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from time import monotonic, sleep
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate_bus.messages import CameraInfo, Image, Quaternion, TFMessage, Transform, TransformStamped, Vector3
+from palpate_bus.messages.stamps import header
+from palpate_bus.run import runtime
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.wire.ros_node import RosNode
+from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_camera.backends.ros.convert import Array, CameraError, chain, depth_metres
+from palpate_models.scenario import Scenario
+
+FRAME = "camera_depth_optical_frame"
+POSE_WAIT_S = 20.0
+"""How long the camera's pose is waited for before the run."""
+
+
+class CameraPort(ABC):
+    """The ROS side, as the bridge sees it."""
+
+    rectified: bool = False
+    """Whether its images are rectified: then `camera_info`'s P holds for them, else its K and distortion."""
+
+    @abstractmethod
+    def images(self) -> list[Any]:
+        """sensor_msgs/Image since last time, oldest first."""
+
+    @abstractmethod
+    def info(self) -> Any | None:
+        """The newest sensor_msgs/CameraInfo."""
+
+    @abstractmethod
+    def transforms(self) -> list[Any]:
+        """geometry_msgs/TransformStamped of tf_static since last time."""
+
+
+class ZenohCamera(CameraPort):
+    """Over zenoh, as rmw_zenoh does."""
+
+    def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
+        """Joins. Raises BusConfigError."""
+        domain = int(environ.get("PALPATE_CAMERA_DOMAIN") or 0)
+        router = environ.get("PALPATE_CAMERA_ROUTER") or "tcp/127.0.0.1:7447"
+        self._node = RosNode("palpate_camera.backends.ros", domain, BusOptions(router=router))
+        image = (environ.get("PALPATE_CAMERA_IMAGE") or "camera/depth/image_rect_raw").strip("/")
+        info = (environ.get("PALPATE_CAMERA_INFO") or "camera/depth/camera_info").strip("/")
+        self.rectified = "rect" in image.rpartition("/")[2]  # image_proc's names: image_rect, image_rect_raw
+        self._images = self._node.subscription(image, "sensor_msgs/msg/Image")
+        self._infos = self._node.subscription(info, "sensor_msgs/msg/CameraInfo")
+        self._tf = self._node.subscription("tf_static", "tf2_msgs/msg/TFMessage", latched=True)
+        self._info: Any | None = None
+
+    def images(self) -> list[Any]:
+        """Images since last time."""
+        return self._images.take()
+
+    def info(self) -> Any | None:
+        """The newest intrinsics."""
+        self._info = self._infos.newest() or self._info
+        return self._info
+
+    def transforms(self) -> list[Any]:
+        """Static transforms since last time."""
+        return [item for message in self._tf.take() for item in message.transforms]
+
+
+class RosCameraService(Service):
+    """Passes on a burst of frames after each trigger."""
+
+    role: ClassVar[str] = "camera"
+
+    def __init__(self, port: CameraPort, frame: str = FRAME, world: str = "world", wait_s: float = POSE_WAIT_S) -> None:
+        """Waits for the camera's pose. Raises CameraError naming the frames that are known when it does not come."""
+        self._port, self._frame = port, frame
+        self._X_WC = _await_pose(port, frame, world, wait_s)
+        self._wanted = 0
+        self._facts = {"bursts": 0, "frames": 0, "frames_rejected": 0}
+        self._problem = ""
+
+    def start(self) -> Outbox:
+        """The calibrated pose of the optical frame in world, latched."""
+        x, y, z, w = (float(v) for v in Rotation.from_matrix(self._X_WC[:3, :3]).as_quat(canonical=True))
+        pose = Transform(Vector3(*self._X_WC[:3, 3].tolist()), Quaternion(x, y, z, w))
+        return {"tf_static": TFMessage([TransformStamped(header(0, "world"), FRAME, pose)])}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """The newest frame while a burst lasts; what came before the trigger is passed over."""
+        images, info = self._port.images(), self._port.info()
+        triggers = list(inbox.new("planning/camera_trigger"))
+        if triggers:
+            self._wanted = int(triggers[-1].frames)
+            self._facts["bursts"] += len(triggers)
+            return {}
+        if not self._wanted or not images or info is None:
+            return {}
+        try:
+            _agree(images[-1], info, self._frame)
+            image = _image(t, images[-1])
+            intrinsics = _intrinsics(t, info, rectified=self._port.rectified)
+        except CameraError as error:
+            self._facts["frames_rejected"] += 1
+            self._problem = str(error)
+            return {}
+        self._wanted -= 1
+        self._facts["frames"] += 1
+        return {"camera/depth/image_raw": image, "camera/depth/camera_info": intrinsics}
+
+    def finish(self) -> Mapping[str, Any]:
+        """How much was passed on, and why something was not."""
+        return {**self._facts, "problem": self._problem}
+
+
+def _await_pose(port: CameraPort, frame: str, world: str, wait_s: float) -> Array:
+    known: dict[str, tuple[str, Array]] = {}
+    begin = monotonic()
+    while True:
+        for item in port.transforms():
+            p, q = item.transform.translation, item.transform.rotation
+            X = np.eye(4)
+            X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            X[:3, 3] = p.x, p.y, p.z
+            known[item.child_frame_id.lstrip("/")] = (item.header.frame_id.lstrip("/"), X)
+        X_WC = chain(known, world, frame)
+        if X_WC is not None:
+            return X_WC
+        if monotonic() - begin > wait_s:
+            tree = ", ".join(f"{parent} -> {child}" for child, (parent, _) in sorted(known.items())) or "nothing"
+            raise CameraError(f"tf_static has no way from {world!r} to {frame!r}: it has {tree}. Calibrate and publish it")
+        sleep(0.05)
+
+
+def _agree(image: Any, info: Any, frame: str) -> None:
+    """The intrinsics must be those of the image, and the pose that of its frame: else everything that is seen is shifted."""
+    for what, message in (("depth image", image), ("camera_info", info)):
+        named = message.header.frame_id.lstrip("/")
+        if named != frame:
+            raise CameraError(f"{what} is in frame {named!r}, the pose is that of {frame!r}: set PALPATE_CAMERA_FRAME={named}")
+    if (image.width, image.height) != (info.width, info.height):
+        raise CameraError(f"depth image is {image.width} x {image.height}, camera_info says {info.width} x {info.height}")
+
+
+def _image(t: int, image: Any) -> Any:
+    depth = depth_metres(
+        image.encoding, int(image.height), int(image.width), int(image.step), bool(image.is_bigendian), np.asarray(image.data)
+    )
+    data = np.ascontiguousarray(depth, "<f4").view(np.uint8).reshape(-1)
+    return Image(header(t, FRAME), image.height, image.width, "32FC1", 0, 4 * image.width, data)
+
+
+def _intrinsics(t: int, info: Any, *, rectified: bool) -> Any:
+    """Intrinsics of the image as it is, without distortion: of a rectified one P's, where it is set (sensor_msgs/CameraInfo)."""
+    P = np.asarray(info.p, dtype=float).reshape(3, 4)
+    K, name = (P[:, :3], "p") if rectified and P.any() else (np.asarray(info.k, dtype=float).reshape(3, 3), "k")
+    if name == "k" and np.any(np.abs(np.asarray(info.d)) > 1e-9):
+        raise CameraError(
+            f"camera_info: d = {list(info.d)}: want an image without distortion, or a rectified one: `rect` in its name, and p"
+        )
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise CameraError(f"camera_info: {name} = {K.ravel().tolist()}: the focal lengths must be positive")
+    P = np.hstack((K, np.zeros((3, 1))))
+    size = (info.height, info.width)
+    return CameraInfo(header(t, FRAME), *size, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P.ravel(), 0, 0, info.roi)
+
+
+def create(scenario: Scenario) -> RosCameraService:
+    """The bridge; of the scenario it needs nothing. Raises CameraError."""
+    if runtime() != "wallclock":
+        raise CameraError("camera.implementation = ros takes a real camera, which does not wait: run with --wallclock")
+    frame, world = os.environ.get("PALPATE_CAMERA_FRAME") or FRAME, os.environ.get("PALPATE_CAMERA_WORLD") or "world"
+    return RosCameraService(ZenohCamera(), frame.strip("/"), world.strip("/"))

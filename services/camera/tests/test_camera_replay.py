@@ -1,0 +1,90 @@
+"""A camera that shows a recording: it conforms, shows the recorded pixels at new stamps, and names what a recording lacks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.check.rig import Heard, ServiceRig, Settings
+from palpate.check.suites import check
+from palpate.check.suites.camera import plane
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import CameraTrigger
+from palpate_bus.messages.codec import encode
+from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.recordings import RecordingError, open_recording
+from palpate_camera.backends.replay.service import IMAGE, INFO, POSE, ReplayedCamera, create
+from palpate_camera.service import create as create_camera
+from palpate_models.load import load_scenario
+from palpate_recorder.service import RecorderService
+
+FRAMES = 4
+SCENARIO = load_scenario("rlq_guarding")
+
+
+@pytest.fixture(scope="module")
+def seen() -> dict[str, list[Heard]]:
+    """A burst of the simulated camera that looks at a level square, as the conformance suite puts it there."""
+    rig = ServiceRig(create_camera(SCENARIO), Settings(SCENARIO))
+    rig.send("planning/camera_trigger", CameraTrigger(header(0), FRAMES))
+    rig.run(0.1 * FRAMES + 0.5, {"sim/surface": plane(np.array(SCENARIO.camera.look_at_m))})
+    return rig.log
+
+
+def record(folder: Path, log: dict[str, list[Heard]], topics: tuple[str, ...] = (IMAGE, INFO, POSE)) -> Path:
+    recorder = RecorderService(folder)
+    rows = contract().topics
+    for topic in topics:
+        for heard in log[topic]:
+            recorder.record(rows[topic], encode(heard.message, rows[topic].type), heard.t, heard.sequence)
+    recorder.finish()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recording(seen: dict[str, list[Heard]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("run") / "recording_mcap", seen)
+
+
+def test_it_conforms_to_the_role_camera(recording: Path) -> None:
+    report = check(ServiceRig(ReplayedCamera(open_recording(recording)), Settings(SCENARIO)))
+    assert report.passed, [result for result in report.results if result.verdict == "failed"]
+
+
+def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: Path, seen: dict[str, list[Heard]]) -> None:
+    rig = ServiceRig(ReplayedCamera(open_recording(recording)), Settings(SCENARIO))
+    rig.run(2.0, {})
+    assert not rig.log[IMAGE], "nothing unasked"
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES + 1))
+    shown = rig.run(1.0, {})
+    recorded = [heard.message for heard in seen[IMAGE]]
+    assert len(recorded) == FRAMES
+    assert len(shown[IMAGE]) == len(shown[INFO]) == FRAMES + 1
+    for heard, info, then in zip(shown[IMAGE], shown[INFO], [*recorded, recorded[0]], strict=True):
+        np.testing.assert_array_equal(heard.message.data, then.data)
+        assert nanoseconds(heard.message.header.stamp) == nanoseconds(info.message.header.stamp) == heard.t
+        assert heard.t >= 2000 * MS
+    assert rig.last(POSE) == seen[POSE][-1].message
+
+
+def test_frames_differ_as_their_noise_does(seen: dict[str, list[Heard]]) -> None:
+    """Else the order would not be tested."""
+    first, second = (np.asarray(heard.message.data) for heard in seen[IMAGE][:2])
+    assert not np.array_equal(first, second)
+
+
+def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[Heard]], tmp_path: Path) -> None:
+    folder = record(tmp_path / "recording_mcap", seen, (IMAGE, INFO))
+    with pytest.raises(RecordingError, match="no message of tf_static"):
+        ReplayedCamera(open_recording(folder))
+
+
+def test_no_recording_is_refused_by_field() -> None:
+    with pytest.raises(RecordingError, match=r"camera\.recording"):
+        create(SCENARIO)
+
+
+def test_a_folder_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
+    chosen = SCENARIO.model_copy(update={"camera": SCENARIO.camera.model_copy(update={"recording": str(tmp_path / "no")})})
+    with pytest.raises(RecordingError, match="no recording there"):
+        create(chosen)

@@ -1,0 +1,214 @@
+"""A ROS camera's images, intrinsics and transforms through the bridge, and over zenoh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate_bus.contract import contract
+from palpate_bus.contract.conformance import violations
+from palpate_bus.messages import (
+    CameraInfo,
+    CameraTrigger,
+    Image,
+    Quaternion,
+    RegionOfInterest,
+    TFMessage,
+    Transform,
+    TransformStamped,
+    Vector3,
+)
+from palpate_bus.messages.stamps import header
+from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.wire.ros_node import RosNode
+from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_camera.backends.ros.convert import CameraError, depth_metres
+from palpate_camera.backends.ros.service import CameraPort, RosCameraService, ZenohCamera
+
+FRAME = "camera_depth_optical_frame"
+METRES = np.array([[1.0, np.nan, 0.731], [0.5, 2.25, 1.125]], dtype=np.float32)
+
+
+def ros_image(encoding: str = "16UC1", big_endian: bool = False) -> Any:
+    order = ">" if big_endian else "<"
+    millimetres = np.nan_to_num(METRES * 1000).round().astype(f"{order}u2")
+    pixels = millimetres if encoding == "16UC1" else METRES.astype(f"{order}f4")
+    padded = np.zeros((2, 3 * pixels.itemsize + 5), np.uint8)  # drivers may pad their rows
+    padded[:, : 3 * pixels.itemsize] = pixels.view(np.uint8).reshape(2, -1)
+    return Image(header(5, FRAME), 2, 3, encoding, int(big_endian), padded.shape[1], padded.ravel())
+
+
+def ros_info(d: float = 0.0) -> Any:
+    K = np.array([600.0, 0, 1.0, 0, 610.0, 0.5, 0, 0, 1])
+    P = np.hstack((K.reshape(3, 3), np.zeros((3, 1)))).ravel()
+    roi = RegionOfInterest(0, 0, 0, 0, False)
+    return CameraInfo(header(5, FRAME), 2, 3, "plumb_bob", np.full(5, d), K, np.eye(3).ravel(), P, 0, 0, roi)
+
+
+def link(parent: str, child: str, x: float, z_turn: float = 0.0) -> Any:
+    rotation = Quaternion(0.0, 0.0, np.sin(z_turn / 2), np.cos(z_turn / 2))
+    return TransformStamped(header(0, parent), child, Transform(Vector3(x, 0.0, 0.0), rotation))
+
+
+TREE = [link("world", "stand", 1.0, np.pi / 2), link("stand", FRAME, 0.5)]
+
+
+class Port(CameraPort):
+    def __init__(self, tree: list[Any] = TREE) -> None:
+        self.tree, self.waiting, self.intrinsics = list(tree), [], ros_info()
+
+    def images(self) -> list[Any]:
+        waiting, self.waiting = self.waiting, []
+        return waiting
+
+    def info(self) -> Any:
+        return self.intrinsics
+
+    def transforms(self) -> list[Any]:
+        tree, self.tree = self.tree, []
+        return tree
+
+
+def asked(frames: int) -> HandInbox:
+    """An inbox with a trigger for so many frames."""
+    return HandInbox().put("planning/camera_trigger", CameraTrigger(header(0), frames))
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_depth_is_in_metres_with_nan_where_there_is_none(encoding: str, big_endian: bool) -> None:
+    image = ros_image(encoding, big_endian)
+    found = depth_metres(encoding, 2, 3, image.step, big_endian, image.data)
+    np.testing.assert_allclose(found, METRES, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "step", "words"), [("rgb8", 11, "16UC1"), ("16UC1", 4, "too few"), ("32FC1", 12, "too few")]
+)
+def test_what_is_no_depth_image_is_named(encoding: str, step: int, words: str) -> None:
+    with pytest.raises(CameraError, match=words):
+        depth_metres(encoding, 2, 3, step, False, np.zeros(11, np.uint8))
+
+
+def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
+    port = Port()
+    service = RosCameraService(port)
+    inbox = asked(2)
+    port.waiting = [ros_image()]
+    assert service.step(0, inbox) == {}, "taken before the trigger"
+    for k in (1, 2):
+        t = k * 100_000_000
+        port.waiting = [ros_image(), ros_image()]
+        out = service.step(t, inbox)
+        for name, message in out.items():
+            assert violations(contract().topics[name], message, t) == []
+        assert set(out) == {"camera/depth/image_raw", "camera/depth/camera_info"}
+    port.waiting = [ros_image()]
+    assert service.step(300_000_000, inbox) == {}
+    assert service.finish() == {"bursts": 1, "frames": 2, "frames_rejected": 0, "problem": ""}
+
+
+def test_the_pose_is_the_whole_chain() -> None:
+    (pose,) = RosCameraService(Port()).start()["tf_static"].transforms
+    p = pose.transform.translation
+    assert (p.x, p.y, p.z) == pytest.approx((1.0, 0.5, 0.0), abs=1e-12)
+    assert violations(contract().topics["tf_static"], TFMessage([pose]), 0) == []
+
+
+def test_a_pose_that_nobody_publishes_is_named_with_what_there_is() -> None:
+    with pytest.raises(CameraError, match=r"no way from 'world'.*world -> stand"):
+        RosCameraService(Port(TREE[:1]), wait_s=0.0)
+
+
+def test_a_distorted_image_is_refused_and_said_so() -> None:
+    port = Port()
+    port.intrinsics = ros_info(d=0.1)
+    service = RosCameraService(port)
+    inbox = asked(1)
+    service.step(0, inbox)
+    port.waiting = [ros_image()]
+    assert service.step(100_000_000, inbox) == {}
+    assert "rectified" in str(service.finish()["problem"])
+
+
+def intrinsics(rectified: bool, info: Any) -> Any:
+    """What the bridge says of an image that came with these; None where it refuses."""
+    port = Port()
+    port.rectified, port.intrinsics = rectified, info
+    service = RosCameraService(port)
+    inbox = asked(1)
+    service.step(0, inbox)
+    port.waiting = [ros_image()]
+    return service.step(100_000_000, inbox).get("camera/depth/camera_info")
+
+
+def test_a_rectified_image_has_the_intrinsics_of_p_and_no_distortion() -> None:
+    """image_proc sends the raw image's camera_info with the rectified one: K and d are of the raw image, P is of this one."""
+    info = ros_info(d=0.1)
+    info.p = np.array([550.0, 0, 1.5, -22.0, 0, 560.0, 1.0, 0, 0, 0, 1, 0])
+    said = intrinsics(True, info)
+    assert said.k.reshape(3, 3).tolist() == [[550.0, 0, 1.5], [0, 560.0, 1.0], [0, 0, 1]]
+    assert said.p.reshape(3, 4)[:, :3].tolist() == said.k.reshape(3, 3).tolist()
+    assert not said.p.reshape(3, 4)[:, 3].any()
+    assert not said.d.any()
+    assert intrinsics(False, info) is None
+
+
+def test_without_p_or_without_rectification_k_counts() -> None:
+    unset, raw = ros_info(), ros_info()
+    unset.p = np.zeros(12)
+    raw.p = np.array([550.0, 0, 1.5, 0, 0, 560.0, 1.0, 0, 0, 0, 1, 0])
+    assert intrinsics(True, unset).k[0] == intrinsics(False, raw).k[0] == 600.0
+
+
+def test_an_image_that_camera_info_is_not_of_is_refused_and_said_so() -> None:
+    port = Port()
+    port.intrinsics.width, port.intrinsics.height = 6, 4
+    service = RosCameraService(port)
+    inbox = asked(1)
+    service.step(0, inbox)
+    port.waiting = [ros_image()]
+    assert service.step(100_000_000, inbox) == {}
+    facts = service.finish()
+    assert (facts["frames"], facts["frames_rejected"]) == (0, 1)
+    assert facts["problem"] == "depth image is 3 x 2, camera_info says 6 x 4"
+
+
+def test_an_image_of_another_frame_than_the_pose_is_refused_and_said_so() -> None:
+    """Depth that is aligned to colour is in the colour camera's frame."""
+    port = Port()
+    service = RosCameraService(port)
+    inbox = asked(1)
+    service.step(0, inbox)
+    image = ros_image()
+    image.header.frame_id = "camera_color_optical_frame"
+    port.waiting = [image]
+    assert service.step(100_000_000, inbox) == {}
+    assert "set PALPATE_CAMERA_FRAME=camera_color_optical_frame" in service.finish()["problem"]
+
+
+def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path}/ros.sock"
+    node = RosNode("realsense", 0, BusOptions(listen=(endpoint,)))
+    tf = node.publisher("tf_static", "tf2_msgs/msg/TFMessage", latched=True)
+    tf.publish(TFMessage(TREE))  # long before anybody listens
+    images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
+    infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
+    camera = ZenohCamera({"PALPATE_CAMERA_ROUTER": endpoint})
+    assert camera.rectified
+    service = RosCameraService(camera)
+    inbox = asked(1)
+    service.step(0, inbox)
+    out: Any = {}
+    for k in range(1, 200):
+        infos.publish(ros_info())
+        images.publish(ros_image())
+        out = service.step(k * 100_000_000, inbox)
+        if out:
+            break
+    image = out["camera/depth/image_raw"]
+    np.testing.assert_allclose(np.asarray(image.data).view("<f4").reshape(2, 3), METRES, atol=1e-3)
+    node.close()

@@ -1,0 +1,105 @@
+"""The arm as LBRState tells it: joint positions and velocities, and whether it takes commands. Arrays in, arrays out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pinocchio as pin
+
+from palpate_models import lbr
+from palpate_models.frames import Array
+from palpate_models.scenario import Robot
+from palpate_robot.backends.lbr.idl import ClientCommandMode, ConnectionQuality, SafetyState, SessionState
+
+VELOCITY_LAG_S: Final = 0.004
+"""Time constant of the low-pass on the differentiated position: LBRState carries no velocity. It keeps the encoder's steps
+(about 1e-5 rad) below 3 mrad/s at 500 Hz and costs the damping 4 ms."""
+STATE_AGE_NS: Final = 20_000_000
+"""A state older than this is none: the contract's age of joint_states."""
+CLOCK_SET_NS: Final = 1_000_000_000
+"""A stamp that is so much older than the newest [ns] is of a controller whose clock was set back; any other is a state that was
+overtaken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tool:
+    """Pose-dependent quantities that the driver needs."""
+
+    gravity: Array
+    """Gravity torques [N m], shape (7,)."""
+    up_S: Array
+    """World's z axis in the F/T sensor's axes, shape (3,)."""
+
+
+class ArmModel:
+    """Gravity and the sensor's orientation."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._model = pin.buildModelFromXML(lbr.urdf(robot, geometry=False))
+        self._data = self._model.createData()
+        self._sensor = self._model.getFrameId("ft_sensor")
+
+    def at(self, q: Array) -> Tool:
+        """At joint positions q [rad], shape (7,)."""
+        pin.forwardKinematics(self._model, self._data, q)
+        rotation = pin.updateFramePlacement(self._model, self._data, self._sensor).rotation
+        gravity = pin.computeGeneralizedGravity(self._model, self._data, q)
+        return Tool(np.array(gravity), rotation[2].copy())
+
+
+class Arm:
+    """Joint state out of a stream of LBRState."""
+
+    def __init__(self) -> None:
+        self.q = np.zeros(lbr.HOME.shape)
+        """Measured positions [rad], shape (7,)."""
+        self.v = np.zeros(lbr.HOME.shape)
+        """Velocities [rad/s], shape (7,), see `VELOCITY_LAG_S`."""
+        self.session = SessionState.IDLE
+        self.heard: int | None = None
+        """When the newest state came [ns], None before the first."""
+        self._stamp: int | None = None
+        self._trouble = "no LBRState has come yet"
+
+    def update(self, t: int, state: Any) -> bool:
+        """Takes a state that came at `t` [ns]; returns whether it is new and usable.
+
+        Where the controller's clock was set, velocities start anew from zero.
+        """
+        q = np.array(state.measured_joint_position)
+        stamp = int(state.time_stamp_sec) * 1_000_000_000 + int(state.time_stamp_nano_sec)
+        if not np.isfinite(q).all():
+            self._trouble = f"LBRState: measured_joint_position = {q}: must be finite"
+            return False
+        if self._stamp is not None and 0 <= self._stamp - stamp < CLOCK_SET_NS:
+            return False
+        dt = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
+        if 0.0 < dt < 0.1:
+            self.v = self.v + dt / (VELOCITY_LAG_S + dt) * ((q - self.q) / dt - self.v)
+        else:
+            self.v = np.zeros(lbr.HOME.shape)
+        self.q, self._stamp, self.heard = q, stamp, t
+        self.session = SessionState(state.session_state)
+        self._trouble = _trouble(state)
+        return True
+
+    def trouble(self, t: int) -> str:
+        """Why the arm does not take commands now, in words; empty when it does."""
+        if self.heard is not None and t - self.heard > STATE_AGE_NS:
+            return f"no LBRState for {(t - self.heard) / 1e6:.0f} ms: the FRI session or the ROS side has ended"
+        return self._trouble
+
+
+def _trouble(state: Any) -> str:
+    if state.safety_state != SafetyState.NORMAL_OPERATION:
+        return f"the arm's safety state is {SafetyState(state.safety_state).name}"
+    if state.session_state != SessionState.COMMANDING_ACTIVE:
+        return f"the FRI session is in {SessionState(state.session_state).name}, not COMMANDING_ACTIVE"
+    if state.connection_quality <= ConnectionQuality.POOR:
+        return "the FRI connection is POOR"
+    if state.client_command_mode != ClientCommandMode.TORQUE:
+        mode = ClientCommandMode(state.client_command_mode).name
+        return f"the client command mode is {mode}: set client_command_mode: torque in lbr_system_config.yaml"
+    return ""

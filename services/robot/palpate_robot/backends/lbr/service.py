@@ -1,0 +1,236 @@
+"""The LBR on the bus: LBRState and F/T readings in, torque overlay out, with the driver's rules of `palpate_robot.driver`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from palpate_bus.messages import (
+    JointState,
+    OperatorRequest,
+    RobotStatus,
+    String,
+    SupervisorState,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+)
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.run import runtime
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models import lbr
+from palpate_models.frames import Array
+from palpate_models.load import exam_input
+from palpate_models.scenario import ExamInput, Scenario
+from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, ArmModel
+from palpate_robot.backends.lbr.inner import InnerLoop, load_control
+from palpate_robot.backends.lbr.port import LbrPort, ZenohPort
+from palpate_robot.backends.lbr.settings import Settings, SettingsError
+from palpate_robot.driver import Cause, Command, Driver, Mode
+
+GRAVITY = 9.81
+"""[m/s^2]"""
+STATUS_PERIOD = 10_000_000
+DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
+"""Most joint damping in a hold [N m s/rad] [A]: as an overlay it acts one to three cycles late on a filtered speed. Below the
+arm's own viscous friction (10) that is stable with any delay; more is for the joints with inertia for it."""
+LINKS_PERIOD = 50_000_000
+FT_AGE = 50_000_000
+"""An F/T reading older than this is none [ns]."""
+TAKE_OVER = 100_000_000
+"""For so long after its first command [ns] the driver lets others finish: the watchdog commands until it hears a new driver."""
+_NAMES = list(lbr.JOINT_NAMES)
+
+
+class LbrService(Service):
+    """A real LBR in the role robot."""
+
+    role: ClassVar[str] = "robot"
+    catches_up: ClassVar[bool] = False
+    """The arm has moved on: a tick that was missed is never made up for."""
+
+    def __init__(self, exam: ExamInput, settings: Settings, port: LbrPort, inner: InnerLoop | None = None) -> None:
+        """`inner` is the loop that follows set-points in this process; without it `control/joint_torque` is obeyed."""
+        self._robot = exam.robot
+        self._port = port
+        self._inner = inner
+        self._arm = Arm()
+        self._model = ArmModel(exam.robot)
+        self._driver = Driver(exam.limits.force_emergency_n)
+        self._emulated = settings.emulated
+        yaw = np.deg2rad(settings.ft_yaw_deg)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        self._R_ST = settings.ft_sign * turn
+        self._command: Command | None = None
+        self._command_message: Message | None = None
+        self._commanding_since: int | None = None
+        self._releases = 0
+        self._wrench = np.zeros(6)
+        self._wrench_at: int | None = None
+        self._tool: Message | None = None
+        self._links: Message | None = None
+        self._force = 0.0
+        self._applied = np.zeros(7)
+        self._sums, self._summed = np.zeros(20), 0
+        self._means = np.zeros(20)
+        self._states = self._commands = 0
+        self._peak_force = 0.0
+        self._peak_torque = np.zeros(7)
+
+    def start(self) -> Outbox:
+        """The robot's description."""
+        return {"robot_description": String(lbr.urdf(self._robot))}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """One tick: what the arm said, what the driver makes of it, what the arm is to do."""
+        outbox: dict[str, Message] = {}
+        fresh = self._listen(t)
+        self._obey(t, inbox)
+        if self._inner is not None:
+            self._inner.listen(inbox)
+        if self._arm.heard is not None and t - self._arm.heard <= STATE_AGE_NS:
+            joints = JointState(header(self._arm.heard), _NAMES, self._arm.q, self._arm.v, self._applied.copy())
+            outbox["joint_states"] = (
+                joints  # on every tick, as readers count on it: between two states the newest, with its stamp
+            )
+            if self._wrench_at is not None and t - self._wrench_at <= FT_AGE:
+                outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), _wrench(self._wrench))
+            if fresh:
+                self._drive(t, inbox, joints)
+        if self._arm.heard is not None:
+            self._judge_connection(t)
+        if not t % STATUS_PERIOD:
+            outbox["robot/status"] = self._status(t)
+        if self._emulated:
+            self._relay(t, inbox, outbox)
+        return outbox
+
+    def finish(self) -> Mapping[str, Any]:
+        """Safe holds, counts, and the largest force and torques; the arm is left damped and without overlay."""
+        if self._arm.heard is not None:
+            self._port.command(self._arm.q, np.zeros(7))
+        driver = self._driver
+        self._port.close()
+        return {
+            "mode": driver.mode.name,
+            "holds": [{"t_s": t / NS, "cause": cause.name, "reason": reason} for t, cause, reason in driver.holds],
+            "commands_rejected": driver.rejected,
+            "peak_external_force_N": self._peak_force,
+            "peak_torque_nm": [round(float(x), 3) for x in self._peak_torque],
+            "states": self._states,
+            "commands": self._commands,
+            "level": "torque" if self._inner is None else "setpoint",
+        }
+
+    def _listen(self, t: int) -> bool:
+        """Takes what the ROS side sent; returns whether the joint state is new."""
+        since = self._commanding_since
+        if self._port.rivals() and since is not None and t - since > TAKE_OVER:
+            self._driver.hold(t, Cause.DEVICE, "another process, likely the watchdog, commands the arm")
+        fresh = False
+        for state in self._port.states():
+            fresh = self._arm.update(t, state) or fresh
+        for reading in self._port.wrenches():
+            force, torque = reading.wrench.force, reading.wrench.torque
+            values = np.array((force.x, force.y, force.z, torque.x, torque.y, torque.z))
+            if not np.isfinite(values).all():
+                self._driver.hold(t, Cause.DEVICE, f"F/T reading {values}: must be finite")
+                continue
+            self._wrench = np.concatenate((self._R_ST @ values[:3], self._R_ST @ values[3:]))
+            self._wrench_at = t
+        if fresh:
+            self._states += 1
+            self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench))
+            self._summed += 1
+        return fresh
+
+    def _obey(self, t: int, inbox: Inbox) -> None:
+        for message in inbox.new("operator/request"):
+            if message.request == OperatorRequest.STOP:
+                self._driver.hold(t, Cause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
+        for message in inbox.new("supervisor/state"):
+            if message.releases != self._releases:
+                self._releases = message.releases
+                self._driver.release(t)
+            if message.level == SupervisorState.LEVEL_EMERGENCY:
+                self._driver.hold(t, Cause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
+
+    def _judge_connection(self, t: int) -> str:
+        """Latches a hold when the arm was active and does not take commands any more; returns why it does not."""
+        trouble = self._arm.trouble(t)
+        if not trouble and (self._wrench_at is None or t - self._wrench_at > FT_AGE):
+            trouble = "no F/T reading" if self._wrench_at is None else f"no F/T reading for {(t - self._wrench_at) / 1e6:.0f} ms"
+        if trouble and self._driver.mode is Mode.ACTIVE:
+            self._driver.hold(t, Cause.DEVICE, trouble)
+        return trouble
+
+    def _drive(self, t: int, inbox: Inbox, joints: Message) -> None:
+        """Judges, and answers a state with a command."""
+        arm = self._arm
+        tool = self._model.at(arm.q)
+        weight = self._robot.tool_mass_kg * GRAVITY
+        self._force = float(np.linalg.norm(self._wrench[:3] + weight * tool.up_S))
+        self._peak_force = max(self._peak_force, self._force)
+        trouble = self._judge_connection(t)
+        command = None if trouble else self._newest_command(t, inbox, joints)
+        lost = inbox.lost("control") and self._inner is None
+        torque = self._driver.update(t, arm.q, arm.v, tool.gravity, self._force, command, lost=lost)
+        if self._driver.mode is not Mode.ACTIVE:
+            torque = -np.minimum(self._driver.damping(arm.v, tool.gravity), DAMPING) * arm.v
+        self._applied = np.asarray(torque, dtype=float)
+        np.maximum(self._peak_torque, np.abs(self._applied), out=self._peak_torque)
+        self._port.command(arm.q, self._applied)
+        self._commanding_since = t if self._commanding_since is None else self._commanding_since
+        self._commands += 1
+
+    def _newest_command(self, t: int, inbox: Inbox, joints: Message) -> Command | None:
+        message = inbox.latest("control/joint_torque") if self._inner is None else self._inner.command(t, inbox, joints)
+        if message is not None and message is not self._command_message:
+            stamp = nanoseconds(message.header.stamp)
+            expires = stamp + nanoseconds(message.valid_for)
+            self._command = Command(np.array(message.torque), stamp, expires, message.problem)
+            self._command_message = message
+        return self._command
+
+    def _status(self, t: int) -> Message:
+        driver = self._driver
+        if self._summed:
+            self._means = self._sums / self._summed
+            self._sums, self._summed = np.zeros(20), 0
+        means = self._means
+        reason = driver.reason or self._arm.trouble(t)
+        return RobotStatus(
+            header(t), int(driver.mode), int(driver.cause), reason, means[:7], means[7:14], _wrench(means[14:]),
+            self._applied.copy(), driver.rejected,
+        )  # fmt: skip
+
+    def _relay(self, t: int, inbox: Inbox, outbox: dict[str, Message]) -> None:
+        """Carries what no sensor knows between the emulator and the simulated tissue and camera."""
+        for contact in inbox.new("sim/contact_wrench"):
+            self._port.contact(contact)
+        tool, links = self._port.physics()
+        self._tool = self._tool if tool is None else tool
+        if self._tool is not None:
+            outbox["sim/tool_state"] = self._tool
+        self._links = self._links if links is None else links
+        if self._links is not None and not t % LINKS_PERIOD:
+            outbox["sim/link_poses"] = self._links
+
+
+def _wrench(values: Array) -> Message:
+    fx, fy, fz, mx, my, mz = values.tolist()
+    return Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz))
+
+
+def create(scenario: Scenario) -> LbrService:
+    """The driver of a scenario, of which it may know the exam input; joins the ROS side as the environment says."""
+    if runtime() != "wallclock":
+        raise SettingsError(
+            "robot.implementation = lbr drives hardware, which does not wait for simulated time: run with --wallclock"
+        )
+    exam, settings = exam_input(scenario), Settings.from_env()
+    inner = InnerLoop(load_control(scenario)) if settings.level == "setpoint" else None
+    return LbrService(exam, settings, ZenohPort(settings), inner)

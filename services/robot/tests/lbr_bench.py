@@ -1,0 +1,124 @@
+"""The driver on an emulated arm without transport and without a wall clock: time is the caller's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from palpate_bus.messages import JointTorqueCommand, RobotStatus
+from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_models import lbr
+from palpate_models.load import exam_input, load_scenario
+from palpate_models.scenario import Scenario
+from palpate_robot.backends.lbr.emulator import Emulator, Options
+from palpate_robot.backends.lbr.inner import InnerLoop, load_control
+from palpate_robot.backends.lbr.port import LbrPort
+from palpate_robot.backends.lbr.service import LbrService
+from palpate_robot.backends.lbr.settings import Settings
+
+MS = 1_000_000
+
+
+class DirectPort(LbrPort):
+    """Hands messages over; `states` is called once a millisecond and cycles the emulator when its period has passed."""
+
+    def __init__(self, emulator: Emulator, period_ms: int) -> None:
+        self.emulator = emulator
+        self.period_ms = period_ms
+        self.t = -MS
+        self.silent = False
+        self.ft_silent = False
+        self.torques: list[np.ndarray] = []
+        self.commanded_by: list[bytes] = []
+        self._readings: list[Any] = []
+        self._moved = True
+
+    def states(self) -> list[Any]:
+        self.t += MS
+        if (self.t // MS) % self.period_ms:
+            return []
+        if self.t:
+            self.emulator.cycle()
+        self._moved = True
+        self._readings = [] if self.ft_silent else [self.emulator.wrench(self.t)]
+        return [] if self.silent or self.emulator.session.ended else [self.emulator.state(self.t)]
+
+    def wrenches(self) -> list[Any]:
+        readings, self._readings = self._readings, []
+        return readings
+
+    def command(self, q: Any, torque: Any) -> None:
+        self.torques.append(np.array(torque))
+        self.emulator.session.take(np.array(q), np.array(torque))
+
+    def rivals(self) -> list[bytes]:
+        others, self.commanded_by = self.commanded_by, []
+        return others
+
+    def contact(self, wrench: Any) -> None:
+        f, m = wrench.wrench.force, wrench.wrench.torque
+        self.emulator.force_W[:], self.emulator.moment_W[:] = (f.x, f.y, f.z), (m.x, m.y, m.z)
+
+    def physics(self) -> tuple[Any | None, Any | None]:
+        moved, self._moved = self._moved, False
+        return (self.emulator.tool(self.t), self.emulator.links(self.t)) if moved else (None, None)
+
+    def close(self) -> None:
+        pass
+
+
+def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any) -> tuple[LbrService, DirectPort]:
+    """Driver and port; options are the emulator's."""
+    exam = exam_input(scenario)
+    chosen = Options(**options)
+    port = DirectPort(Emulator(exam, chosen), chosen.period_ms)
+    inner = InnerLoop(load_control(scenario)) if level == "setpoint" else None
+    return LbrService(exam, Settings(level=level, emulated=True), port, inner), port
+
+
+SCENARIO = load_scenario("rlq_guarding")
+GAIN = np.array([400.0, 400.0, 300.0, 300.0, 100.0, 60.0, 30.0])
+
+
+class Rig:
+    """Driver, emulated arm, and a joint servo that commands it."""
+
+    def __init__(self, **options: Any) -> None:
+        self.driver: LbrService
+        self.port: DirectPort
+        self.driver, self.port = driver_on_emulator(SCENARIO, **options)
+        self.inbox = HandInbox()
+        self.t = -MS
+        self.outbox: Mapping[str, Any] = {}
+        self.status: Any = None
+        self.target = np.array(lbr.HOME)
+        self.torque = np.zeros(7)
+        self.commanding = True
+
+    @property
+    def plant(self) -> Any:
+        return self.port.emulator._plant
+
+    def tick(self, ticks: int) -> None:
+        for _ in range(ticks):
+            self.t += MS
+            joints = self.outbox.get("joint_states")
+            if joints is not None and self.commanding:
+                error = self.target - joints.position
+                torque = GAIN * error - 0.5 * np.sqrt(GAIN) * joints.velocity
+                self.torque = np.clip(torque, self.torque - 1.0, self.torque + 1.0)  # as the driver wants it
+                command = JointTorqueCommand(header(self.t), self.torque, duration_message(50 * MS), "")
+                self.inbox.messages["control/joint_torque"] = command
+            self.outbox = self.driver.step(self.t, self.inbox)
+            self.status = self.outbox.get("robot/status", self.status)
+
+
+def active_rig() -> Rig:
+    """A rig whose driver obeys commands."""
+    rig = Rig()
+    rig.tick(600)
+    assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason
+    return rig

@@ -1,0 +1,132 @@
+"""The driver on the emulated arm, in simulated time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lbr_bench import SCENARIO, Rig, active_rig
+
+from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.messages.stamps import header
+from palpate_models import lbr
+from palpate_robot.backends.lbr.arm import ArmModel
+from palpate_robot.backends.lbr.settings import Settings, SettingsError
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return active_rig()
+
+
+def test_until_the_session_commands_the_driver_waits_and_says_for_what() -> None:
+    rig = Rig()
+    rig.tick(100)
+    assert rig.status.mode == RobotStatus.MODE_IDLE
+    assert "MONITORING" in rig.status.reason
+    assert rig.outbox["joint_states"].position == pytest.approx(lbr.HOME, abs=1e-4)
+
+
+def test_positive_torque_turns_a_joint_the_positive_way(rig: Rig) -> None:
+    for joint in range(7):
+        target = rig.target.copy()
+        target[joint] += 0.05
+        rig.target = target
+        rig.tick(350)
+        assert rig.outbox["joint_states"].position[joint] == pytest.approx(target[joint], abs=0.03)
+        assert rig.plant.q[joint] > lbr.HOME[joint] + 0.02
+
+
+def test_velocity_is_differentiated_without_much_lag(rig: Rig) -> None:
+    rig.target = rig.target + 0.1
+    worst = fastest = 0.0
+    for _ in range(300):
+        rig.tick(1)
+        fastest = max(fastest, float(np.abs(rig.plant.v).max()))
+        worst = max(worst, float(np.abs(rig.outbox["joint_states"].velocity - rig.plant.v).max()))
+    assert fastest > 0.2
+    assert worst < 0.5 * fastest, "a change of 1 N m/ms is what lags most"
+
+
+def test_the_overlay_excludes_gravity(rig: Rig) -> None:
+    gravity = ArmModel(SCENARIO.robot).at(np.array(lbr.HOME)).gravity
+    assert np.abs(gravity).max() > 20.0
+    assert np.abs(rig.port.torques[-1]).max() < 1.0
+    assert np.abs(rig.plant.q - lbr.HOME).max() < 0.01
+
+
+def test_the_sensor_reads_the_tools_weight(rig: Rig) -> None:
+    wrench = rig.outbox["ft/wrench"].wrench.force
+    assert wrench.z == pytest.approx(0.35 * 9.81, abs=1.5)
+
+
+def hold_cause(rig: Rig) -> tuple[int, str]:
+    assert rig.status.mode == RobotStatus.MODE_SAFE_HOLD
+    return rig.status.cause, rig.status.reason
+
+
+def test_silent_arm_holds(rig: Rig) -> None:
+    rig.port.silent = True
+    rig.tick(60)
+    cause, reason = hold_cause(rig)
+    assert cause == RobotStatus.CAUSE_DEVICE
+    assert "no LBRState" in reason
+    assert "joint_states" not in rig.outbox
+
+
+def test_silent_sensor_holds(rig: Rig) -> None:
+    rig.port.ft_silent = True
+    rig.tick(80)
+    assert "no F/T reading" in hold_cause(rig)[1]
+
+
+def test_a_session_that_ends_holds(rig: Rig) -> None:
+    rig.port.emulator.session.end("the Sunrise application was stopped")
+    rig.tick(60)
+    assert hold_cause(rig)[0] == RobotStatus.CAUSE_DEVICE
+
+
+def test_expired_commands_hold_and_the_arm_stands(rig: Rig) -> None:
+    rig.target = rig.target + 0.1
+    rig.tick(150)
+    assert np.abs(rig.plant.v).max() > 0.05
+    rig.commanding = False
+    rig.tick(500)
+    assert hold_cause(rig)[0] == RobotStatus.CAUSE_COMMAND_EXPIRED
+    assert np.abs(rig.plant.v).max() < 0.02, "damped, not swinging"
+    assert not rig.port.emulator.session.ended
+
+
+@pytest.mark.parametrize("who", ["operator", "supervisor"])
+def test_stops_hold_and_a_release_goes_on(rig: Rig, who: str) -> None:
+    if who == "operator":
+        rig.inbox.events["operator/request"] = [OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough")]
+    else:
+        rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 2, 1, "41 N", 0, 41.0, 0.0, 0.0, 0)]
+    rig.tick(20)
+    assert hold_cause(rig)[0] == RobotStatus.CAUSE_STOP_REQUESTED
+    rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 0, 0, "", 1, 0.0, 0.0, 0.0, 0)]
+    rig.tick(20)
+    assert rig.status.mode == RobotStatus.MODE_ACTIVE
+
+
+@pytest.mark.parametrize("period", [1, 5])
+def test_other_send_periods(period: int) -> None:
+    rig = Rig(period_ms=period)
+    rig.tick(800)
+    assert rig.status.mode == RobotStatus.MODE_ACTIVE
+    assert np.abs(rig.plant.q - lbr.HOME).max() < 0.01
+
+
+def test_a_load_that_is_wrong_by_a_newton_metre_is_carried(rig: Rig) -> None:
+    rig = Rig(gravity_error_nm=1.0)
+    rig.tick(900)
+    assert rig.status.mode == RobotStatus.MODE_ACTIVE
+    assert np.abs(rig.plant.q - lbr.HOME).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("PALPATE_LBR_LEVEL", "pose"), ("PALPATE_LBR_FT_SIGN", "2"), ("PALPATE_LBR_DOMAIN", "x")]
+)
+def test_a_setting_that_cannot_be_is_named(name: str, value: str) -> None:
+    with pytest.raises(SettingsError, match=name):
+        Settings.from_env({name: value})

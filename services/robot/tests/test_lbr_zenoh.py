@@ -1,0 +1,50 @@
+"""Emulator and driver as processes see each other: the stack's messages under rmw_zenoh's keys."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from palpate_models import lbr
+from palpate_robot.backends.lbr.idl import SessionState
+from palpate_robot.backends.lbr.port import ZenohPort
+from palpate_robot.backends.lbr.settings import Settings
+
+
+def test_states_come_and_commands_move_the_arm(tmp_path: Path) -> None:
+    endpoint = f"unixsock-stream/{tmp_path}/lbr.sock"
+    words = [sys.executable, "-m", "palpate_robot.backends.lbr.emulator", "rlq_guarding", "--listen", endpoint]
+    emulator = subprocess.Popen(words, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    port = ZenohPort(Settings(router=endpoint, emulated=True))
+    torque = np.zeros(7)
+    torque[0] = 6.0
+    try:
+        seen: set[int] = set()
+        moved, wrenches, begin = 0.0, 0, time.monotonic()
+        while moved < 0.05 and time.monotonic() - begin < 60.0:
+            for state in port.states():
+                seen.add(int(state.session_state))
+                moved = float(state.measured_joint_position[0] - lbr.HOME[0])
+                if state.session_state == SessionState.COMMANDING_ACTIVE:
+                    port.command(np.array(state.measured_joint_position), torque)
+            wrenches += len(port.wrenches())
+            time.sleep(0.001)
+        assert moved >= 0.05, f"session states seen: {sorted(seen)}"
+        assert SessionState.COMMANDING_ACTIVE in seen
+        assert wrenches > 10
+    finally:
+        port.close()
+        emulator.terminate()
+        assert emulator.wait(timeout=20) == 0
+
+
+def test_a_period_that_fri_does_not_have_ends_with_status_2() -> None:
+    words = [sys.executable, "-m", "palpate_robot.backends.lbr.emulator", "--period-ms", "0"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 2
+    assert "whole milliseconds" in done.stderr

@@ -1,0 +1,140 @@
+"""MuJoCo's plant against DART's: two engines, two step sizes, one arm."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from palpate_models import lbr
+from palpate_models.scenario import Robot
+from palpate_robot import plant as in_dart
+from palpate_robot.backends.mujoco.plant import Plant
+from palpate_robot.driver import HOLD_DAMPING
+from palpate_robot.physics import END_STOP_MARGIN_RAD, GRAVITY
+
+NOTHING = np.zeros(3)
+NO_DAMPING = np.zeros(7)
+FREE = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
+TURNED = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
+
+
+def postures(count: int, seed: int = 1) -> np.ndarray:
+    """Random postures well above the table."""
+    return lbr.HOME + np.random.default_rng(seed).uniform(-0.3, 0.3, (count, 7))
+
+
+def pair(robot: Robot) -> tuple[Plant, in_dart.Plant]:
+    return Plant(robot), in_dart.Plant(robot)
+
+
+def positive(quaternions: np.ndarray) -> np.ndarray:
+    """Each with its largest part positive, shape (n, 4)."""
+    largest = np.argmax(np.abs(quaternions), axis=1, keepdims=True)
+    return quaternions * np.sign(np.take_along_axis(quaternions, largest, axis=1))
+
+
+def test_poses_twist_and_gravity_are_the_same() -> None:
+    mujoco, dart = pair(TURNED)
+    rng = np.random.default_rng(2)
+    for q in postures(10):
+        v = rng.uniform(-1, 1, 7)
+        mujoco.reset(q, v)
+        dart.reset(q, v)
+        poses, poses_dart = mujoco.link_poses(), dart.link_poses()
+        np.testing.assert_allclose(poses[:, :3], poses_dart[:, :3], atol=1e-9)
+        np.testing.assert_allclose(positive(poses[:, 3:]), positive(poses_dart[:, 3:]), atol=1e-9)
+        np.testing.assert_array_equal(mujoco.tool_motion()[:7], poses[-1])
+        np.testing.assert_allclose(mujoco.tool_motion()[7:], dart.tool_motion()[7:], atol=1e-9)
+        np.testing.assert_allclose(mujoco.gravity_torque(), dart.gravity_torque(), atol=1e-9)
+        assert mujoco.kinetic_energy() == pytest.approx(dart.kinetic_energy(), rel=1e-9)
+
+
+def excited(robot: Robot, q: np.ndarray, ticks: int = 400) -> Iterator[tuple[Plant, in_dart.Plant]]:
+    """Both arms under the same torques and the same force at the tool, as strong as in an examination."""
+    mujoco, dart = pair(robot)
+    mujoco.reset(q)
+    dart.reset(q)
+    strength = np.array([20.0, 20.0, 15.0, 15.0, 6.0, 4.0, 2.0])
+    for tick in range(ticks):
+        torque = strength * np.sin(tick / 30 + np.arange(7))
+        force = np.array([3.0, -2.0, 15.0]) * np.sin(tick / 50)
+        for plant in (mujoco, dart):
+            plant.step(plant.gravity_torque() + torque, force, np.array([0.1, 0.2, 0.05]), NO_DAMPING)
+        yield mujoco, dart
+
+
+@pytest.mark.parametrize(("friction", "part"), [(0.0, 1.0), (Robot().joint_friction_nm, 0.95)])
+def test_forced_response_agrees_while_the_tool_moves_centimetres(friction: float, part: float) -> None:
+    """What is left is half a millisecond of motion. Where a joint turns round, friction jumps, one step earlier or later."""
+    positions, errors, readings = [], [], []
+    for mujoco, dart in excited(Robot(joint_friction_nm=friction), postures(1, seed=3)[0]):
+        p, p_dart = mujoco.tool_motion()[:3], dart.tool_motion()[:3]
+        positions.append(p)
+        errors.append(np.linalg.norm(p - p_dart))
+        readings.append((mujoco.sensor_wrench(), dart.sensor_wrench()))
+    assert np.ptp(positions, axis=0).max() > 0.02
+    assert np.max(errors) < 2e-4
+    mujoco_read, dart_read = np.array(readings[50:]).transpose(1, 0, 2)
+    difference = np.quantile(np.abs(mujoco_read - dart_read), part, axis=0)
+    assert np.ptp(dart_read, axis=0)[:3].max() > 20
+    assert difference[:3].max() < 0.2, "N, of the F/T sensor, while the tool is accelerated"
+    assert difference[3:].max() < 0.02, "N m"
+
+
+def test_free_motion_agrees_and_keeps_its_energy() -> None:
+    """Without friction, gravity carried: half a radian a second for 0.2 s."""
+    mujoco, dart = pair(FREE)
+    v = np.array([0.3, -0.2, 0.4, 0.3, -0.5, 0.4, 0.6])
+    for plant in (mujoco, dart):
+        plant.reset(lbr.HOME, v)
+    start = mujoco.kinetic_energy()
+    for _ in range(200):
+        for plant in (mujoco, dart):
+            plant.step(plant.gravity_torque(), NOTHING, NOTHING, NO_DAMPING)
+        assert mujoco.kinetic_energy() == pytest.approx(start, rel=0.01)
+    np.testing.assert_allclose(mujoco.q, dart.q, atol=2e-4)
+    assert np.linalg.norm(mujoco.tool_motion()[:3] - dart.tool_motion()[:3]) < 2e-4
+
+
+def test_sensor_at_rest_reads_weight_and_push() -> None:
+    plant = Plant(Robot())
+    weight = Robot().tool_mass_kg * GRAVITY
+    np.testing.assert_allclose(plant.sensor_wrench(), [0, 0, weight, 0, 0, 0], atol=1e-9)
+    up = np.array([0.0, 0.0, 10.0])
+    for _ in range(50):  # held by gravity torque and the driver's damping: it creeps, as a hold does
+        plant.step(plant.gravity_torque(), up, NOTHING, 50 * HOLD_DAMPING)
+    np.testing.assert_allclose(plant.sensor_wrench()[:3], [0, 0, weight - 10.0], atol=0.2)
+
+
+def test_gravity_torque_holds_the_arm_still() -> None:
+    plant = Plant(FREE)
+    for q in postures(3):
+        plant.reset(q)
+        for _ in range(300):
+            plant.step(plant.gravity_torque(), NOTHING, NOTHING, NO_DAMPING)
+        np.testing.assert_allclose(plant.q, q, atol=1e-9)
+
+
+def test_end_stop_stops_the_joint() -> None:
+    """75 % of A7's torque limit pushes on: MuJoCo's stop is soft and the joint bounces in it, by less than half a degree."""
+    plant = Plant(Robot())
+    push = np.zeros(7)
+    push[6] = 30.0
+    history = []
+    for _ in range(1500):
+        plant.step(plant.gravity_torque() + push, NOTHING, NOTHING, NO_DAMPING)
+        history.append(plant.q[6])
+    stop = lbr.POSITION_LIMIT[6] + END_STOP_MARGIN_RAD
+    assert np.max(history) < stop + 8e-3
+    assert np.min(history[-300:]) > stop - 8e-3
+
+
+def test_limp_arm_comes_to_rest_on_the_table_not_in_it() -> None:
+    robot = Robot()
+    plant = Plant(robot, np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0]))
+    touched = 0
+    for _ in range(2500):
+        plant.step(NO_DAMPING, NOTHING, NOTHING, NO_DAMPING)
+        touched = max(touched, plant.contacts())
+    assert touched > 0
+    assert plant.link_poses()[lbr.LINK_NAMES.index("lbr_link_7"), 2] > 0.73

@@ -1,0 +1,127 @@
+"""A flat slab pressed by a sphere: the elastic tissue where theory has an answer.
+
+slab = FlatSlab(young_pa=1e4)
+pressed = slab.press(radius_m=0.02, depth_m=0.005)
+pressed.force_n / hertz_force(slab.young_pa, slab.poisson, 0.02, 0.005)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from palpate_models.phantom import PhantomModel, flat_phantom
+from palpate_models.scenario import Breathing, Lesion, Stiffness
+from palpate_tissue.backends.elastic.compliance import POISSON, Compliance, compliance
+from palpate_tissue.backends.elastic.contact import ContactSolver
+from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
+from palpate_tissue.backends.elastic.tissue import ElasticTissue
+
+Array = NDArray[np.float64]
+Profile = Literal["sphere", "paraboloid"]
+
+
+def hertz_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:
+    """Force [N] on a paraboloid of curvature radius R at depth d in a half-space (Hertz 1882).
+
+    4/3 E / (1 - nu^2) sqrt(R) d^(3/2).
+    """
+    return float(4 / 3 * young_pa / (1 - poisson**2) * math.sqrt(radius_m) * depth_m**1.5)
+
+
+def sphere_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:
+    """Force [N] on a true sphere at depth d in a half-space (Sneddon 1965): Hertz's, less 2 % at d = R/5 and less 6 % at 2R/3.
+
+    d = a/2 ln((R + a)/(R - a)),  F = E / (1 - nu^2) [(a^2 + R^2)/2 ln((R + a)/(R - a)) - a R].
+    """
+
+    def depth(a: float) -> float:
+        return 0.5 * a * math.log((radius_m + a) / (radius_m - a))
+
+    a = float(brentq(lambda a: depth(a) - depth_m, 0.0, radius_m * (1 - 1e-12), xtol=1e-12))
+    return young_pa / (1 - poisson**2) * (0.5 * (a**2 + radius_m**2) * math.log((radius_m + a) / (radius_m - a)) - a * radius_m)
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """A slab at rest under an indenter."""
+
+    force_n: float
+    """Along the slab's outward normal, on the indenter."""
+    displacement_m: Array
+    """Of every vertex, inward, shape (n,)."""
+    vertex_force_n: Array
+    """On every vertex, inward, shape (n,)."""
+    contact_radius_m: float
+    """Of the circle that is as large as the area of the vertices in contact."""
+
+
+class FlatSlab:
+    """A flat layer of skin vertices on a hexagonal lattice, elastic and instantaneous; half-space when `thickness_m` is infinite.
+
+    The skin beyond the lattice is there too, but cannot be touched: choose `half_m` larger than the contact's radius.
+    Lesions need a finite thickness.
+    """
+
+    def __init__(
+        self,
+        young_pa: float = 1e4,
+        poisson: float = POISSON,
+        thickness_m: float = math.inf,
+        half_m: float = 0.025,
+        edge_m: float = 0.0015,
+        lesions: Sequence[Lesion] = (),
+        pitch_m: float = 0.010,
+    ) -> None:
+        self.young_pa = young_pa
+        self.poisson = poisson
+        self.model: PhantomModel = flat_phantom(half_m, edge_m, young_pa / YOUNG_OVER_K_W)
+        self.compliance: Compliance = compliance(self.model, lesions, thickness_m, poisson, pitch_m)
+        self._matrix: Array = self.compliance.matrix.astype(np.float64)
+
+    @property
+    def vertices(self) -> Array:
+        """Rest positions [m], shape (n, 3): in z = 0, a vertex at the origin."""
+        return self.model.vertices
+
+    def press(
+        self, radius_m: float, depth_m: float, xy_m: tuple[float, float] = (0.0, 0.0), profile: Profile = "sphere"
+    ) -> Pressed:
+        """The slab at rest under a sphere whose lowest point is `depth_m` below z = 0, over `xy_m`.
+
+        `paraboloid` is Hertz's indenter: a sphere to second order.
+        """
+        offset = self.vertices[self.compliance.free, :2] - np.asarray(xy_m)
+        square = (offset**2).sum(axis=1)
+        if profile == "paraboloid":
+            held = depth_m - square / (2 * radius_m)
+        else:
+            held = depth_m - radius_m + np.sqrt(np.maximum(radius_m**2 - square, 0.0))
+            held[square >= radius_m**2] = -1.0
+        near = np.flatnonzero(held > 0)
+        force = np.zeros(len(self.vertices))
+        displacement = np.zeros(len(self.vertices))
+        free = self.compliance.free
+        if len(near):
+            solver = ContactSolver(np.ascontiguousarray(self._matrix[np.ix_(near, near)]))
+            solver.begin_with(held[near] > 0.5 * held[near].max())
+            force[free[near]] = solver.solve(held[near])[0]
+            displacement[free] = self._matrix[:, near] @ force[free[near]]
+        area = float(self.model.areas[force > 0].sum())
+        return Pressed(float(force.sum()), displacement, force, math.sqrt(area / math.pi))
+
+    @cached_property
+    def border_m(self) -> float:
+        """How far from the origin the slab can be touched."""
+        return float(np.abs(self.vertices[self.compliance.free, :2]).max(axis=0).min())
+
+    def tissue(self, stiffness: Stiffness | None = None, breathing: Breathing | None = None, dt: float = 1e-3) -> ElasticTissue:
+        """The same slab as a tissue that steps in time: `tissue.step(t_s, p_A, v_A, radius)` gives force and torque."""
+        return ElasticTissue(self.model, self.compliance, stiffness, breathing, dt)

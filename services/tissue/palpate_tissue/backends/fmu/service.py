@@ -1,0 +1,165 @@
+"""The FMU service: messages in, a step of the FMU, messages out, whatever the FMU is."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate_bus.contract import Contract, contract
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_fmu.compiling import native
+from palpate_fmu.export import build_scenario_fmu
+from palpate_fmu.instance import FmuInstance
+from palpate_models.frames import matrix
+from palpate_models.phantom import build_phantom
+from palpate_models.scenario import Scenario
+from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
+from palpate_tissue.backends.fmu.wiring import Array, Wiring
+
+_log = logging.getLogger("palpate.fmu_host")
+
+MOST_STEPS = 1000
+"""Steps an FMU of fixed step size may be behind in one call; more is a mistake."""
+
+
+class FmuService(Service):
+    """Hosts an FMU in a role. At tick T the FMU is advanced to T, with the newest inputs; it starts a period before tick 0."""
+
+    def __init__(
+        self,
+        fmu_file: Path,
+        table: FmuMap,
+        frames: Mapping[str, Array],
+        scenario: Mapping[str, Any] | None = None,
+        rules: Contract | None = None,
+    ) -> None:
+        rules = rules or contract()
+        if table.role not in rules.roles:
+            raise MapError(f"there is no role {table.role!r}; roles are {', '.join(rules.roles)}")
+        self._period = rules.roles[table.role].period
+        self._time = -self._period
+        self._fmu = FmuInstance(fmu_file, self._time / NS, table.parameters)
+        self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
+        self._latched = tuple(output for output in self._wiring.outputs if output.topic.latched)
+        self._running = tuple(output for output in self._wiring.outputs if not output.topic.latched)
+        simulation = self._fmu.description.coSimulation
+        self._variable_step = bool(getattr(simulation, "canHandleVariableCommunicationStepSize", False))
+        self._steps = 0
+        _log.info("%s: FMI %s, %d variables", fmu_file.name, self._fmu.description.fmiVersion, len(self._fmu.variables))
+
+    def start(self) -> Outbox:
+        """The latched topics."""
+        return {output.topic.name: output.message(0) for output in self._latched}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Advances the FMU to `t` [ns]. Raises FmuError, with what the FMU says, if it fails."""
+        for source in self._wiring.inputs:
+            message = inbox.latest(source.topic.name)
+            if message is not None:
+                source.write(message)
+        self._advance(t)
+        outbox: dict[str, Message | list[Message]] = {}
+        for output in self._running:
+            if t % output.topic.period == 0:
+                outbox[output.topic.name] = output.message(t)
+        return outbox
+
+    def _advance(self, t: int) -> None:
+        behind, rest = divmod(t - self._time, self._period)
+        if behind > MOST_STEPS:
+            raise RuntimeError(f"the FMU would have to catch up {behind} periods, at most {MOST_STEPS} are allowed")
+        if behind == 1 or (self._variable_step and t > self._time):
+            self._fmu.step(self._time / NS, (t - self._time) / NS)
+            self._steps += 1
+        else:
+            if rest:
+                raise RuntimeError(f"the FMU takes steps of {self._period / NS} s only, not to {t / NS} s")
+            for k in range(behind):
+                self._fmu.step((self._time + k * self._period) / NS, self._period / NS)
+                self._steps += 1
+        self._time = t
+
+    def finish(self) -> Mapping[str, Any]:
+        """What was hosted; frees the FMU."""
+        description = self._fmu.description
+        facts = {
+            "fmu": self._fmu.path.name,
+            "model": description.modelName,
+            "fmi_version": description.fmiVersion,
+            "token": description.guid or getattr(description, "instantiationToken", None),
+            "steps": self._steps,
+        }
+        self._fmu.close()
+        return facts
+
+
+def host(role: str, *arguments: Any, **options: Any) -> FmuService:
+    """An FMU service of a role: the arguments are those of FmuService."""
+    cls = type(f"Fmu{role.title()}Service", (FmuService,), {"role": role})
+    service: FmuService = cls(*arguments, **options)
+    return service
+
+
+def chosen_role() -> str:
+    """The role of this process: that of the map that PALPATE_FMU_MAP names, or tissue."""
+    path = os.environ.get("PALPATE_FMU_MAP")
+    return load_map(Path(path)).role if path else "tissue"
+
+
+def packaged_map(name: str) -> FmuMap:
+    """A map that comes with this package."""
+    with resources.as_file(resources.files("palpate_tissue.backends.fmu").joinpath("maps", f"{name}.yaml")) as path:
+        return load_map(path)
+
+
+def create(scenario: Scenario) -> FmuService:
+    """The FMU that PALPATE_FMU names, tied by the map that PALPATE_FMU_MAP names.
+
+    By default the abdomen of the scenario, built here, in the role of the tissue.
+    """
+    file, path = os.environ.get("PALPATE_FMU"), os.environ.get("PALPATE_FMU_MAP")
+    table = load_map(Path(path)) if path else None
+    if file is None or file == "":
+        if table is not None and table.role != "tissue":
+            raise MapError(f"PALPATE_FMU is not set: which FMU plays the role {table.role}?")
+        with tempfile.TemporaryDirectory() as folder:
+            fmu_file = build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()])
+            return _host(fmu_file, table, scenario)
+    return _host(Path(file), table, scenario)
+
+
+def _host(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
+    """The patient's true pose is in the scenario of the tissue alone: other roles get a scenario with the registered one."""
+    if not fmu_file.is_file():
+        raise MapError(f"PALPATE_FMU={fmu_file}: no such file")
+    table = table or packaged_map("tissue_fmi2" if _fmi_version(fmu_file) == "2.0" else "tissue")
+    X_WA = matrix(scenario.phantom.pose.true)
+    frames = {"world": np.eye(4), "abdomen": X_WA}
+    known: dict[str, Any] = {"X_WA.position": X_WA[:3, 3], "X_WA.orientation": Rotation.from_matrix(X_WA[:3, :3]).as_quat()}
+    if table.role == "tissue":
+        model = build_phantom(scenario.phantom, scenario.seed)
+        known |= {
+            "phantom.vertices": model.vertices,
+            "phantom.normals": model.normals,
+            "phantom.triangles": model.triangles,
+            "phantom.stiffness": model.stiffness,
+            "phantom.background": model.background,
+            "phantom.lesion": model.lesion,
+        }
+    return host(table.role, fmu_file, table, frames, known)
+
+
+def _fmi_version(fmu_file: Path) -> str:
+    import fmpy  # noqa: PLC0415  (slow to import)
+
+    return str(fmpy.read_model_description(str(fmu_file), validate=False).fmiVersion)

@@ -1,0 +1,270 @@
+"""The elastic tissue's laws: the layer, the finite elements, lesions, relaxation, energy, contact."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import nnls
+
+from palpate_models.phantom import PhantomModel, flat_phantom
+from palpate_models.scenario import Breathing, Lesion, Stiffness
+from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, compliance
+from palpate_tissue.backends.elastic.contact import ContactSolver
+from palpate_tissue.backends.elastic.kernel import LayerKernel, layer_factor
+from palpate_tissue.backends.elastic.slab import FlatSlab
+from palpate_tissue.backends.elastic.solid import brick_stiffness, graded_grid, skin_compliance
+from palpate_tissue.backends.elastic.tissue import ElasticTissue, update_rule
+
+STILL = np.zeros(3)
+ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
+LUMP = Lesion(centre_m=(0.0, 0.0), radii_m=(0.02, 0.02), contrast=5, depth_m=0.01)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@cache
+def flat(edge_m: float = 0.005, half_m: float = 0.045) -> PhantomModel:
+    return flat_phantom(half_m, edge_m)
+
+
+@cache
+def solid(lesions: tuple[Lesion, ...] = (), thickness_m: float = 0.05, pitch_m: float = 0.020) -> Compliance:
+    return compliance(flat(), lesions, thickness_m, pitch_m=pitch_m)
+
+
+def hold(tissue: ElasticTissue, depth: float, radius: float, xy: tuple[float, float] = (0.0, 0.0), seconds: float = 1.0) -> float:
+    p = np.array((*xy, radius - depth))
+    force = STILL
+    for k in range(round(seconds / tissue.dt)):
+        force, _ = tissue.step(k * tissue.dt, p, STILL, radius)
+    return float(force[2])
+
+
+def test_a_layers_long_waves_are_uniaxial_strain_and_its_short_ones_boussinesqs() -> None:
+    for poisson in (0.0, 0.3, 0.49):
+        wave = 1e-3
+        assert layer_factor(np.array([wave]), poisson)[0] == pytest.approx(
+            wave * (1 - 2 * poisson) / (2 * (1 - poisson) ** 2), rel=1e-3
+        )
+        assert layer_factor(np.array([30.0]), poisson)[0] == pytest.approx(1, abs=1e-9)
+
+
+def test_the_self_term_makes_the_lattice_sum_an_integral() -> None:
+    """A smooth pressure p = (1 - r^2/c^2)^2 on a fine hexagonal lattice against its integral over 1/r."""
+    c = 0.02
+    for edge in (0.004, 0.002):
+        x = np.array([(i + j % 2 / 2, j * math.sqrt(3) / 2) for i, j in product(range(-30, 31), repeat=2)]) * edge
+        r = np.linalg.norm(x, axis=1)
+        p, area = np.where(r < c, (1 - (r / c) ** 2) ** 2, 0.0), edge**2 * math.sqrt(3) / 2
+        kernel = LayerKernel()
+        own = r < 1e-9
+        k = np.where(own, kernel.at_own_place(np.full(len(r), area)), kernel(np.where(own, 1.0, r)))
+        exact = 2 * math.pi * quad(lambda r: (1 - (r / c) ** 2) ** 2, 0, c)[0]
+        assert area * (k @ p) == pytest.approx(exact, rel=0.002)
+
+
+def test_a_brick_strains_evenly_and_turns_freely() -> None:
+    size, poisson = np.array([0.01, 0.02, 0.03]), 0.3
+    stiffness = brick_stiffness(size[None], poisson)[0]
+    assert (np.abs(np.linalg.eigvalsh(stiffness)) < 1e-9).sum() == 6
+    nodes = np.array(list(product((0, 1), repeat=3))) * size
+    gradient = np.random.default_rng(0).normal(size=(3, 3))
+    u = (nodes @ gradient.T).ravel()
+    strain = (gradient + gradient.T) / 2
+    shear, lame = 1 / (2 * (1 + poisson)), poisson / ((1 + poisson) * (1 - 2 * poisson))
+    energy = 0.5 * size.prod() * (2 * shear * (strain**2).sum() + lame * np.trace(strain) ** 2)
+    assert 0.5 * u @ stiffness @ u == pytest.approx(energy, rel=1e-10)
+
+
+def test_finite_elements_of_a_uniform_layer_meet_the_layers_own_solution() -> None:
+    """Two independent ways to the same compliance, for a smooth pressure: elements and Hankel transform."""
+    thickness, poisson = 0.05, 0.45
+    corner = np.array((0.04, 0.04))
+    errors = []
+    for pitch in (0.010, 0.0075):
+        grid = graded_grid(-corner, corner, thickness, pitch)
+        elements = skin_compliance(grid, lambda points: np.full(len(points), 1e4), poisson)
+        np.testing.assert_allclose(elements, elements.T, atol=1e-12 * elements.max())
+        xy = np.column_stack([a.ravel() for a in np.meshgrid(*grid.skin, indexing="ij")])
+        kernel = LayerKernel(poisson, thickness)
+        distance = np.linalg.norm(xy[:, None] - xy[None], axis=2)
+        np.fill_diagonal(distance, 1)
+        exact = kernel(distance)
+        np.fill_diagonal(exact, kernel.at_own_place(np.full(len(xy), pitch**2)))
+        load = np.exp(-((xy**2).sum(axis=1)) / (2 * 0.018**2))
+        errors.append((load @ elements @ load) / (kernel.factor(1e4) * (load @ exact @ load)) - 1)
+    assert abs(errors[0]) < 0.04
+    assert abs(errors[1]) < 0.02
+
+
+def test_contact_forces_are_those_of_a_quadratic_programme() -> None:
+    rng = np.random.default_rng(1)
+    for m in (3, 12, 40):
+        root = rng.normal(size=(m, m)) + 2 * np.eye(m)
+        matrix, b = root @ root.T, rng.normal(size=m)
+        force, moved = ContactSolver(matrix).solve(b)
+        upper = np.linalg.cholesky(matrix)
+        reference, _ = nnls(upper.T, np.linalg.solve(upper, b))
+        np.testing.assert_allclose(force, reference, atol=1e-8)
+        np.testing.assert_allclose(moved, matrix @ force, atol=1e-9)
+        assert (moved >= b - 1e-9).all()
+
+
+def test_the_step_settles_at_the_static_solution() -> None:
+    model = flat(0.003, 0.03)
+    body = compliance(model, thickness_m=np.inf)
+    slab = FlatSlab(1e4, edge_m=0.003, half_m=0.03)
+    assert hold(ElasticTissue(model, body, ELASTIC), 0.006, 0.015) == pytest.approx(slab.press(0.015, 0.006).force_n, rel=1e-5)
+
+
+def test_a_lesion_is_felt_the_less_the_deeper_it_is() -> None:
+    forces = [
+        hold(ElasticTissue(flat(), solid((LUMP.model_copy(update={"depth_m": d}),)), ELASTIC), 0.010, 0.015, seconds=0.5)
+        for d in (0.005, 0.015, 0.030)
+    ]
+    healthy = hold(ElasticTissue(flat(), solid(), ELASTIC), 0.010, 0.015, seconds=0.5)
+    assert forces[0] > forces[1] > forces[2] > healthy
+    assert forces[0] / healthy > 1.3
+    assert forces[2] / healthy < 1.15
+
+
+def test_a_column_from_the_skin_is_felt_with_nearly_its_contrast() -> None:
+    wide = Lesion(centre_m=(0.0, 0.0), radii_m=(0.04, 0.04), contrast=4)
+    ratio = hold(ElasticTissue(flat(), solid((wide,)), ELASTIC), 0.008, 0.012, seconds=0.5)
+    ratio /= hold(ElasticTissue(flat(), solid(), ELASTIC), 0.008, 0.012, seconds=0.5)
+    assert 3.2 < ratio <= 4.05
+
+
+def test_with_a_lesion_the_compliance_stays_positive_definite_and_symmetric() -> None:
+    matrix = solid((LUMP,)).matrix.astype(np.float64)
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-6 * matrix.max())
+    assert np.linalg.eigvalsh((matrix + matrix.T) / 2).min() > 0
+
+
+def test_superposition_over_time_and_place() -> None:
+    """The skin is the sum of what each force of each millisecond did to it, while the contact wanders and the lists change."""
+    tissue = ElasticTissue(flat(), solid((LUMP,)), Stiffness(friction=0.0))
+    free, steps, history = tissue.compliance.free, 400, []
+    for k in range(steps):
+        tissue.step(k * 1e-3, np.array((-0.02 + 1e-4 * k, 0.0, 0.009)), STILL, 0.015)
+        pressed = np.zeros(len(free))
+        pressed[np.searchsorted(free, tissue.contacts)] = tissue.contact_forces
+        history.append(pressed)
+    advance, feed = update_rule(Stiffness(), 1e-3)
+    answer, answers = feed, []
+    for _ in range(steps):
+        answers.append(answer[0])
+        answer = advance @ answer
+    pressed = np.array(answers[::-1]) @ np.array(history)
+    expected = tissue.compliance.matrix.astype(np.float64) @ pressed
+    np.testing.assert_allclose(tissue.displacement[free], expected, atol=1e-7)
+    assert expected.max() > 0.004
+
+
+def test_force_relaxes_by_the_prony_series() -> None:
+    stiffness = Stiffness(friction=0.0)
+    tissue = ElasticTissue(flat(), solid(), stiffness)
+    p = np.array((0.0, 0.0, 0.005))
+    forces = [tissue.step(0, p, STILL, 0.015)[0][2] for _ in range(6000)]
+    instantaneous = hold(ElasticTissue(flat(), solid(), ELASTIC), 0.010, 0.015)
+    for t in (1.0, 1.86, 4.0, 6.0):
+        left = 1 - sum(g * (1 - math.exp(-t / tau)) for g, tau in zip(stiffness.prony_g, stiffness.prony_tau_s, strict=True))
+        assert forces[round(t / tissue.dt) - 1] / instantaneous == pytest.approx(left, rel=0.005)
+
+
+def test_time_constants_read_from_the_force_are_those_given() -> None:
+    stiffness = Stiffness(prony_g=(0.4,), prony_tau_s=(0.5,), dashpot_s=0.005, friction=0.0)
+    tissue = ElasticTissue(flat(), solid(), stiffness)
+    forces = np.array([tissue.step(0, np.array((0.0, 0.0, 0.005)), STILL, 0.015)[0][2] for _ in range(4000)])
+    end = forces[-1]
+    t = 1e-3 * np.arange(1, 4001)
+    seen = slice(100, 1200)
+    slope = np.polyfit(t[seen], np.log(forces[seen] - end), 1)[0]
+    assert -1 / slope == pytest.approx(0.5, rel=0.02)
+    instantaneous = hold(ElasticTissue(flat(), solid(), ELASTIC), 0.010, 0.015)
+    assert end / instantaneous == pytest.approx(0.6, rel=0.02)
+
+
+def test_far_vertices_catch_up_exactly_with_stepping_every_one() -> None:
+    """Reading the surface each millisecond or once at the end gives the same surface and forces, while the sphere slides."""
+    results = []
+    for every in (1, 10_000):
+        tissue = ElasticTissue(flat(), solid((LUMP,)), Stiffness())
+        forces = []
+        for k in range(1200):
+            p = np.array((-0.03 + 5e-5 * k, 0.003, 0.007 + 0.006 * math.cos(k / 150)))
+            forces.append(tissue.step(k * 1e-3, p, np.array((0.05, 0.0, 0.0)), 0.015)[0])
+            if k % every == 0:
+                tissue.deformed_vertices  # noqa: B018
+        results.append((np.array(forces), tissue.displacement))
+    np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-6)
+    np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-8)
+
+
+def loop(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """A random closed path of the sphere's centre that dips in and out, starting and ending out of contact."""
+    t = np.linspace(0, 2 * np.pi, steps + 1)
+    p = np.zeros((steps + 1, 3))
+    for axis in range(2):
+        for n in (1, 2, 3):
+            p[:, axis] += 0.015 / n * rng.normal() * np.sin(n * t + rng.uniform(0, 2 * np.pi))
+    p[:, 2] = 0.0145 + 0.005 * np.cos(t) + 0.004 * np.cos(rng.integers(2, 6) * t)
+    p[:, 2] += 0.016 - p[0, 2]
+    return p
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_closed_cycle_yields_work(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tissue = ElasticTissue(flat(), solid((LUMP,)), Stiffness(friction=float(rng.choice((0.0, 0.3)))))
+    path = loop(rng, int(rng.integers(600, 1500)))
+    work = touched = 0.0
+    last = np.zeros(3)
+    for k, (a, b) in enumerate(pairwise(path)):
+        force, _ = tissue.step(0, b, (b - a) / tissue.dt, 0.015)
+        work -= 0.5 * (force + last) @ (b - a)
+        touched += tissue.touching
+        last = force
+        if k % 100 == 0:
+            assert tissue.energy() <= work + 1e-6  # never more than was put in
+    assert touched > 100
+    assert work > 0
+
+
+def test_breathing_lifts_the_skin_into_the_sphere() -> None:
+    tissue = ElasticTissue(flat(), solid(), ELASTIC, Breathing(amplitude_m=0.006, rate_per_min=15))
+    forces = [tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.015)), STILL, 0.015)[0][2] for k in range(4000)]
+    assert max(forces) > 0.5
+    assert forces[1000] == pytest.approx(max(forces), rel=0.05)  # a quarter of the period
+    assert min(forces[2100:3900]) == 0
+
+
+def test_sliding_friction_is_coulombs() -> None:
+    tissue = ElasticTissue(flat(), solid(), Stiffness(friction=0.3, dashpot_s=1e-4, prony_g=(), prony_tau_s=()))
+    force = STILL
+    for k in range(1200):
+        force, _ = tissue.step(k * 1e-3, np.array((-0.018 + 3e-5 * k, 0.0, 0.007)), np.array((0.03, 0.0, 0.0)), 0.015)
+    assert -force[0] / force[2] == pytest.approx(0.3, abs=0.02)
+
+
+def test_too_many_vertices_are_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch, pytest.raises(SizeError, match="edge_m"):
+        patch.setattr("palpate_tissue.backends.elastic.compliance.MOST_VERTICES", 100)
+        compliance(flat(), thickness_m=0.1)
+    with pytest.raises(ValueError, match="thickness_m"):
+        compliance(flat(), (LUMP,), thickness_m=np.inf)
+
+
+def test_a_position_that_is_no_number_is_refused() -> None:
+    with pytest.raises(ValueError, match="not finite"):
+        ElasticTissue(flat(), solid()).step(0.0, np.array((np.nan, 0, 0)), STILL, 0.015)

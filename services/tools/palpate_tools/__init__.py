@@ -1,1 +1,0 @@
-"""Tools to look at a live bus, and the conformance kit for implementations of a role."""

@@ -1,0 +1,66 @@
+"""What the fault campaign makes of how a case ended."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from conductor_messages import collected, result
+
+from palpate.run.result import Progress
+from palpate_benchmarks.campaign import COMPLETE, WENT_ON, Case, CaseOver, Finding, _conclude, _Watch
+from palpate_benchmarks.campaign_tables import markdown
+from palpate_bus.messages import ExamState
+
+
+def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
+    struck = Finding("nan", where, "lockstep", injected_s=0.0)
+    local: Any = SimpleNamespace(running={})
+    return _Watch(Case("nan", where, False), local, target, struck, since=1e12)
+
+
+def in_phase(phase: int, message: str = "") -> Progress:
+    messages = collected()
+    last = messages.exam_states[-1]
+    messages.exam_states.append(ExamState(**{**vars(last), "phase": phase, "message": message}))
+    return Progress(0, 1.0, messages)
+
+
+@pytest.mark.parametrize(
+    ("phase", "end"),
+    [
+        (ExamState.PHASE_DONE, COMPLETE),
+        (ExamState.PHASE_RETURN, WENT_ON),
+        (ExamState.PHASE_ABORTED, "aborted in phase SCAN: planning/setpoint refused"),
+    ],
+)
+def test_a_case_is_over_as_soon_as_its_end_is_sure(phase: int, end: str) -> None:
+    progress = in_phase(phase, end)
+    case = watch()
+    with pytest.raises(CaseOver, match=end):
+        case.tell(progress)
+    _conclude(case.finding, case, result(progress.collected, failure=end))
+    assert case.finding.ended == end
+    assert case.finding.good
+    assert (case.finding.sign == "") == (end in (COMPLETE, WENT_ON)), "what goes on was not noticed"
+
+
+def test_what_assessment_does_shows_after_the_scan() -> None:
+    watch("assessment/map", "assessment").tell(in_phase(ExamState.PHASE_RETURN))
+    watch().tell(in_phase(ExamState.PHASE_SCAN))
+
+
+def test_an_end_that_names_nobody_is_bad() -> None:
+    case = watch()
+    _conclude(case.finding, case, result(collected(), failure="something went wrong"))
+    assert not case.finding.good
+
+
+def test_the_page_sums_up_and_marks_what_is_bad() -> None:
+    fine = Finding("kill", "robot", "lockstep", 8.0, 20.0, "robot lost", "run ended", 5.0, 5.5, "robot lost", True)
+    slow = Finding("kill", "tissue", "lockstep", 8.0, 40.0, "tissue lost", "run ended", 5.0, 26.0, "tissue lost", True)
+    page = markdown([fine, slow])
+    assert "1 of 2 as they should be; the largest force was 26.0 N." in page
+    assert "| lockstep | kill | 2 | 1 | 2 | 30, 40 | 26.0 | run ended 2 |" in page
+    assert "| **!** | lockstep | kill | tissue |" in page

@@ -1,0 +1,106 @@
+"""What palpate reproduce makes of runs: pictures of what stands there, the graph of the bus, a page of what was measured."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from palpate.report.archive import Evidence, completed
+from palpate_reproduction import figures
+from palpate_reproduction.render import BACKGROUND, Body, View, picture
+from palpate_reproduction.reproduction import chosen_moments
+
+
+def square(z: float, color: tuple[float, float, float], half: float = 1.0) -> Body:
+    vertices = np.array([(-half, -half, z), (half, -half, z), (half, half, z), (-half, half, z)], dtype=np.float32)
+    triangles = np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32)
+    normals = np.tile(np.array((0, 0, 1), dtype=np.float32), (4, 1))
+    return Body(vertices, triangles, normals, np.tile(np.array(color, dtype=np.float32), (4, 1)))
+
+
+def test_a_picture_shows_what_is_nearest_lit_from_above_with_its_shadow() -> None:
+    view = View((0.0, -0.01, 4.0), (0.0, 0.0, 0.0), 40.0)
+    image = picture([square(0.0, (200, 0, 0)), square(0.5, (0, 200, 0), 0.2)], view, 80, 80).astype(int)
+    assert tuple(image[0, 0]) == BACKGROUND
+    assert image[40, 40].argmax() == 1  # the green one lies above
+    red = image[..., 0] * (image[..., 0] > 2 * image[..., 1])
+    shades = np.unique(red[red > 0])
+    assert shades.max() > 1.5 * shades.min()  # where the lamp is hidden it is darker
+    lit = np.argwhere(red == shades.max())
+    dark = np.argwhere(red == shades.min())
+    assert dark[:, 1].mean() < lit[:, 1].mean() + 40
+
+
+def test_the_graph_counts_what_was_there(tmp_path: Path) -> None:
+    rows = [
+        {"node": "robot", "kind": "MP", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
+        {"node": "control", "kind": "MS", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
+        {"node": "control", "kind": "MP", "topic": "control/joint_torque", "type": "palpation_msgs/msg/JointTorqueCommand"},
+        {"node": "robot", "kind": "MS", "topic": "control/joint_torque", "type": "palpation_msgs/msg/JointTorqueCommand"},
+        {"node": "recorder", "kind": "MS", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
+        {"node": "stranger", "kind": "MS", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
+    ]
+    path = tmp_path / "graph.png"
+    assert figures.graph(path, rows, ("recorder",)) == (4, 2)
+    image = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    service, watcher = (np.abs(image - c).max(axis=-1) < 6 for c in ((0xCC, 0xFB, 0xF1), (0xE2, 0xE8, 0xF0)))
+    assert service.sum() > 2.5 * watcher.sum() > 0
+
+
+def evidence(phase: list[int], force: list[float]) -> Evidence:
+    n = len(phase)
+    flat, none = np.zeros(n), np.zeros(n, dtype=bool)
+    return Evidence(
+        time=np.arange(n, dtype=float), phase=np.array(phase, dtype=np.uint8), depth=flat, setpoint=flat, force=np.array(force),
+        in_contact=none, steady=none, force_limited=none, visited=np.zeros(n, np.uint32), skipped=np.zeros(n, np.uint32),
+        target_count=1, true_time=flat, true_depth=flat, true_force=flat, events=(), stiffness_map=None, findings=None,
+        phantom=None, targets=None,
+    )  # fmt: skip
+
+
+def test_the_moments_are_of_their_phases() -> None:
+    one = evidence([0, 1, 1, 3, 3, 4, 4, 5, 5, 5, 5, 6, 7], [0, 0, 0, 0, 0, 1, 2, 2, 2, 9, 2, 1, 0])
+    chosen = {words: time for words, time, _ in chosen_moments(one)}
+    assert 1 <= chosen["looking"] <= 2
+    assert 3 <= chosen["approaching"] <= 4
+    assert 5 <= chosen["descending"] <= 6
+    assert chosen["scanning, on the stiff area"] == 9
+
+
+def test_a_run_that_failed_is_not_finished(tmp_path: Path) -> None:
+    assert completed(tmp_path) is None
+    (tmp_path / "evidence.npz").touch()
+    (tmp_path / "report.json").write_text('{"failure": "robot lost"}', encoding="utf-8")
+    assert completed(tmp_path) is None
+    (tmp_path / "report.json").write_text('{"failure": null}', encoding="utf-8")
+    assert completed(tmp_path) is not None
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_page_is_made_of_runs(tmp_path: Path) -> None:
+    small = [w for s in ("exam.region_m=[0.06,0.06]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=6") for w in ("--set", s)]
+    palpate = str(Path(sys.executable).with_name("palpate"))
+    done = subprocess.run(
+        [palpate, "reproduce", "--out", str(tmp_path), "--json", *small],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=1700,
+    )
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["factor"] > 1.5  # points take longer
+    assert facts["nodes"] >= 10
+    page = (tmp_path / "reproduction.md").read_text(encoding="utf-8")
+    for number in (3, 5, 6, 7, 8):
+        assert f"## Figure {number}" in page
+    images = sorted((tmp_path / "images" / "reproduction").glob("*.png"))
+    assert len(images) == 6
+    assert all(image.stat().st_size < 400_000 for image in images)

@@ -1,0 +1,49 @@
+"""Renews the references of all services from one short examination: `python services/replay/tests/make_references.py`.
+
+Needed after a change of a message type, or where the inputs themselves should change. When a service is meant to answer its old
+inputs in a new way, `palpate replay REFERENCE --service ROLE --update-refs REFERENCE` is enough.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from palpate.replay.golden import make_reference, prepare
+from palpate_bus.messages.stamps import NS
+
+FOLDER = Path(__file__).parent / "references"
+SETTINGS = (
+    "exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "phantom.edge_m=0.02",
+    "camera.frames=2", "camera.width_px=160", "camera.height_px=120", "camera.focal_px=146",
+)  # fmt: skip
+"""A small examination with small messages: a coarse abdomen and a camera of few pixels."""
+CUTS = {
+    "robot": (0.0, 0.1),
+    "control": (7.0, 0.1),
+    "tissue": (8.5, 0.1),
+    "planning": (0.0, 3.0),
+    "supervisor": (7.0, 1.0),
+    "assessment": (8.0, 2.0),
+    "camera": (0.0, 1.2),
+    "perception": (0.0, 1.5),
+}
+"""What of the run a service is held to: from, and how long [s]."""
+
+
+def main() -> None:
+    """Runs and cuts."""
+    palpate = str(Path(sys.executable).with_name("palpate"))
+    with tempfile.TemporaryDirectory(prefix="palpate-references-") as folder:
+        words = [word for setting in SETTINGS for word in ("--set", setting)]
+        subprocess.run([palpate, "run", "rlq_guarding", "--composed", "--quiet", "--out", folder, *words], check=True)
+        for role, (begin, length) in CUTS.items():
+            target = FOLDER / f"{role}.mcap"
+            make_reference(prepare(Path(folder), role), target, round(begin * NS), round((begin + length) * NS))
+            print(f"{target}: {target.stat().st_size} bytes")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""Which command is loaded."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from palpate.commands import app_for
+
+
+def names(word: str) -> set[str]:
+    app = app_for(word)
+    return {c.name or getattr(c.callback, "__name__", "") for c in app.registered_commands} | {
+        str(group.name) for group in app.registered_groups
+    }
+
+
+def test_a_command_of_another_package_comes_alone() -> None:
+    assert names("doctor") == {"doctor"}
+    assert names("topic") == {"topic"}
+
+
+def test_an_operator_does_not_wait_for_plots_and_meshes() -> None:
+    program = (
+        "import sys; from palpate.commands import app_for; app_for('stop');"
+        "print(sorted({'open3d', 'matplotlib', 'scipy', 'pinocchio', 'rerun', 'IPython'} & sys.modules.keys()))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_help_and_unknown_words_know_them_all() -> None:
+    assert {"run", "stop", "pause", "doctor", "topic", "reproduce"} <= names("--help")
+    assert names("nonsense") >= names("--help")
+    assert "doctor" not in names("run") or names("run") == names("--help")  # an app keeps what was added to it before

@@ -1,0 +1,68 @@
+"""Bad input to the commands that measure for minutes: a sentence and status 2, before anything starts."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from palpate.command_line import EXIT_BAD_INPUT
+from palpate.commands import app_for
+
+MEASURING = ("bench", "evaluate", "swaps", "wallclock")
+
+
+@pytest.fixture(autouse=True)
+def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """No examination is begun, and files land in a scratch folder."""
+
+    def started(*words: object, **_: object) -> None:
+        raise AssertionError(f"started {words}")
+
+    monkeypatch.setattr(subprocess, "run", started)
+    monkeypatch.setattr(subprocess, "Popen", started)
+    monkeypatch.setattr("palpate_benchmarks.measure_commands.run_bench", started)
+    monkeypatch.chdir(tmp_path)
+
+
+def refused(*words: str) -> str:
+    """What the command says on its way out, on one line."""
+    called = CliRunner().invoke(app_for(words[0]), words)
+    assert called.exit_code == EXIT_BAD_INPUT, called.output
+    return " ".join(called.output.replace("│", " ").split())
+
+
+@pytest.mark.parametrize("command", MEASURING)
+def test_a_scenario_that_there_is_not(command: str) -> None:
+    assert "nosuch: no such scenario; known are" in refused(command, "nosuch")
+
+
+@pytest.mark.parametrize("command", ["swaps", "wallclock", "reproduce"])
+def test_a_setting_that_cannot_be(command: str) -> None:
+    said = refused(command, "--set", "exam.depth_m=-1")
+    assert "exam.depth_m" in said
+    assert "-1" in said
+
+
+def test_among_good_scenarios_a_bad_one() -> None:
+    assert "nosuch" in refused("evaluate", "elsewhere", "healthy", "nosuch")
+
+
+@pytest.mark.parametrize("command", ["bench", "evaluate", "faults"])
+def test_a_file_that_cannot_be_written(command: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "file: cannot be made a folder" in refused(command, "--out", "file/figures.json")
+    assert "isnofilethatcanbewritten" in refused(command, "--out", str(tmp_path)).replace(" ", "")
+
+
+@pytest.mark.parametrize("words", ["swaps --out", "wallclock --out", "reproduce --out", "reproduce --docs", "validate --docs"])
+def test_a_folder_that_cannot_be(words: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "file: cannot be made a folder" in refused(*words.split(), "file" if "--out" in words else "file/page.md")
+
+
+def test_findings_that_are_none(tmp_path: Path) -> None:
+    (tmp_path / "faults.json").write_text("[1, 2")
+    assert "faults.json: holds no findings" in refused("faults")

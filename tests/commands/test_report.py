@@ -1,0 +1,128 @@
+"""The report of a run, from messages as the bus carries them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conductor_messages import FOUND, collected, result
+from rich.console import Console
+
+from palpate.report.evidence import samples_of, steady_contact
+from palpate.report.page import write_page
+from palpate.report.results import Report, assemble, print_findings, write_results
+from palpate.run.distributed import write_scenario_files
+from palpate_models.load import load_scenario
+from palpate_models.scenario import Scenario
+
+ISSUE_FIELDS = [
+    *("scenario", "seed", "runtime", "platform", "sim_time_s", "wall_time_s", "real_time_factor", "run_hash", "samples"),
+    *("skipped_targets", "max_force_N", "mean_force_N", "depth_rms_error_m", "surface_rms_error_m"),
+    *("findings", "truth", "scores", "blame"),
+]
+FINDING_FIELDS = ["centroid_m", "quadrant", "area_m2", "stiffness_ratio", "confidence"]
+SCORE_FIELDS = ["localisation_error_m", "dice", "matched", "missed", "false_positives", "coverage_90"]
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return load_scenario("rlq_guarding", seed=3)
+
+
+def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
+    report = write_results(tmp_path, scenario, result(collected()))
+    written = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert set(ISSUE_FIELDS) <= set(written)
+    assert set(FINDING_FIELDS) <= set(written["findings"][0])
+    assert set(SCORE_FIELDS) <= set(written["scores"])
+    assert Report.model_validate(written) == report
+    assert written["scenario"] == "rlq_guarding"
+    assert written["seed"] == 3
+    assert written["findings"][0]["quadrant"] == "RLQ"
+    assert written["findings"][0]["centroid_m"][:2] == pytest.approx(FOUND)
+    assert written["truth"]["lesions"][0]["quadrant"] == "RLQ"
+    assert written["real_time_factor"] == pytest.approx(4.0)
+    assert written["max_force_N"] == pytest.approx(7.2)
+    assert written["mean_force_N"] == pytest.approx(2.5)
+    assert (written["scores"]["matched"], written["scores"]["missed"], written["scores"]["false_positives"]) == (1, 0, 0)
+    assert written["scores"]["localisation_error_m"] == pytest.approx(0.004, abs=1e-3)
+    assert written["surface_rms_error_m"] == pytest.approx(0.0005, abs=1e-5)
+    assert (tmp_path / "map.png").stat().st_size > 50_000
+
+
+def test_depth_error_is_of_the_true_depth_in_steady_contact(scenario: Scenario) -> None:
+    report = assemble(scenario, result(collected(depth_error=0.0007, measured_error=0.0002)))
+    assert report.depth_rms_error_m == pytest.approx(0.0007)
+    assert report.depth.measured_against_true_m == pytest.approx(0.0005)
+    assert report.depth.true_against_setpoint_lesion_m == pytest.approx(0.0007)
+    assert report.depth.force_limited == 0.0
+
+
+def test_states_without_a_truth_of_their_stamp_are_left_out() -> None:
+    c = collected()
+    whole = steady_contact(c.exam_states, c.indentation, np.eye(4))
+    half = steady_contact(c.exam_states, c.indentation[::2], np.eye(4))
+    assert len(whole.true) == sum(s.steady for s in c.exam_states)
+    assert 0 < len(half.true) < len(whole.true)
+
+
+def test_a_run_that_ended_early_has_a_report_all_the_same(scenario: Scenario, tmp_path: Path) -> None:
+    early = collected(map_too=False)
+    report = write_results(tmp_path, scenario, result(early, failure="tissue lost at tick 12.345 s: killed by signal 9"))
+    assert report.failure is not None
+    assert report.scores is None
+    assert report.findings == []
+    assert not (tmp_path / "map.png").exists()
+    assert (tmp_path / "samples.csv").exists()
+
+
+def test_a_run_that_never_ticked_has_a_report_all_the_same(scenario: Scenario, tmp_path: Path) -> None:
+    from palpate_conductor.collector import Collected
+
+    report = write_results(tmp_path, scenario, result(Collected(), failure="robot never answered"))
+    assert report.max_force_N is None
+    assert report.depth_rms_error_m is None
+    assert report.truth is None
+
+
+def test_growing_findings_are_no_findings(scenario: Scenario) -> None:
+    c = collected()
+    c.findings.final = False
+    assert assemble(scenario, result(c)).findings == []
+    c.findings.final = True
+
+
+def test_samples_csv_has_a_row_a_sample(scenario: Scenario, tmp_path: Path) -> None:
+    c = collected()
+    write_results(tmp_path, scenario, result(c))
+    rows = list(csv.DictReader((tmp_path / "samples.csv").open(encoding="utf-8")))
+    samples = samples_of(c.samples)
+    assert len(rows) == len(samples.time)
+    assert float(rows[3]["normal_force_N"]) == pytest.approx(samples.force[3])
+    assert float(rows[3]["x_m"]) == pytest.approx(samples.position[3, 0])
+
+
+def test_findings_in_words(scenario: Scenario) -> None:
+    text = io.StringIO()
+    print_findings(Console(file=text, width=120), assemble(scenario, result(collected())))
+    assert "RLQ" in text.getvalue()
+    assert "1 matched, 0 missed, 0 false" in text.getvalue()
+
+
+def test_a_real_abdomen_is_assessed_without_a_truth(scenario: Scenario, tmp_path: Path) -> None:
+    real = collected()
+    real.phantom, real.indentation = None, []
+    write_scenario_files(scenario, tmp_path)
+    report = write_results(tmp_path, scenario, result(real))
+    assert report.assessed
+    assert report.findings[0].quadrant == "RLQ"
+    assert (report.truth, report.scores, report.depth_rms_error_m) == (None, None, None)
+    assert "nothing is known of it" in write_page(tmp_path).read_text(encoding="utf-8").lower()
+    text = io.StringIO()
+    print_findings(Console(file=text, width=120), report)
+    assert "RLQ" in text.getvalue()
+    assert "truth" not in text.getvalue()

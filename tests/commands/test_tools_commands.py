@@ -1,0 +1,181 @@
+"""The commands on a live bus that somebody else started and that is found without an endpoint."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from small_bus import RULES, SmallRobot, small_bus
+from typer.testing import CliRunner, Result
+
+from palpate.live.doctor_command import doctor
+from palpate.live.node import app as node
+from palpate.live.topic import app as topic
+from palpate_bus.runs.announcement import Announcement, Run, live
+from palpate_bus.wire.liveliness import NodeTokens
+
+tools = typer.Typer()
+tools.add_typer(topic, name="topic")
+tools.add_typer(node, name="node")
+tools.command("doctor")(doctor)
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(tools, list(words))
+
+
+def output_of(*words: str) -> Any:
+    result = run(*words, "--json")
+    assert result.exit_code in (0, 1), result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def robot() -> Iterator[SmallRobot]:
+    with tempfile.TemporaryDirectory(prefix="small-") as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PALPATE_RUNS", folder)
+        for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG"):
+            patch.delenv(name, raising=False)
+        with small_bus(Path(folder), domain=7) as small:
+            yield small
+
+
+def test_topics_of_a_bus_that_nobody_named(robot: SmallRobot) -> None:
+    rows = {row["topic"]: row for row in output_of("topic", "list")}
+    assert set(rows) == {"joint_states", "ft/wrench", "robot_description"}
+    assert rows["joint_states"]["publishers"] == ["robot"]
+    assert all(row["matches_contract"] for row in rows.values())
+    assert "joint_states" in run("topic", "list").stdout
+
+
+def test_info_is_the_row_and_who_is_there(robot: SmallRobot) -> None:
+    facts = output_of("topic", "info", "/ft/wrench")
+    assert facts["contract"]["frame"] == "ft_sensor"
+    assert [(end["node"], end["kind"]) for end in facts["endpoints"]] == [("robot", "publisher")]
+    assert "[N] -200 .. 200" in run("topic", "info", "ft/wrench").stdout
+
+
+def test_echo_prints_what_is_sent(robot: SmallRobot) -> None:
+    heard = output_of("topic", "echo", "ft/wrench", "--once")
+    assert heard["message"]["wrench"]["force"] == {"x": 1.0, "y": -2.0, "z": 3.5}
+    text = run("topic", "echo", "ft/wrench", "--once", "--field", "wrench.force").stdout
+    assert text == "x: 1.0\ny: -2.0\nz: 3.5\n---\n"
+
+
+def test_echo_of_a_latched_topic_shows_what_was_sent_before(robot: SmallRobot) -> None:
+    assert output_of("topic", "echo", "robot_description", "--once")["message"] == {"data": "<robot/>"}
+
+
+def test_echo_names_the_fields_there_are(robot: SmallRobot) -> None:
+    result = run("topic", "echo", "ft/wrench", "--once", "--field", "wrench.power")
+    assert result.exit_code == 2
+    assert "no 'power' among force, torque" in result.stderr
+
+
+def test_hz_counts_simulated_time(robot: SmallRobot) -> None:
+    result = run("topic", "hz", "joint_states", "--seconds", "2.2", "--json")
+    rows = [json.loads(line) for line in result.stdout.splitlines()]
+    assert rows
+    assert all(abs(row["simulated_hz"] - 1000) < 1 for row in rows)
+    assert all(row["contract_hz"] == 1000 for row in rows)
+
+
+def test_bw_counts_bytes(robot: SmallRobot) -> None:
+    result = run("topic", "bw", "ft/wrench", "--seconds", "1.5", "--json")
+    row = json.loads(result.stdout.splitlines()[0])
+    assert row["mean_bytes"] == 76
+    assert row["bytes_per_s"] > 0
+
+
+def test_nodes_and_who_is_missing(robot: SmallRobot) -> None:
+    found = output_of("node", "list")
+    assert [row["node"] for row in found["nodes"]] == ["robot"]
+    assert found["missing"][0] == "tissue"
+    assert "control" in found["missing"]
+
+
+def test_doctor_finds_what_is_wrong(robot: SmallRobot) -> None:
+    def spoil(message: Any) -> Any:
+        message.position[2] = np.nan
+        return message
+
+    outdated = RULES.topics["joint_states"].model_copy(update={"type": "geometry_msgs/msg/WrenchStamped"})
+    tokens = NodeTokens(robot.bus, "rviz", 7)
+    tokens.subscription(outdated, RULES.qos["control"])
+    robot.spoil = spoil
+    try:
+        found = output_of("doctor", "--seconds", "2")
+    finally:
+        robot.spoil = lambda message: message
+        tokens.undeclare()
+    assert not found["healthy"]
+    about = {(finding["about"], finding["level"]) for finding in found["findings"]}
+    assert {("versions", "ok"), ("endpoints", "ok"), ("roles", "trouble"), ("types", "trouble")} <= about
+    kinds = {(v["topic"], v["sender"], v["kind"]) for v in found["violations"]}
+    assert ("joint_states", "robot", "not finite") in kinds
+    assert ("joint_states", "rviz", "type hash") in kinds
+    texts = " ".join(finding["text"] for finding in found["findings"])
+    assert "control is missing" in texts
+    assert "1 of 1 endpoints answer" in texts
+
+
+def test_ctrl_c_ends_a_tool_with_status_0_and_whole_lines(robot: SmallRobot) -> None:
+    words = [sys.executable, "-c", "from palpate.live.topic import app; app()", "echo", "joint_states", "--json"]
+    # A shell lets what it starts in the background ignore SIGINT, and that is inherited.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        tool = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert tool.stdout is not None
+    first = tool.stdout.readline()
+    tool.send_signal(signal.SIGINT)
+    rest, errors = tool.communicate(timeout=30)
+    assert tool.returncode == 0
+    assert errors == ""
+    assert all(json.loads(line) for line in [first, *rest.splitlines()])
+
+
+def test_without_a_run_it_says_where_it_looked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
+    for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG"):
+        monkeypatch.delenv(name, raising=False)
+    result = run("topic", "list")
+    assert result.exit_code == 2
+    assert str(tmp_path) in result.stderr.replace("\n", "")
+    assert "palpate run" in result.stderr
+
+
+def test_of_two_runs_one_must_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
+    both = [Announcement(Run(name=name, endpoints={}, pid=pid)) for pid, name in enumerate(("left", "right"), 1)]
+    result = run("topic", "list")
+    assert result.exit_code == 2
+    assert "left (process 1), right (process 2)" in result.stderr.replace("\n", " ")
+    for announcement in both:
+        announcement.withdraw()
+    assert live() == []
+
+
+def test_a_killed_run_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
+    code = "from palpate_bus.runs.announcement import *; a = Announcement(Run('x', {})); print('on', flush=True)"
+    code += "; import time; time.sleep(60)"
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    assert child.stdout.readline() == "on\n"
+    assert [found.name for found in live()] == ["x"]
+    child.kill()
+    child.wait()
+    assert live() == []
+    assert list(tmp_path.glob("*.json")) == []

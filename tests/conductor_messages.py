@@ -1,0 +1,167 @@
+"""Messages of a small examination, made by hand: a lesion, a finding 4 mm beside it, a flat abdomen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from palpate.run.result import RunResult
+from palpate_bus.messages import (
+    ExamState,
+    Finding,
+    Findings,
+    IndentationTruth,
+    PalpationSample,
+    PhantomTruth,
+    StiffnessMap,
+    SurfaceMesh,
+)
+from palpate_bus.messages.codec import message_type
+from palpate_bus.messages.stamps import header
+from palpate_conductor.collector import Collected
+
+_Point: Any = message_type("geometry_msgs/msg/Point")
+_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
+_Pose: Any = message_type("geometry_msgs/msg/Pose")
+_Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
+
+LESION, FOUND, RADIUS = (-0.05, -0.05), (-0.046, -0.05), 0.03
+P_WA = (0.56, 0.0, 0.93)
+
+
+def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+    n = round(2 * half / pitch) + 1
+    axis = np.linspace(-half, half, n)
+    x, y = np.meshgrid(axis, axis)
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    lower = np.column_stack((corner, corner + 1, corner + n + 1))
+    upper = np.column_stack((corner, corner + n + 1, corner + n))
+    vertices = np.column_stack((x.ravel(), y.ravel(), np.zeros(n * n)))
+    return vertices, np.concatenate((lower, upper)).astype(np.uint32)
+
+
+def mesh(vertices: np.ndarray, triangles: np.ndarray, frame: str) -> Any:
+    return SurfaceMesh(header(0, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
+
+
+def phantom() -> Any:
+    vertices, triangles = plane(0.14, 0.005)
+    beyond = np.linalg.norm(vertices[:, :2] - LESION, axis=1) - RADIUS
+    background = np.full(len(vertices), 1.7e5)
+    stiffness = background * (1 + 3 * np.clip(0.5 - beyond / 0.008, 0, 1))
+    lesion = np.where(beyond < 0, 0, -1).astype(np.int32)
+    pose = _Pose(_Point(*P_WA), _Quaternion(0.0, 0.0, 0.0, 1.0))
+    return PhantomTruth(mesh(vertices, triangles, "abdomen"), stiffness, background, lesion, pose)
+
+
+def stiffness_map() -> Any:
+    vertices, triangles = plane(0.12, 0.005)
+    beyond = np.linalg.norm(vertices[:, :2] - FOUND, axis=1) - RADIUS
+    stiffness = (1.7e5 * (1 + 3 * np.clip(0.5 - beyond / 0.012, 0, 1))).astype(np.float32)
+    return StiffnessMap(
+        header=header(60_000_000_000, "abdomen"),
+        vertices=vertices.astype(np.float32).ravel(),
+        triangles=triangles.ravel(),
+        force=(stiffness * 1.1e-5).astype(np.float32),
+        stiffness=stiffness,
+        stiffness_lower=(0.85 * stiffness).astype(np.float32),
+        stiffness_upper=(stiffness / 0.85).astype(np.float32),
+        scanned=(np.abs(vertices[:, :2]) <= 0.105).all(axis=1),
+        finding=np.where(beyond < 0, 0, -1).astype(np.int32),
+        common_depth=0.01,
+        background=1.7e5,
+        samples=400,
+    )
+
+
+def findings(final: bool = True) -> Any:
+    one = Finding(_Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999)
+    return Findings(header(60_000_000_000, "abdomen"), [one], final)
+
+
+def samples() -> list[Any]:
+    places = [(x, y) for y in np.arange(-0.1, 0.11, 0.02) for x in np.arange(-0.1, 0.11, 0.01)]
+    return [
+        PalpationSample(
+            header=header(k * 100_000_000, "abdomen"),
+            position=_Point(float(x), float(y), 0.0),
+            normal=_Vector3(0.0, 0.0, 1.0),
+            depth=0.01,
+            normal_force=2.0 + 0.01 * k,
+            tangential_speed=0.03,
+            time_in_contact=0.1 * k,
+            force_limited=False,
+        )
+        for k, (x, y) in enumerate(places)
+    ]
+
+
+def exam_states(measured_error: float) -> list[Any]:
+    return [
+        ExamState(
+            header=header(k * 10_000_000, "world"),
+            phase=ExamState.PHASE_SCAN,
+            message="",
+            target_index=k,
+            target_count=100,
+            targets_skipped=2,
+            in_contact=True,
+            steady=k >= 10,
+            force_limited=False,
+            view_blocked=False,
+            depth_setpoint=0.01,
+            depth=0.01 + measured_error,
+            normal_force=2.5,
+            surface_point=_Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
+            surface_normal=_Vector3(0.0, 0.0, 1.0),
+            end_tick=-1,
+        )
+        for k in range(100)
+    ]
+
+
+def indentation(depth_error: float) -> list[Any]:
+    return [
+        IndentationTruth(
+            header=header(k * 10_000_000, "world"),
+            depth=0.01 + depth_error if k >= 10 else 0.001,
+            normal_force=7.0 if k == 50 else 2.4,
+            tangential_force=0.5,
+            peak_force=7.2 if k == 50 else 2.5,
+            contacts=20,
+            surface_point=_Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
+            stiffness=6.8e5,
+        )
+        for k in range(100)
+    ]
+
+
+def collected(depth_error: float = 0.0003, measured_error: float = 0.0, map_too: bool = True) -> Collected:
+    """Everything that the conductor collects from a whole run, or from one that ended before its map."""
+    vertices, triangles = plane(0.125, 0.005)
+    return Collected(
+        exam_states=exam_states(measured_error),
+        indentation=indentation(depth_error),
+        samples=samples(),
+        phantom=phantom(),
+        surface=mesh(vertices + P_WA + np.array((0.0, 0.0, 0.0005)), triangles, "world"),
+        stiffness_map=stiffness_map() if map_too else None,
+        findings=findings() if map_too else None,
+    )
+
+
+def result(c: Collected, failure: str | None = None) -> RunResult:
+    return RunResult(
+        runtime="composed",
+        collected=c,
+        run_hash=None if failure else "0" * 64,
+        digests={},
+        sim_time_s=60.0,
+        wall_time_s=15.0,
+        start_time_s=0.5,
+        blame={},
+        counters={},
+        failure=failure,
+        lost={"tissue": 12_345_000_000} if failure else {},
+    )
