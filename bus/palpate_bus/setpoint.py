@@ -1,0 +1,109 @@
+"""The set-point of the impedance controller: one class from planning, which makes it, to the law, which follows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_bus.contract import MS, contract
+from palpate_bus.contract.checker import Checker
+from palpate_bus.messages import ImpedanceSetpoint
+from palpate_bus.messages.geometry import pose_message, rotation, twist, twist_message, vector, wrench, wrench_message
+from palpate_bus.messages.stamps import duration_message, header, nanoseconds
+
+Array = NDArray[np.float64]
+
+TOPIC = "planning/setpoint"
+
+
+class ControlMode(IntEnum):
+    """What a set-point asks for; values of `palpation_msgs/ImpedanceSetpoint`."""
+
+    CARTESIAN = 0
+    JOINT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """What the arm is to do at one moment, and how it goes on: control extrapolates by `V_WD` and `qd`.
+
+    D is the desired frame of the indenter, W is world. The contract's row of `planning/setpoint` says which values are allowed.
+    """
+
+    stamp: int
+    """Time at which pose and joint position hold [ns]."""
+    mode: ControlMode
+    R_WD: Array
+    """Desired rotation of the indenter, shape (3, 3)."""
+    p_WD: Array
+    """Desired origin of the indenter [m], shape (3,)."""
+    V_WD: Array
+    """Desired twist in world axes, linear [m/s] then angular [rad/s], shape (6,)."""
+    F_W: Array
+    """Feed-forward wrench on the environment at D's origin, force [N] then torque [N m], world axes, shape (6,)."""
+    stiffness: Array
+    """In axes of D: translation [N/m], rotation [N m/rad], shape (6,)."""
+    damping_ratio: Array
+    """[1], shape (6,)."""
+    q: Array
+    """JOINT: target; CARTESIAN: null-space posture [rad], shape (7,)."""
+    qd: Array
+    """Velocity of `q` [rad/s], shape (7,)."""
+    joint_stiffness: Array
+    """JOINT: of the joints; CARTESIAN: of the null-space posture [N m/rad], shape (7,)."""
+
+    def message(self) -> Any:
+        """`palpation_msgs/ImpedanceSetpoint`, valid for as long as the contract says."""
+        return ImpedanceSetpoint(
+            header=header(self.stamp, "world"),
+            mode=int(self.mode),
+            pose=pose_message(self.R_WD, self.p_WD),
+            twist=twist_message(self.V_WD),
+            wrench=wrench_message(self.F_W),
+            stiffness=self.stiffness,
+            damping_ratio=self.damping_ratio,
+            joint_position=self.q,
+            joint_velocity=self.qd,
+            joint_stiffness=self.joint_stiffness,
+            valid_for=_validity(),
+        )
+
+    @classmethod
+    def from_message(cls, message: Any) -> Setpoint:
+        """Of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field, its value and what is allowed."""
+        for wrong in _checker()(message):
+            raise ValueError(f"{TOPIC}: {wrong.field} = {wrong.got}: must be {wrong.expected}")
+        if message.mode not in tuple(ControlMode):
+            raise ValueError(f"{TOPIC}: mode = {message.mode}: must be one of {list(map(int, ControlMode))}")
+        try:
+            R_WD = rotation(message.pose.orientation)
+        except ValueError as error:
+            raise ValueError(f"{TOPIC}: pose.{error}") from None
+        return cls(
+            stamp=nanoseconds(message.header.stamp),
+            mode=ControlMode(message.mode),
+            R_WD=R_WD,
+            p_WD=vector(message.pose.position),
+            V_WD=twist(message.twist),
+            F_W=wrench(message.wrench),
+            stiffness=message.stiffness,
+            damping_ratio=message.damping_ratio,
+            q=message.joint_position,
+            qd=message.joint_velocity,
+            joint_stiffness=message.joint_stiffness,
+        )
+
+
+@cache
+def _checker() -> Checker:
+    return Checker(contract().topics[TOPIC])
+
+
+@cache
+def _validity() -> Any:
+    return duration_message((contract().topics[TOPIC].expiry_ms or 0) * MS)
