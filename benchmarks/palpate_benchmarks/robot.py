@@ -14,8 +14,8 @@ from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
 from palpate_models.scenario import Scenario
-from palpate_robot.plant import Plant
-from palpate_robot.service import create
+from palpate_robot.backends.dart.plant import DartPlant
+from palpate_robot.backends.dart.service import create
 
 _MS = 1_000_000
 _ROUNDS = 7
@@ -38,7 +38,7 @@ def measure(steps: int = 2000) -> dict[str, float]:
     The contact force changes its sign at every step, so that the arm stays where it is.
     """
     scenario = Scenario()
-    plant = Plant(scenario.robot)
+    plant = DartPlant(scenario.robot)
     force, moment, none = np.array([0.0, 0.0, 2.5]), np.zeros(3), np.zeros(7)
 
     def plant_step() -> None:

@@ -29,7 +29,7 @@ from palpate_planning.kinematics import Kinematics
 from palpate_planning.messages import setpoint_message
 from palpate_planning.poses import least_twist, pose
 from palpate_planning.setpoint import ControlMode, Setpoint
-from palpate_robot.plant import Plant
+from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.service import RobotService
 from palpate_tissue.service import TissueService
 from palpate_tissue.service import create as create_tissue
@@ -181,7 +181,7 @@ def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
             modes.append(outbox["robot/status"].mode)
 
     script = _Script(contrast, stiffness)
-    robot = RobotService(exam_input(chosen), lambda robot: Plant(robot, script.ready))
+    robot = RobotService(exam_input(chosen), lambda robot: DartPlant(robot, script.ready))
     run = Composed(
         [
             Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_status),

@@ -2,5 +2,5 @@
 
 from typing import Final
 
-GRAVITY: Final = 9.80665
-"""Standard gravity [m/s^2] (3rd CGPM, 1901)."""
+GRAVITY: Final = 9.81
+"""Along -z of world [m/s^2]: the value that pinocchio takes of itself, so that plant, controller and planner agree."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from palpate_models.frames import Array
+from palpate_models.gravity import GRAVITY
 from palpate_models.lbr import (
     FLANGE_TO_FT_M,
     FT_TO_INDENTER_M,
@@ -26,8 +27,6 @@ from palpate_models.lbr import (
 )
 from palpate_models.scenario import Robot
 
-GRAVITY = 9.81
-"""[m/s^2]"""
 ELBOW_CLEARANCE_M = 0.15
 """The elbow stays at least this far above the indenter, so that upper arm and forearm keep off abdomen and table."""
 REACH_LENGTH_M = 0.4

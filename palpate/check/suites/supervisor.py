@@ -13,11 +13,11 @@ from palpate_bus.messages import ExamState, OperatorRequest, Point, RobotStatus,
 from palpate_bus.messages.stamps import header
 from palpate_models import lbr
 from palpate_models.frames import Array, apply, inverse
+from palpate_models.gravity import GRAVITY
 from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
 from palpate_models.load import exam_input
 
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
-GRAVITY = 9.81
 FORCE_ERROR_N = 3.0
 """Force is untared: the sensor's bias is in it."""
 REACT_MS = 150

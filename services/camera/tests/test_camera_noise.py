@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_camera.noise import BASELINE_M, DISPARITY_STEP_PX, GRAZING_RAD, KinectNoise, axial_sigma, lateral_sigma
-from palpate_camera.scene import View
+from palpate_camera.backends.kinect.noise import (
+    BASELINE_M,
+    DISPARITY_STEP_PX,
+    GRAZING_RAD,
+    KinectNoise,
+    axial_sigma,
+    lateral_sigma,
+)
+from palpate_camera.backends.kinect.scene import View
 
 FOCAL = 585.0
 SHAPE = (240, 320)

@@ -13,8 +13,8 @@ from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.codec import encode
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.recordings import RecordingError, open_recording
+from palpate_camera.backends.kinect.service import create as create_camera
 from palpate_camera.backends.replay.service import IMAGE, INFO, POSE, ReplayedCamera, create
-from palpate_camera.service import create as create_camera
 from palpate_models.load import load_scenario
 from palpate_recorder.service import RecorderService
 

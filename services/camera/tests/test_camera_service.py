@@ -12,7 +12,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger, SurfaceMesh, TFMessage, codec
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_camera.service import FRAME, CameraService, create, transform
+from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform
 from palpate_models.frames import look_at
 from palpate_models.load import exam_input
 from palpate_models.scenario import Pose, Scenario

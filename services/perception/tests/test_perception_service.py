@@ -14,7 +14,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger, Image, SurfaceMesh, TFMessage, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_camera.service import CameraService, transform
+from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.frames import apply, inverse, matrix
 from palpate_models.load import exam_input, load_scenario
 from palpate_models.phantom import PhantomModel, build_phantom

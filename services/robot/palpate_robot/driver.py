@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from palpate_models import lbr
+from palpate_models.compiled import compiled
 from palpate_models.frames import Array
-from palpate_robot import kernel
 
 HOLD_DAMPING: Final = np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])
 """Joint damping in a hold [N m s/rad] [A]: about 300 N s/m at the tool. Breathing at 8 mm/s against it adds less than 3 N."""
@@ -98,8 +98,8 @@ class Driver:
         self._before: Array | None = None
         """The torques of the command judged last; None when none was obeyed since the driver was IDLE."""
         still = np.zeros(7)  # compiles what a tick calls
-        kernel.within(still, still, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT)
-        kernel.obeyable(still, still, still, lbr.TORQUE_LIMIT, TORQUE_RATE)
+        _within(still, still, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT)
+        _obeyable(still, still, still, lbr.TORQUE_LIMIT, TORQUE_RATE)
 
     @property
     def held(self) -> bool:
@@ -155,7 +155,7 @@ class Driver:
         return np.asarray(np.minimum(wanted, np.maximum(room, 0.0) / np.maximum(np.abs(v), 1e-9)))
 
     def _check_joints(self, t: int, q: Array, v: Array) -> None:
-        if kernel.within(q, v, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT):
+        if _within(q, v, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT):
             return
         for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, q.tolist(), v.tolist(), strict=True):
             if not -q_max <= q_i <= q_max:
@@ -191,7 +191,7 @@ class Driver:
         if self._judged is not None:
             apart = max((command.stamp - self._judged.stamp) / 1e6, 1.0)
         change = TORQUE_RATE * apart
-        if not kernel.obeyable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
+        if not _obeyable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
             numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())
             for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, *numbers, strict=True):
                 if torque - torque != 0.0:  # NaN or infinite
@@ -210,3 +210,15 @@ class Driver:
     def _reject(self, t: int, cause: Cause, reason: str) -> None:
         self.rejected += 1
         self.hold(t, cause, reason)
+
+
+@compiled
+def _within(q: Array, v: Array, position_limit: Array, velocity_limit: Array) -> bool:
+    """Whether positions and velocities, shapes (7,), are numbers and at most their limits in size."""
+    return bool(np.all(np.abs(q) <= position_limit) and np.all(np.abs(v) <= velocity_limit))
+
+
+@compiled
+def _obeyable(torque: Array, gravity: Array, before: Array, limit: Array, change: float) -> bool:
+    """Whether a command (7,), gravity added, is within its limit and no more than `change` away from the one before [N m]."""
+    return bool(np.all(np.abs(torque + gravity) <= limit) and np.all(np.abs(torque - before) <= change))

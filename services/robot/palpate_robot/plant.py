@@ -1,150 +1,36 @@
-"""The robot's physics in DART: rigid-body dynamics with joint friction, end stops, and contact with table and base.
-
-DART integrates semi-implicitly at 1 ms: accelerations by articulated bodies with the joint damping taken implicitly, end
-stops and contacts as constraints on the velocity, then positions with the new velocity.
-
-    (M + dt D(v)) a = tau - h(q, v) - D(v) v + J' F,    D(v) = d + f / max(|v|, v_stick),    v += dt a,    q += dt v
-
-with viscous damping d and Coulomb friction f of each joint. So friction, too, is implicit and can neither chatter nor add
-energy. DART's own Coulomb constraint is not used: it stops a joint with the inertia M instead of M + dt D, which makes
-0.1 N m of friction on A7 (5e-4 kg m^2, 10 N m s/rad) stick up to 2.1 N m.
-
-Looking for contacts is more than half of DART's step. While nothing is within reach (`clearance.py`) the step leaves that
-out; the result is the same to the bit.
-"""
+"""What the service needs of a simulated arm, so that another physics engine can stand behind the same driver and sensor."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from typing import Final, Protocol
 
-import dartpy as dart
-import numpy as np
-
-from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
-from palpate_models.table import boxes
-from palpate_robot.clearance import Clearance
-from palpate_robot.kinematics import Kinematics
-from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY, STICK_RADPS, Wrench
 
-LEAST_CLEARANCE_RAD: Final = 0.01
-"""Closer than this, in angle, DART looks for contacts: far more than a step turns."""
-LOOK_EVERY: Final = 20
-"""Steps between looks at the clearance while there is too little."""
+DT: Final = 1e-3
+"""Step [s]."""
+END_STOP_MARGIN_RAD: Final = 0.03
+"""How far behind the position limit the mechanical end stop is [A]; the driver acts at the limit."""
+STICK_RADPS: Final = 1e-3
+"""Below this speed friction is viscous: a joint under less than its friction creeps slower than this [A]."""
+FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
+"""Links that stand on or turn over the base and so have no collision shapes."""
 
-
-def _isometry(X: Array) -> Any:
-    return dart.math.Isometry3(X)
+Wrench = tuple[float, float, float, float, float, float]
 
 
-def _along(start: Array, end: Array) -> Array:
-    """Pose, shape (4, 4), half-way from start to end with z along that direction."""
-    z = (end - start) / np.linalg.norm(end - start)
-    x = np.cross((0.0, 1.0, 0.0), z) if abs(z[1]) < 0.9 else np.cross((1.0, 0.0, 0.0), z)
-    x /= np.linalg.norm(x)
-    X = np.eye(4)
-    X[:3, :3] = np.column_stack((x, np.cross(z, x), z))
-    X[:3, 3] = (start + end) / 2
-    return X
-
-
-def _collide(body: Any, shape: Any, X: Array) -> None:
-    node = body.createShapeNode(shape)
-    node.createCollisionAspect()
-    node.createDynamicsAspect()
-    node.setRelativeTransform(_isometry(X))
-
-
-def _load_arm(robot: Robot) -> Any:
-    """The arm as a DART skeleton without shapes. DART's loader wants a file, by its absolute path."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder).resolve() / "lbr.urdf"
-        path.write_text(lbr.urdf(robot, geometry=False), encoding="utf-8")
-        arm = dart.utils.DartLoader().parseSkeleton(str(path))
-    if arm is None or arm.getNumDofs() != len(lbr.JOINT_NAMES):
-        raise RuntimeError("DART could not load the robot's URDF with its seven joints")
-    return arm
-
-
-def _environment(robot: Robot) -> Any:
-    """Table and base as one immobile skeleton."""
-    skeleton = dart.dynamics.Skeleton("environment")
-    _, body = skeleton.createWeldJointAndBodyNodePair()
-    for box in boxes(robot):
-        _collide(body, dart.dynamics.BoxShape(box.size), box.X_WB)
-    skeleton.setMobile(False)
-    return skeleton
-
-
-class Plant:
+class Plant(Protocol):
     """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
 
-    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME) -> None:
-        """Starts at rest at joint positions `q` [rad]."""
-        self._arm = _load_arm(robot)
-        self._set_damping = tuple(self._arm.getDof(i).setDampingCoefficient for i in range(7))
-        for joint, stop in zip(self._arm.getJoints()[1:8], lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD, strict=True):
-            joint.setPositionLowerLimit(0, -stop)
-            joint.setPositionUpperLimit(0, stop)
-            joint.setVelocityLowerLimit(0, -np.inf)  # nothing physical stops at a speed: the driver watches it
-            joint.setVelocityUpperLimit(0, np.inf)
-            joint.setLimitEnforcement(True)
-            joint.setCoulombFriction(0, 0.0)
-        capsules = {link: parts for link, parts in lbr.capsules(robot).items() if link not in FIXED_LINKS}
-        for link, parts in capsules.items():
-            for capsule in parts:
-                self._add_capsule(self._arm.getBodyNode(link), capsule)
-        self._world = dart.simulation.World()
-        self._world.setTimeStep(DT)
-        self._world.setGravity([0.0, 0.0, -GRAVITY])
-        awake = self._world.getDeactivationOptions()
-        awake.mEnabled = False  # DART may put to sleep what moves slower than 1 cm/s: palpation does
-        self._world.setDeactivationOptions(awake)
-        # DART's own detector knows capsules and boxes exactly and is the cheapest here; FCL has no capsules.
-        self._world.getConstraintSolver().setCollisionDetector(dart.collision.DARTCollisionDetector())
-        self._world.addSkeleton(self._arm)
-        self._world.addSkeleton(_environment(robot))
-        self._links = {link: self._arm.getBodyNode(link) for link in lbr.LINK_NAMES}
-        self._sensor = self._links["ft_sensor"]
-        self._indenter = self._links["indenter"]
-        stop = lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD
-        self._kinematics = Kinematics(robot)
-        self._clearance = Clearance(self._links, capsules, boxes(robot), stop)
-        self._free = 0.0  # sum of angles [rad] that the joints may turn before anything can touch
-        self._look_in = 0  # steps until that is found anew
-        self._viscous = robot.joint_damping_nms
-        self._coulomb = robot.joint_friction_nm
-        self._known: Array | None = None
-        self.q: Array
-        """Joint positions [rad], a fresh array at every step."""
-        self.v: Array
-        """Joint velocities [rad/s], a fresh array at every step."""
-        self.reset(q)
-
-    @staticmethod
-    def _add_capsule(body: Any, capsule: lbr.Capsule) -> None:
-        start, end = np.array(capsule.start), np.array(capsule.end)
-        length = float(np.linalg.norm(end - start))
-        if length > 0:
-            _collide(body, dart.dynamics.CapsuleShape(capsule.radius, length), _along(start, end))
-        else:
-            X = np.eye(4)
-            X[:3, 3] = start
-            _collide(body, dart.dynamics.SphereShape(capsule.radius), X)
+    q: Array
+    """Joint positions [rad], a fresh array at every step."""
+    v: Array
+    """Joint velocities [rad/s], a fresh array at every step."""
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
         """Puts the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
-        self._arm.setPositions(np.asarray(q, dtype=float))
-        self._arm.setVelocities(np.zeros(7) if v is None else np.asarray(v, dtype=float))
-        self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
-        self._known = None
-        self._arm.setForces(self.gravity_torque())
-        self._arm.computeForwardDynamics()  # so that the sensor reads the tool's weight before the first step
-        self._free, self._look_in = 0.0, 0
+        ...
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advances 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
@@ -152,83 +38,31 @@ class Plant:
         `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
-        viscous, coulomb = self._viscous, self._coulomb
-        for set_damping, v, extra in zip(self._set_damping, self.v.tolist(), damping.tolist(), strict=True):
-            speed = abs(v)
-            set_damping(viscous + extra + coulomb / (speed if speed > STICK_RADPS else STICK_RADPS))
-        self._arm.setForces(torque)
-        if force_W is not None:
-            self._indenter.addExtForce(force_W)  # at its origin, in world axes
-            self._indenter.addExtTorque(moment_W, False)
-        if self._is_clear():
-            arm = self._arm
-            arm.computeForwardDynamics()
-            arm.integrateVelocities(DT)
-            arm.integratePositions(DT)
-            arm.clearInternalForces()
-            if force_W is not None:
-                arm.clearExternalForces()
-        else:
-            self._world.step()  # clears torques and external forces, too
-        self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
-        self._known = None
-
-    def _is_clear(self) -> bool:
-        """Whether nothing can touch during the coming step."""
-        self._free -= sum(map(abs, self.v.tolist())) * DT
-        if self._free > LEAST_CLEARANCE_RAD:
-            return True
-        if self._look_in:
-            self._look_in -= 1
-            return False
-        self._free = self._clearance.angle(self.q)
-        clear = self._free > LEAST_CLEARANCE_RAD
-        self._look_in = 0 if clear else LOOK_EVERY
-        return clear
+        ...
 
     def gravity_torque(self) -> Array:
         """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""
-        return self._state()[13:]
-
-    def _state(self) -> Array:
-        """What `Kinematics.state` says here."""
-        if self._known is None:
-            self._known = self._kinematics.state(self.q, self.v)
-        return self._known
-
-    def accelerations(self) -> Array:
-        """Joint accelerations of the last step [rad/s^2], shape (7,)."""
-        return np.asarray(self._arm.getAccelerations())
-
-    def kinetic_energy(self) -> float:
-        """[J]."""
-        return float(self._arm.computeKineticEnergy())
+        ...
 
     def sensor_wrench(self) -> Wrench:
-        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m].
-
-        At the sensor's origin, in its axes, averaged over the last step: contact, weight and inertia of the tool.
-        It is minus the wrench that the joint above `ft_sensor` transmits (Featherstone's f_i), constraints included.
-        """
-        mx, my, mz, fx, fy, fz = self._sensor.getBodyForce().tolist()
-        return -fx, -fy, -fz, -mx, -my, -mz
+        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m], in its axes."""
+        ...
 
     def tool_motion(self) -> Array:
         """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
         The linear velocity is that of the sphere's centre.
         """
-        return self._state()[:13]
+        ...
 
     def link_poses(self) -> Array:
         """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
-        return self._kinematics.links(self.q)
-
-    def link_pose(self, link: str) -> tuple[Array, Any]:
-        """Position [m], shape (3,), and orientation (DART quaternion) of a link of `lbr.LINK_NAMES` in world, from the engine."""
-        X_WL = self._links[link].getTransform()  # in world; dartpy takes longer over `getWorldTransform`
-        return X_WL.translation(), X_WL.quaternion()
+        ...
 
     def contacts(self) -> int:
         """Number of contact points with table or base in the last step."""
-        return 0 if self._free > LEAST_CLEARANCE_RAD else int(self._world.getLastCollisionResult().getNumContacts())
+        ...
+
+
+PlantFactory = Callable[[Robot], Plant]
+"""Makes the plant of a scenario's robot, at rest at `lbr.HOME`."""

@@ -8,40 +8,42 @@ from zlib import crc32
 
 import numpy as np
 
-from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import (
+    Header,
+    JointState,
+    OperatorRequest,
+    Point,
+    Pose,
+    Quaternion,
+    RobotStatus,
+    String,
+    SupervisorState,
+    TFMessage,
+    Time,
+    ToolState,
+    Transform,
+    TransformStamped,
+    Twist,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+)
+from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models import lbr
 from palpate_models.frames import Array
-from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.gravity import GRAVITY
+from palpate_models.scenario import ExamInput
 from palpate_robot.driver import Cause, Command, Driver, Mode
 from palpate_robot.ft_sensor import FtSensor
-from palpate_robot.physics import DT, GRAVITY, Factory
-
-_Time: Any = message_type("builtin_interfaces/msg/Time")
-_Header: Any = message_type("std_msgs/msg/Header")
-_String: Any = message_type("std_msgs/msg/String")
-_JointState: Any = message_type("sensor_msgs/msg/JointState")
-_Point: Any = message_type("geometry_msgs/msg/Point")
-_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
-_Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
-_Pose: Any = message_type("geometry_msgs/msg/Pose")
-_Twist: Any = message_type("geometry_msgs/msg/Twist")
-_Wrench: Any = message_type("geometry_msgs/msg/Wrench")
-_WrenchStamped: Any = message_type("geometry_msgs/msg/WrenchStamped")
-_Transform: Any = message_type("geometry_msgs/msg/Transform")
-_TransformStamped: Any = message_type("geometry_msgs/msg/TransformStamped")
-_TFMessage: Any = message_type("tf2_msgs/msg/TFMessage")
-_ToolState: Any = message_type("palpation_msgs/msg/ToolState")
-_RobotStatus: Any = message_type("palpation_msgs/msg/RobotStatus")
-_Supervisor: Any = message_type("palpation_msgs/msg/SupervisorState")
-_Request: Any = message_type("palpation_msgs/msg/OperatorRequest")
+from palpate_robot.plant import DT, PlantFactory
 
 _TICK = round(DT * NS)
-_STATUS_PERIOD = 10 * _TICK
-_LINKS_PERIOD = 50 * _TICK
-_CONTACT_AGE = 100 * _TICK
+_STATUS_PERIOD = contract().topics["robot/status"].period
+_LINKS_PERIOD = contract().topics["sim/link_poses"].period
+_CONTACT_AGE = (contract().topics["sim/contact_wrench"].max_age_ms or 0) * MS
 _MOST_STEPS = 50
 """Steps of the plant that one tick may catch up with, in wall-clock mode after an overrun."""
 _NOISE_BLOCK = 1024
@@ -53,13 +55,13 @@ class RobotService(Service):
 
     role: ClassVar[str] = "robot"
 
-    def __init__(self, exam: ExamInput, plant: Factory | None = None) -> None:
-        """Starts at `lbr.HOME`, at rest. `plant` makes the physics behind driver and sensor; DART if there is none."""
+    def __init__(self, exam: ExamInput, plant: PlantFactory) -> None:
+        """Starts at rest at `lbr.HOME`. `plant` makes the physics behind the driver and the sensor."""
         robot = exam.robot
         streams = np.random.SeedSequence([exam.seed, crc32(b"robot")]).spawn(2)
         joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
         self._robot = robot
-        self._plant = (plant or _dart())(robot)
+        self._plant = plant(robot)
         self._sensor = FtSensor(robot, ft_rng)
         self._driver = Driver(exam.limits.force_emergency_n)
         self._rng = joint_rng
@@ -83,7 +85,7 @@ class RobotService(Service):
 
     def start(self) -> Outbox:
         """The robot's description."""
-        return {"robot_description": _String(lbr.urdf(self._robot))}
+        return {"robot_description": String(lbr.urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Moves the plant to `t` under what arrived up to the tick before, and measures."""
@@ -93,12 +95,12 @@ class RobotService(Service):
         """The same: first what control waits for, then what tissue does."""
         self._obey_operator(t, inbox)
         self._drive(t, inbox)
-        stamp = _Time(t // NS, t % NS)
+        stamp = Time(t // NS, t % NS)
         yield {"joint_states": self._joint_state(stamp)}
         px, py, pz, x, y, z, w, vx, vy, vz, wx, wy, wz = self._plant.tool_motion().tolist()
-        pose = _Pose(_Point(px, py, pz), _Quaternion(x, y, z, w))
-        twist = _Twist(_Vector3(vx, vy, vz), _Vector3(wx, wy, wz))
-        yield {"sim/tool_state": _ToolState(_Header(stamp, "world"), pose, twist, self._robot.indenter_radius_m)}
+        pose = Pose(Point(px, py, pz), Quaternion(x, y, z, w))
+        twist = Twist(Vector3(vx, vy, vz), Vector3(wx, wy, wz))
+        yield {"sim/tool_state": ToolState(Header(stamp, "world"), pose, twist, self._robot.indenter_radius_m)}
         up_S = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         outbox: dict[str, Message] = {"ft/wrench": self._wrench(stamp, up_S)}
         if not t % _STATUS_PERIOD:
@@ -119,13 +121,13 @@ class RobotService(Service):
 
     def _obey_operator(self, t: int, inbox: Inbox) -> None:
         for message in inbox.new("operator/request"):
-            if message.request == _Request.STOP:
+            if message.request == OperatorRequest.STOP:
                 self._driver.hold(t, Cause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
         for message in inbox.new("supervisor/state"):
             if message.releases != self._releases:
                 self._releases = message.releases
                 self._driver.release(t)
-            if message.level == _Supervisor.LEVEL_EMERGENCY:
+            if message.level == SupervisorState.LEVEL_EMERGENCY:
                 self._driver.hold(t, Cause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
 
     def _drive(self, t: int, inbox: Inbox) -> None:
@@ -177,7 +179,7 @@ class RobotService(Service):
             self._joint_noise = list(noise.reshape(-1, 7)[::-1])
         q, v = self._plant.q + self._joint_noise.pop(), self._plant.v + self._joint_noise.pop()
         self._recent += (q, v)
-        return _JointState(_Header(stamp, ""), _NAMES, q, v, self._applied)
+        return JointState(Header(stamp, ""), _NAMES, q, v, self._applied)
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
@@ -188,7 +190,7 @@ class RobotService(Service):
         external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
         self._external_force = external**0.5
         self._peak_force = max(self._peak_force, self._external_force)
-        return _WrenchStamped(_Header(stamp, "ft_sensor"), _Wrench(_Vector3(fx, fy, fz), _Vector3(mx, my, mz)))
+        return WrenchStamped(Header(stamp, "ft_sensor"), Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)))
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
@@ -197,33 +199,21 @@ class RobotService(Service):
         fx, fy, fz, mx, my, mz = (np.add.reduce(self._readings) / ticks).tolist()
         self._recent.clear()
         self._readings.clear()
-        return _RobotStatus(
-            _Header(stamp, ""),
+        return RobotStatus(
+            Header(stamp, ""),
             int(driver.mode),
             int(driver.cause),
             driver.reason,
             mean[:7],
             mean[7:],
-            _Wrench(_Vector3(fx, fy, fz), _Vector3(mx, my, mz)),
+            Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)),
             self._applied,
             driver.rejected,
         )
 
     def _link_poses(self, stamp: Message) -> Message:
-        transforms, stamped = [], _Header(stamp, "world")
+        transforms, stamped = [], Header(stamp, "world")
         for link, (px, py, pz, x, y, z, w) in zip(lbr.LINK_NAMES, self._plant.link_poses().tolist(), strict=True):
-            pose = _Transform(_Vector3(px, py, pz), _Quaternion(x, y, z, w))
-            transforms.append(_TransformStamped(stamped, link, pose))
-        return _TFMessage(transforms)
-
-
-def _dart() -> Factory:
-    """DART, which is not installed where another physics takes its place."""
-    from palpate_robot.plant import Plant  # noqa: PLC0415
-
-    return Plant
-
-
-def create(scenario: Scenario) -> RobotService:
-    """The robot of a scenario; it gets no phantom."""
-    return RobotService(exam_input(scenario))
+            pose = Transform(Vector3(px, py, pz), Quaternion(x, y, z, w))
+            transforms.append(TransformStamped(stamped, link, pose))
+        return TFMessage(transforms)

@@ -7,12 +7,12 @@ import pytest
 
 from palpate_models import lbr
 from palpate_models.scenario import Robot
-from palpate_robot.plant import LEAST_CLEARANCE_RAD, Plant
+from palpate_robot.backends.dart.plant import LEAST_CLEARANCE_RAD, DartPlant
 
 NOTHING = np.zeros(3)
 
 
-class Thorough(Plant):
+class Thorough(DartPlant):
     """Looks for contacts at every step."""
 
     def _is_clear(self) -> bool:
@@ -25,7 +25,7 @@ OVER_TABLE = np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0])
 @pytest.mark.parametrize(("start", "carried", "touches"), [(lbr.HOME, 1.0, False), (OVER_TABLE, 0.0, True)])
 def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -> None:
     """An arm that swings in the air, and a limp one that falls onto the table."""
-    quick, thorough = Plant(Robot(), start), Thorough(Robot(), start)
+    quick, thorough = DartPlant(Robot(), start), Thorough(Robot(), start)
     rng = np.random.default_rng(2)
     free = 0
     touched = False
@@ -46,7 +46,7 @@ def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -
 
 def test_nothing_is_looked_for_while_nothing_is_near(monkeypatch: pytest.MonkeyPatch) -> None:
     """An arm that swings far from everything uses its clearance up again and again, and finds new room at each look."""
-    plant = Plant(Robot(), lbr.HOME)
+    plant = DartPlant(Robot(), lbr.HOME)
     looks: list[float] = []
     angle = plant._clearance.angle
 
@@ -66,7 +66,7 @@ def test_nothing_is_looked_for_while_nothing_is_near(monkeypatch: pytest.MonkeyP
 
 
 def test_the_clearance_ends_at_a_joint_stop() -> None:
-    plant = Plant(Robot())
+    plant = DartPlant(Robot())
     q = np.array(lbr.HOME)
     assert plant._clearance.angle(q) > 0.05
     q[6] = lbr.POSITION_LIMIT[6] + 0.02

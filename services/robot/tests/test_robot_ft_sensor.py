@@ -5,15 +5,16 @@ import pinocchio as pin
 import pytest
 
 from palpate_models import lbr
+from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
+from palpate_robot.backends.dart.plant import DT, DartPlant
 from palpate_robot.ft_sensor import FtSensor
-from palpate_robot.plant import DT, GRAVITY, Plant
 
 NOTHING = np.zeros(3)
 ROBOT = Robot(tool_mass_kg=0.6)
 
 
-def _settle(plant: Plant, force: np.ndarray = NOTHING, moment: np.ndarray = NOTHING) -> np.ndarray:
+def _settle(plant: DartPlant, force: np.ndarray = NOTHING, moment: np.ndarray = NOTHING) -> np.ndarray:
     """The true wrench at the sensor with the arm held still."""
     for _ in range(3):
         plant.step(plant.gravity_torque(), force, moment, np.full(7, 1e6))
@@ -32,7 +33,7 @@ def _centre_of_mass(robot: Robot) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(6))
 def test_static_reading_is_the_tools_weight(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    plant = Plant(ROBOT, lbr.HOME + rng.uniform(-0.3, 0.3, 7))
+    plant = DartPlant(ROBOT, lbr.HOME + rng.uniform(-0.3, 0.3, 7))
     wrench = _settle(plant)
     R_WS = plant.link_pose("ft_sensor")[1].to_rotation_matrix()
     weight_S = R_WS.T @ [0.0, 0.0, -ROBOT.tool_mass_kg * GRAVITY]
@@ -41,20 +42,20 @@ def test_static_reading_is_the_tools_weight(seed: int) -> None:
 
 
 def test_reading_is_right_before_the_first_step() -> None:
-    wrench = Plant(ROBOT).sensor_wrench()
+    wrench = DartPlant(ROBOT).sensor_wrench()
     np.testing.assert_allclose(wrench, [0.0, 0.0, ROBOT.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0], atol=1e-9)
 
 
 def test_press_from_below_pushes_along_minus_z_of_the_sensor() -> None:
     """HOME holds the tool straight down; tissue presses the sphere upwards, so into the flange: -z of the sensor."""
-    plant = Plant(ROBOT)
+    plant = DartPlant(ROBOT)
     free = _settle(plant)
     pressed = _settle(plant, force=np.array([0.0, 0.0, 5.0]))
     np.testing.assert_allclose((pressed - free)[:3], [0.0, 0.0, -5.0], atol=0.01)
 
 
 def test_sideways_force_has_the_lever_of_the_standoff() -> None:
-    plant = Plant(ROBOT)
+    plant = DartPlant(ROBOT)
     free = _settle(plant)
     force_W = np.array([0.0, 3.0, 0.0])  # HOME turns the tool by pi about y, so y of the sensor is y of world
     pushed = _settle(plant, force=force_W, moment=np.array([0.0, 0.02, 0.0])) - free
@@ -64,7 +65,7 @@ def test_sideways_force_has_the_lever_of_the_standoff() -> None:
 
 def test_moving_tool_reads_weight_contact_and_inertia() -> None:
     """Newton and Euler for the body below the sensor, from pinocchio, along a motion of the plant."""
-    plant = Plant(ROBOT, lbr.HOME)
+    plant = DartPlant(ROBOT, lbr.HOME)
     model = pin.buildModelFromXML(lbr.urdf(ROBOT, geometry=False))
     data = model.createData()
     frame = model.getFrameId("ft_sensor")

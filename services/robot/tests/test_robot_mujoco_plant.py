@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from palpate_models import lbr
+from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
-from palpate_robot import plant as in_dart
-from palpate_robot.backends.mujoco.plant import Plant
+from palpate_robot.backends.dart import plant as in_dart
+from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.driver import HOLD_DAMPING
-from palpate_robot.physics import END_STOP_MARGIN_RAD, GRAVITY
+from palpate_robot.plant import END_STOP_MARGIN_RAD
 
 NOTHING = np.zeros(3)
 NO_DAMPING = np.zeros(7)
@@ -23,8 +24,8 @@ def postures(count: int, seed: int = 1) -> np.ndarray:
     return lbr.HOME + np.random.default_rng(seed).uniform(-0.3, 0.3, (count, 7))
 
 
-def pair(robot: Robot) -> tuple[Plant, in_dart.Plant]:
-    return Plant(robot), in_dart.Plant(robot)
+def pair(robot: Robot) -> tuple[MujocoPlant, in_dart.DartPlant]:
+    return MujocoPlant(robot), in_dart.DartPlant(robot)
 
 
 def positive(quaternions: np.ndarray) -> np.ndarray:
@@ -49,7 +50,7 @@ def test_poses_twist_and_gravity_are_the_same() -> None:
         assert mujoco.kinetic_energy() == pytest.approx(dart.kinetic_energy(), rel=1e-9)
 
 
-def excited(robot: Robot, q: np.ndarray, ticks: int = 400) -> Iterator[tuple[Plant, in_dart.Plant]]:
+def excited(robot: Robot, q: np.ndarray, ticks: int = 400) -> Iterator[tuple[MujocoPlant, in_dart.DartPlant]]:
     """Both arms under the same torques and the same force at the tool, as strong as in an examination."""
     mujoco, dart = pair(robot)
     mujoco.reset(q)
@@ -97,7 +98,7 @@ def test_free_motion_agrees_and_keeps_its_energy() -> None:
 
 
 def test_sensor_at_rest_reads_weight_and_push() -> None:
-    plant = Plant(Robot())
+    plant = MujocoPlant(Robot())
     weight = Robot().tool_mass_kg * GRAVITY
     np.testing.assert_allclose(plant.sensor_wrench(), [0, 0, weight, 0, 0, 0], atol=1e-9)
     up = np.array([0.0, 0.0, 10.0])
@@ -107,7 +108,7 @@ def test_sensor_at_rest_reads_weight_and_push() -> None:
 
 
 def test_gravity_torque_holds_the_arm_still() -> None:
-    plant = Plant(FREE)
+    plant = MujocoPlant(FREE)
     for q in postures(3):
         plant.reset(q)
         for _ in range(300):
@@ -117,7 +118,7 @@ def test_gravity_torque_holds_the_arm_still() -> None:
 
 def test_end_stop_stops_the_joint() -> None:
     """75 % of A7's torque limit pushes on: MuJoCo's stop is soft and the joint bounces in it, by less than half a degree."""
-    plant = Plant(Robot())
+    plant = MujocoPlant(Robot())
     push = np.zeros(7)
     push[6] = 30.0
     history = []
@@ -131,7 +132,7 @@ def test_end_stop_stops_the_joint() -> None:
 
 def test_limp_arm_comes_to_rest_on_the_table_not_in_it() -> None:
     robot = Robot()
-    plant = Plant(robot, np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0]))
+    plant = MujocoPlant(robot, np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0]))
     touched = 0
     for _ in range(2500):
         plant.step(NO_DAMPING, NOTHING, NOTHING, NO_DAMPING)

@@ -6,10 +6,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate_models import lbr
+from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
+from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.driver import HOLD_DAMPING
-from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, GRAVITY, STICK_RADPS
-from palpate_robot.plant import Plant
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS
 
 NOTHING = np.zeros(3)
 NO_DAMPING = np.zeros(7)
@@ -31,7 +32,7 @@ def _model(robot: Robot) -> tuple[pin.Model, pin.Data]:
 @pytest.mark.parametrize("link", lbr.LINK_NAMES)
 def test_forward_kinematics_agrees_with_pinocchio(link: str) -> None:
     robot = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
-    plant = Plant(robot)
+    plant = DartPlant(robot)
     model, data = _model(robot)
     for q in _postures(20):
         plant.reset(q)
@@ -44,7 +45,7 @@ def test_forward_kinematics_agrees_with_pinocchio(link: str) -> None:
 
 def test_tool_motion_agrees_with_pinocchio() -> None:
     robot = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
-    plant = Plant(robot)
+    plant = DartPlant(robot)
     model, data = _model(robot)
     rng = np.random.default_rng(2)
     frame = model.getFrameId("indenter")
@@ -62,7 +63,7 @@ def test_tool_motion_agrees_with_pinocchio() -> None:
 
 
 def test_poses_and_weight_are_the_engines() -> None:
-    plant = Plant(FREE)
+    plant = DartPlant(FREE)
     model, data = _model(FREE)
     rng = np.random.default_rng(5)
     for q in rng.uniform(-2, 2, (50, 7)):
@@ -77,7 +78,7 @@ def test_poses_and_weight_are_the_engines() -> None:
 
 
 def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
-    plant = Plant(FREE)
+    plant = DartPlant(FREE)
     model, data = _model(FREE)
     rng = np.random.default_rng(3)
     frame = model.getFrameId("indenter")
@@ -96,7 +97,7 @@ def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
 def test_friction_is_implicit() -> None:
     """(M + dt D) a = tau - h - D v is stable whatever D; explicit, 10 N m s/rad on a wrist of 5e-4 kg m^2 is not."""
     robot = Robot(joint_friction_nm=0.2)
-    plant = Plant(robot)
+    plant = DartPlant(robot)
     model, data = _model(robot)
     rng = np.random.default_rng(4)
     for extra in (0.0, 40.0):
@@ -114,7 +115,7 @@ def test_friction_is_implicit() -> None:
 
 
 def test_gravity_torque_holds_the_arm_still() -> None:
-    plant = Plant(FREE)
+    plant = DartPlant(FREE)
     for q in _postures(3):
         plant.reset(q)
         for _ in range(300):
@@ -126,7 +127,7 @@ def test_without_friction_energy_is_conserved_and_with_it_it_decays() -> None:
     v = np.array([0.3, -0.2, 0.4, 0.3, -0.5, 0.4, 0.6])
     energies = {}
     for robot in (FREE, Robot()):
-        plant = Plant(robot)
+        plant = DartPlant(robot)
         plant.reset(lbr.HOME, v)
         start = plant.kinetic_energy()
         history = []
@@ -142,7 +143,7 @@ def test_without_friction_energy_is_conserved_and_with_it_it_decays() -> None:
 @pytest.mark.parametrize("joint", range(7))
 def test_coulomb_friction_sticks_below_its_limit_and_slides_against_it_above(joint: int) -> None:
     robot = Robot(joint_friction_nm=0.5)
-    plant = Plant(robot, np.zeros(7))
+    plant = DartPlant(robot, np.zeros(7))
     push = np.zeros(7)
     for torque, speed in ((0.25, None), (1.5, (1.5 - 0.5) / robot.joint_damping_nms)):
         push[joint] = torque
@@ -158,7 +159,7 @@ def test_coulomb_friction_sticks_below_its_limit_and_slides_against_it_above(joi
 def test_slow_motion_is_motion() -> None:
     """2 mrad/s, a millimetre a second at the tool, for seconds, and from rest: nothing falls asleep."""
     robot = Robot(joint_friction_nm=0.0)
-    plant = Plant(robot)
+    plant = DartPlant(robot)
     push = np.zeros(7)
     for _ in range(1000):
         plant.step(plant.gravity_torque(), NOTHING, NOTHING, NO_DAMPING)
@@ -170,7 +171,7 @@ def test_slow_motion_is_motion() -> None:
 
 
 def test_end_stop_stops_the_joint() -> None:
-    plant = Plant(Robot())
+    plant = DartPlant(Robot())
     push = np.zeros(7)
     push[6] = 30.0
     for _ in range(1500):
@@ -181,7 +182,7 @@ def test_end_stop_stops_the_joint() -> None:
 
 def test_arm_comes_to_rest_on_the_table_not_in_it() -> None:
     robot = Robot()
-    plant = Plant(robot, np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0]))
+    plant = DartPlant(robot, np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0]))
     touched = 0
     for _ in range(2500):
         plant.step(NO_DAMPING, NOTHING, NOTHING, NO_DAMPING)  # limp: nothing carries the arm
@@ -201,7 +202,7 @@ def test_hold_stops_a_moving_tool_within_a_millimetre() -> None:
     frame = model.getFrameId("indenter")
     q = np.deg2rad([0.0, 30.0, 0.0, -80.0, 0.0, 70.0, 0.0])
     J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
-    plant = Plant(robot)
+    plant = DartPlant(robot)
     plant.reset(q, np.linalg.pinv(J) @ [0.0, 0.0, -0.03, 0.0, 0.0, 0.0])
     start = plant.tool_motion()
     for _ in range(300):

@@ -11,9 +11,10 @@ from palpate_bus.messages.codec import decode, encode, message_type
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
+from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot, Scenario
-from palpate_robot.physics import GRAVITY
-from palpate_robot.service import RobotService, create
+from palpate_robot.backends.dart.service import create
+from palpate_robot.service import RobotService
 
 MS = 1_000_000
 STATUS = message_type("palpation_msgs/msg/RobotStatus")

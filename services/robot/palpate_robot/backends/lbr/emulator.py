@@ -40,6 +40,7 @@ from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.load import ScenarioError, exam_input, load_scenario
 from palpate_models.scenario import ExamInput
+from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.lbr.fri import Drive, Session
 from palpate_robot.backends.lbr.idl import (
     STATE,
@@ -52,7 +53,6 @@ from palpate_robot.backends.lbr.idl import (
 )
 from palpate_robot.backends.lbr.port import CONTACT_TOPIC, LINKS, LINKS_TOPIC, TOOL_STATE, TOOL_TOPIC, WRENCH
 from palpate_robot.ft_sensor import FtSensor
-from palpate_robot.plant import Plant
 
 log = logging.getLogger("emulator")
 
@@ -79,7 +79,7 @@ class Emulator:
 
     def __init__(self, exam: ExamInput, options: Options) -> None:
         self._options = options
-        self._plant = Plant(exam.robot)
+        self._plant = DartPlant(exam.robot)
         self.session = Session(options.period_ms, np.array(lbr.HOME), command_timeout_ms=options.command_timeout_ms)
         streams = np.random.SeedSequence([exam.seed, 0x4C4252]).spawn(3)
         self._rng, ft, load = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)

@@ -23,6 +23,7 @@ from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models import lbr
 from palpate_models.frames import Array
+from palpate_models.gravity import GRAVITY
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, ArmModel
@@ -31,8 +32,6 @@ from palpate_robot.backends.lbr.port import LbrPort, ZenohPort
 from palpate_robot.backends.lbr.settings import Settings, SettingsError
 from palpate_robot.driver import Cause, Command, Driver, Mode
 
-GRAVITY = 9.81
-"""[m/s^2]"""
 STATUS_PERIOD = 10_000_000
 DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
 """Most joint damping in a hold [N m s/rad] [A]: as an overlay it acts one to three cycles late on a filtered speed. Below the

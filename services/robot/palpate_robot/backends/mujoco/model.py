@@ -13,9 +13,10 @@ import numpy as np
 
 from palpate_models import lbr
 from palpate_models.frames import Array
+from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
 from palpate_models.table import boxes
-from palpate_robot.physics import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, GRAVITY
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS
 
 SUBSTEPS: Final = 2
 """Integration steps a millisecond: another step size than the DART plant's, so that what depends on it shows."""

@@ -18,12 +18,13 @@ import numpy as np
 
 from palpate_models import lbr
 from palpate_models.frames import Array
+from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
 from palpate_robot.backends.mujoco.model import SUBSTEPS, build
-from palpate_robot.physics import DT, GRAVITY, STICK_RADPS, Wrench
+from palpate_robot.plant import DT, STICK_RADPS, Wrench
 
 
-class Plant:
+class MujocoPlant:
     """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
 
     def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME) -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_camera.open3d_loader import open3d
-from palpate_camera.pinhole import Pinhole
+from palpate_camera.backends.kinect.open3d_loader import open3d
+from palpate_camera.backends.kinect.pinhole import Pinhole
 from palpate_models.frames import apply, inverse
 
 Array = NDArray[np.float64]

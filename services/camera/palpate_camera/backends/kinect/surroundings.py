@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import trimesh
 
-from palpate_camera.scene import Mesh
+from palpate_camera.backends.kinect.scene import Mesh
 from palpate_models import lbr_visual, table
 from palpate_models.frames import Array, apply
 from palpate_models.scenario import Robot

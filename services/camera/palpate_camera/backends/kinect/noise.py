@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_camera.scene import Image, View
+from palpate_camera.backends.kinect.scene import Image, View
 
 Vector = NDArray[np.float32]
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from palpate_bus.messages.codec import Message, message_type
 from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_camera import surroundings
-from palpate_camera.noise import KinectNoise
-from palpate_camera.pinhole import Pinhole
-from palpate_camera.scene import Array, Caster, Image, Mesh, Scene
+from palpate_camera.backends.kinect import surroundings
+from palpate_camera.backends.kinect.noise import KinectNoise
+from palpate_camera.backends.kinect.pinhole import Pinhole
+from palpate_camera.backends.kinect.scene import Array, Caster, Image, Mesh, Scene
 from palpate_models.frames import look_at, matrix
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario

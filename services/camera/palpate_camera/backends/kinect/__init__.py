@@ -1,0 +1,1 @@
+"""A simulated Kinect: ray casting of the deformed abdomen with a published noise model."""

@@ -1,0 +1,1 @@
+"""The arm simulated in DART."""
