@@ -15,7 +15,7 @@ from palpate_models.scenario import Robot
 
 Array = NDArray[np.float64]
 
-GRAVITY = 9.80665
+GRAVITY = 9.81
 """Standard gravity [m/s^2] (CGPM 1901)."""
 
 

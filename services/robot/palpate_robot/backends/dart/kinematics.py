@@ -39,6 +39,8 @@ class Chain(NamedTuple):
     """Centre of that mass in the joint's link [m], shape (7, 3)."""
     mounts: Array
     """Flange, F/T sensor and indenter along the last link's z axis [m], shape (3,)."""
+    lift_W: Array
+    """Against gravity, in world [m/s^2], shape (3,)."""
 
 
 @compiled
@@ -91,7 +93,7 @@ def _state(chain: Chain, q: Array, v: Array) -> Array:
         axis = R[i + 1] @ chain.axis[i]
         mass += chain.mass[i]
         moment += chain.mass[i] * (p[i + 1] + R[i + 1] @ chain.centre[i])
-        torque[i] = axis @ np.cross(moment - mass * p[i + 1], np.array((0.0, 0.0, GRAVITY)))
+        torque[i] = axis @ np.cross(moment - mass * p[i + 1], chain.lift_W)
         velocity += np.cross(axis * v[i], p_WI - p[i + 1])
         spin += axis * v[i]
     return np.concatenate((p_WI, _quaternion(R[7]), velocity, spin, torque))
@@ -149,4 +151,5 @@ def _chain(robot: Robot) -> Chain:
         mass=mass[:7].copy(),
         centre=moment[:7] / mass[:7, None],
         mounts=mounts,
+        lift_W=np.array((0.0, 0.0, GRAVITY)),
     )
