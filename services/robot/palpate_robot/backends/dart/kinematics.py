@@ -45,11 +45,16 @@ class Chain(NamedTuple):
 
 @compiled
 def _rotation(axis: Array, angle: float) -> Array:
-    """Rotation matrix by Rodrigues' formula, shape (3, 3); `axis` is a unit vector."""
+    """Rotation matrix exp([axis] angle), shape (3, 3), by Rodrigues' formula; `axis` is a unit vector."""
     x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    R: Array = np.eye(3) + sin(angle) * K + (1.0 - cos(angle)) * (K @ K)
-    return R
+    c, s, d = cos(angle), sin(angle), 1.0 - cos(angle)
+    return np.array(
+        (
+            (c + d * x * x, d * x * y - s * z, d * x * z + s * y),
+            (d * x * y + s * z, c + d * y * y, d * y * z - s * x),
+            (d * x * z - s * y, d * y * z + s * x, c + d * z * z),
+        )
+    )
 
 
 @compiled
