@@ -157,8 +157,48 @@ class Exam(_Section):
     """Centre of the region in the abdomen frame."""
 
 
+class LbrConnection(_Section):
+    """Where a real LBR is and how it is commanded: the ROS side, lbr_fri_ros2_stack over rmw_zenoh."""
+
+    router: str = "tcp/127.0.0.1:7447"
+    """zenoh endpoint of the ROS side: its rmw_zenohd, or the emulator."""
+    domain: Annotated[int, Field(ge=0, le=232)] = 0
+    """Its ROS domain."""
+    namespace: str = "lbr"
+    """The stack's `robot_name`, which is its namespace too."""
+    ft_topic: str = "ft_sensor/wrench"
+    """Topic of the F/T sensor's driver, geometry_msgs/WrenchStamped."""
+    ft_sign: Literal[1, -1] = 1
+    """-1 when that driver reports what the sensor exerts on the tool."""
+    ft_yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """How far the sensor's x axis is turned about the flange's z."""
+    level: Literal["torque", "setpoint"] = "torque"
+    """`setpoint`: the control law runs in the driver's process, and `control/joint_torque` is not read."""
+    emulated: bool = False
+    """Whether the arm is the emulator: then what only physics knows is exchanged with it, for simulated tissue and camera."""
+
+
+class RosCamera(_Section):
+    """Where a depth camera of a ROS 2 system is, over rmw_zenoh."""
+
+    router: str = "tcp/127.0.0.1:7447"
+    """zenoh endpoint of the ROS side, its rmw_zenohd."""
+    domain: Annotated[int, Field(ge=0, le=232)] = 0
+    """Its ROS domain."""
+    image: str = "camera/depth/image_rect_raw"
+    """Topic of the depth images, 16UC1 [mm] or 32FC1 [m]; they count as rectified when its last part has `rect` in it."""
+    info: str = "camera/depth/camera_info"
+    """Topic of the intrinsics."""
+    frame: str = "camera_depth_optical_frame"
+    """The camera's optical frame."""
+    world: str = "world"
+    """The ROS frame that is our world: on the floor under the robot, z up, x towards the table."""
+
+
 class Robot(_Section):
     """Robot, tool and its sensor."""
+
+    lbr: LbrConnection = LbrConnection()
 
     implementation: str = "default"
     """`default`, or the name of another driver that an installed package registers (`lbr`)."""
@@ -187,6 +227,8 @@ class Robot(_Section):
 
 class Camera(_Section):
     """Kinect-like depth camera on a tripod (Nguyen 2012)."""
+
+    ros: RosCamera = RosCamera()
 
     implementation: str = "default"
     """`default`, or the name of another camera that an installed package registers (`replay`, `ros`)."""

@@ -27,6 +27,7 @@ from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera.backends.ros.convert import CameraError, depth_metres
 from palpate_camera.backends.ros.service import CameraPort, RosCameraService, ZenohCamera
+from palpate_models.scenario import RosCamera
 
 FRAME = "camera_depth_optical_frame"
 METRES = np.array([[1.0, np.nan, 0.731], [0.5, 2.25, 1.125]], dtype=np.float32)
@@ -187,7 +188,7 @@ def test_an_image_of_another_frame_than_the_pose_is_refused_and_said_so() -> Non
     image.header.frame_id = "camera_color_optical_frame"
     port.waiting = [image]
     assert service.step(100_000_000, inbox) == {}
-    assert "set PALPATE_CAMERA_FRAME=camera_color_optical_frame" in service.finish()["problem"]
+    assert "set camera.ros.frame=camera_color_optical_frame" in service.finish()["problem"]
 
 
 def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
@@ -197,7 +198,7 @@ def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     tf.publish(TFMessage(TREE))  # long before anybody listens
     images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
     infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
-    camera = ZenohCamera({"PALPATE_CAMERA_ROUTER": endpoint})
+    camera = ZenohCamera(RosCamera(router=endpoint))
     assert camera.rectified
     service = RosCameraService(camera)
     inbox = asked(1)

@@ -17,7 +17,6 @@ from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort
 from palpate_robot.backends.lbr.service import LbrService
-from palpate_robot.backends.lbr.settings import Settings
 
 MS = 1_000_000
 
@@ -76,7 +75,9 @@ def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any
     chosen = Options(**options)
     port = DirectPort(Emulator(exam, chosen), chosen.period_ms)
     inner = InnerLoop(load_control(scenario)) if level == "setpoint" else None
-    return LbrService(exam, Settings(level=level, emulated=True), port, inner), port
+    connection = exam.robot.lbr.model_copy(update={"level": level, "emulated": True})
+    robot = exam.robot.model_copy(update={"lbr": connection})
+    return LbrService(exam.model_copy(update={"robot": robot}), port, inner), port
 
 
 SCENARIO = load_scenario("rlq_guarding")

@@ -9,8 +9,8 @@ from lbr_bench import SCENARIO, Rig, active_rig
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import header
 from palpate_models import lbr
+from palpate_models.load import ScenarioError, load_scenario
 from palpate_robot.backends.lbr.arm import ArmModel
-from palpate_robot.backends.lbr.settings import Settings, SettingsError
 
 
 @pytest.fixture
@@ -124,9 +124,7 @@ def test_a_load_that_is_wrong_by_a_newton_metre_is_carried(rig: Rig) -> None:
     assert np.abs(rig.plant.q - lbr.HOME).max() < 0.05
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("PALPATE_LBR_LEVEL", "pose"), ("PALPATE_LBR_FT_SIGN", "2"), ("PALPATE_LBR_DOMAIN", "x")]
-)
-def test_a_setting_that_cannot_be_is_named(name: str, value: str) -> None:
-    with pytest.raises(SettingsError, match=name):
-        Settings.from_env({name: value})
+@pytest.mark.parametrize(("name", "value"), [("level", "pose"), ("ft_sign", "2"), ("domain", "x")])
+def test_a_field_of_the_connection_that_cannot_be_is_named(name: str, value: str) -> None:
+    with pytest.raises(ScenarioError, match=f"robot.lbr.{name}"):
+        load_scenario("rlq_guarding", [f"robot.lbr.{name}={value}"])

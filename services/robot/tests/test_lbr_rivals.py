@@ -14,10 +14,10 @@ from palpate_bus.messages import RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import header
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_models.scenario import LbrConnection
 from palpate_robot.backends.lbr.idl import TORQUE_COMMAND, LBRTorqueCommand
 from palpate_robot.backends.lbr.port import ZenohPort
 from palpate_robot.backends.lbr.service import TAKE_OVER
-from palpate_robot.backends.lbr.settings import Settings
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_over_zenoh_the_sender_of_every_command_is_told(tmp_path: Path) -> None:
     topic, command = "lbr/command/torque", LBRTorqueCommand(np.zeros(7), np.zeros(7))
     commands = node.subscription(topic, TORQUE_COMMAND)
     watchdog, new = node.publisher(topic, TORQUE_COMMAND), node.publisher(topic, TORQUE_COMMAND)
-    port = ZenohPort(Settings(router=endpoint))
+    port = ZenohPort(LbrConnection(router=endpoint))
     try:
         begin = time.monotonic()
         while not (first := port.rivals()) and time.monotonic() - begin < 20.0:

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from palpate_models import lbr
+from palpate_models.scenario import LbrConnection
 from palpate_robot.backends.lbr.idl import SessionState
 from palpate_robot.backends.lbr.port import ZenohPort
-from palpate_robot.backends.lbr.settings import Settings
 
 
 def test_states_come_and_commands_move_the_arm(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/lbr.sock"
     words = [sys.executable, "-m", "palpate_robot.backends.lbr.emulator", "rlq_guarding", "--listen", endpoint]
     emulator = subprocess.Popen(words, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    port = ZenohPort(Settings(router=endpoint, emulated=True))
+    port = ZenohPort(LbrConnection(router=endpoint, emulated=True))
     torque = np.zeros(7)
     torque[0] = 6.0
     try:

@@ -1,18 +1,7 @@
-"""The bridge: a ROS 2 camera's depth image, camera_info and tf_static in place of the simulated camera's.
-
-| variable | default | meaning |
-|---|---|---|
-| `PALPATE_CAMERA_ROUTER` | `tcp/127.0.0.1:7447` | zenoh endpoint of the ROS side, its rmw_zenohd |
-| `PALPATE_CAMERA_DOMAIN` | 0 | its ROS domain |
-| `PALPATE_CAMERA_IMAGE` | `camera/depth/image_rect_raw` | depth, 16UC1 [mm] or 32FC1 [m]; rectified if so called (`rect`) |
-| `PALPATE_CAMERA_INFO` | `camera/depth/camera_info` | its intrinsics |
-| `PALPATE_CAMERA_FRAME` | `camera_depth_optical_frame` | its optical frame |
-| `PALPATE_CAMERA_WORLD` | `world` | the ROS frame that is our world: floor under the robot, z up, x to the table |
-"""
+"""The bridge: a ROS 2 camera's depth image, camera_info and tf_static in place of the simulated camera's."""
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from time import monotonic, sleep
@@ -28,7 +17,7 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera.backends.ros.convert import Array, CameraError, chain, depth_metres
-from palpate_models.scenario import Scenario
+from palpate_models.scenario import RosCamera, Scenario
 
 FRAME = "camera_depth_optical_frame"
 POSE_WAIT_S = 20.0
@@ -57,13 +46,10 @@ class CameraPort(ABC):
 class ZenohCamera(CameraPort):
     """Over zenoh, as rmw_zenoh does."""
 
-    def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
-        """Joins. Raises BusConfigError."""
-        domain = int(environ.get("PALPATE_CAMERA_DOMAIN") or 0)
-        router = environ.get("PALPATE_CAMERA_ROUTER") or "tcp/127.0.0.1:7447"
-        self._node = RosNode("palpate_camera.backends.ros", domain, BusOptions(router=router))
-        image = (environ.get("PALPATE_CAMERA_IMAGE") or "camera/depth/image_rect_raw").strip("/")
-        info = (environ.get("PALPATE_CAMERA_INFO") or "camera/depth/camera_info").strip("/")
+    def __init__(self, ros: RosCamera) -> None:
+        """Joins the ROS side. Raises BusConfigError."""
+        self._node = RosNode("palpate_camera", ros.domain, BusOptions(router=ros.router))
+        image, info = ros.image.strip("/"), ros.info.strip("/")
         self.rectified = "rect" in image.rpartition("/")[2]  # image_proc's names: image_rect, image_rect_raw
         self._images = self._node.subscription(image, "sensor_msgs/msg/Image")
         self._infos = self._node.subscription(info, "sensor_msgs/msg/CameraInfo")
@@ -154,7 +140,7 @@ def _agree(image: Any, info: Any, frame: str) -> None:
     for what, message in (("depth image", image), ("camera_info", info)):
         named = message.header.frame_id.lstrip("/")
         if named != frame:
-            raise CameraError(f"{what} is in frame {named!r}, the pose is that of {frame!r}: set PALPATE_CAMERA_FRAME={named}")
+            raise CameraError(f"{what} is in frame {named!r}, the pose is that of {frame!r}: set camera.ros.frame={named}")
     if (image.width, image.height) != (info.width, info.height):
         raise CameraError(f"depth image is {image.width} x {image.height}, camera_info says {info.width} x {info.height}")
 
@@ -183,8 +169,8 @@ def _intrinsics(t: int, info: Any, *, rectified: bool) -> Any:
 
 
 def create(scenario: Scenario) -> RosCameraService:
-    """The bridge; of the scenario it needs nothing. Raises CameraError."""
+    """The camera that the scenario's `camera.ros` names. Raises CameraError."""
     if runtime() != "wallclock":
-        raise CameraError("camera.implementation = ros takes a real camera, which does not wait: run with --wallclock")
-    frame, world = os.environ.get("PALPATE_CAMERA_FRAME") or FRAME, os.environ.get("PALPATE_CAMERA_WORLD") or "world"
-    return RosCameraService(ZenohCamera(), frame.strip("/"), world.strip("/"))
+        raise CameraError("a real camera does not wait for simulated time: run with --wallclock")
+    ros = scenario.camera.ros
+    return RosCameraService(ZenohCamera(ros), ros.frame.strip("/"), ros.world.strip("/"))

@@ -8,8 +8,8 @@ from typing import Any
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.frames import Array
+from palpate_models.scenario import LbrConnection
 from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand
-from palpate_robot.backends.lbr.settings import Settings
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 TOOL_STATE = "palpation_msgs/msg/ToolState"
@@ -52,15 +52,15 @@ class LbrPort(ABC):
 class ZenohPort(LbrPort):
     """Over zenoh, as rmw_zenoh does."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, connection: LbrConnection) -> None:
         """Joins. Raises BusConfigError."""
-        name = settings.namespace
-        self._node = RosNode("palpate_robot.backends.lbr", settings.domain, BusOptions(router=settings.router))
+        name = connection.namespace.strip("/")
+        self._node = RosNode("palpate_robot.backends.lbr", connection.domain, BusOptions(router=connection.router))
         self._states = self._node.subscription(f"{name}/state", STATE)
-        self._wrenches = self._node.subscription(settings.ft_topic, WRENCH)
+        self._wrenches = self._node.subscription(connection.ft_topic.strip("/"), WRENCH)
         self._command = self._node.publisher(f"{name}/command/torque", TORQUE_COMMAND)
         self._commands = self._node.subscription(f"{name}/command/torque", TORQUE_COMMAND)
-        if settings.emulated:
+        if connection.emulated:
             self._contact = self._node.publisher(CONTACT_TOPIC, WRENCH)
             self._tool = self._node.subscription(TOOL_TOPIC, TOOL_STATE)
             self._links = self._node.subscription(LINKS_TOPIC, LINKS)

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from palpate_bus.contract import contract
 from palpate_bus.messages import (
     JointState,
     OperatorRequest,
@@ -21,6 +22,7 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.wire.zenoh_config import BusConfigError
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
@@ -29,14 +31,13 @@ from palpate_models.scenario import ExamInput, Scenario
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, ArmModel
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort, ZenohPort
-from palpate_robot.backends.lbr.settings import Settings, SettingsError
 from palpate_robot.driver import Cause, Command, Driver, Mode
 
-STATUS_PERIOD = 10_000_000
+STATUS_PERIOD = contract().topics["robot/status"].period
 DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
 """Most joint damping in a hold [N m s/rad] [A]: as an overlay it acts one to three cycles late on a filtered speed. Below the
 arm's own viscous friction (10) that is stable with any delay; more is for the joints with inertia for it."""
-LINKS_PERIOD = 50_000_000
+LINKS_PERIOD = contract().topics["sim/link_poses"].period
 FT_AGE = 50_000_000
 """An F/T reading older than this is none [ns]."""
 TAKE_OVER = 100_000_000
@@ -51,7 +52,7 @@ class LbrService(Service):
     catches_up: ClassVar[bool] = False
     """The arm has moved on: a tick that was missed is never made up for."""
 
-    def __init__(self, exam: ExamInput, settings: Settings, port: LbrPort, inner: InnerLoop | None = None) -> None:
+    def __init__(self, exam: ExamInput, port: LbrPort, inner: InnerLoop | None = None) -> None:
         """`inner` is the loop that follows set-points in this process; without it `control/joint_torque` is obeyed."""
         self._robot = exam.robot
         self._port = port
@@ -59,10 +60,11 @@ class LbrService(Service):
         self._arm = Arm()
         self._model = ArmModel(exam.robot)
         self._driver = Driver(exam.limits.force_emergency_n)
-        self._emulated = settings.emulated
-        yaw = np.deg2rad(settings.ft_yaw_deg)
+        lbr_side = exam.robot.lbr
+        self._emulated = lbr_side.emulated
+        yaw = np.deg2rad(lbr_side.ft_yaw_deg)
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        self._R_ST = settings.ft_sign * turn
+        self._R_ST = lbr_side.ft_sign * turn
         self._command: Command | None = None
         self._command_message: Message | None = None
         self._commanding_since: int | None = None
@@ -225,11 +227,11 @@ def _wrench(values: Array) -> Message:
 
 
 def create(scenario: Scenario) -> LbrService:
-    """The driver of a scenario, of which it may know the exam input; joins the ROS side as the environment says."""
+    """The driver of a scenario, of which it may know the exam input; it joins the ROS side that `robot.lbr` names."""
     if runtime() != "wallclock":
-        raise SettingsError(
+        raise BusConfigError(
             "robot.implementation = lbr drives hardware, which does not wait for simulated time: run with --wallclock"
         )
-    exam, settings = exam_input(scenario), Settings.from_env()
-    inner = InnerLoop(load_control(scenario)) if settings.level == "setpoint" else None
-    return LbrService(exam, settings, ZenohPort(settings), inner)
+    exam = exam_input(scenario)
+    inner = InnerLoop(load_control(scenario)) if exam.robot.lbr.level == "setpoint" else None
+    return LbrService(exam, ZenohPort(exam.robot.lbr), inner)

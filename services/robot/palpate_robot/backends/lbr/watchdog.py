@@ -10,6 +10,7 @@ share how messages are read, and nothing of what decides.
 
 from __future__ import annotations
 
+import argparse
 import logging
 import signal
 import sys
@@ -22,9 +23,9 @@ import numpy as np
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.frames import Array
+from palpate_models.scenario import LbrConnection
 from palpate_robot.backends.lbr.arm import Arm
 from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
-from palpate_robot.backends.lbr.settings import Settings
 
 log = logging.getLogger("watchdog")
 
@@ -67,8 +68,12 @@ class Watchdog:
 
 def main() -> int:
     """Watches until a signal; returns the exit status."""
+    parser = argparse.ArgumentParser(description="Damps the arm when its driver falls silent.")
+    parser.add_argument("--router", default=LbrConnection().router, help="zenoh endpoint of the ROS side")
+    parser.add_argument("--domain", type=int, default=0, help="its ROS domain")
+    parser.add_argument("--namespace", default=LbrConnection().namespace, help="the stack's robot_name")
+    words = parser.parse_args()
     logging.basicConfig(level="INFO", format="%(asctime)s watchdog %(levelname)s %(message)s", stream=sys.stderr)
-    settings = Settings.from_env()
     running = [True]
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -76,10 +81,10 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    node = RosNode("palpate_lbr_watchdog", settings.domain, BusOptions(router=settings.router))
-    states = node.subscription(f"{settings.namespace}/state", STATE)
-    commands = node.subscription(f"{settings.namespace}/command/torque", TORQUE_COMMAND)
-    publisher = node.publisher(f"{settings.namespace}/command/torque", TORQUE_COMMAND)
+    node = RosNode("palpate_lbr_watchdog", words.domain, BusOptions(router=words.router))
+    states = node.subscription(f"{words.namespace}/state", STATE)
+    commands = node.subscription(f"{words.namespace}/command/torque", TORQUE_COMMAND)
+    publisher = node.publisher(f"{words.namespace}/command/torque", TORQUE_COMMAND)
     watchdog = Watchdog()
     said = False
     try:
