@@ -30,6 +30,7 @@ from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.security.access import ROUTER
 from palpate_bus.security.keys import init
+from palpate_bus.settings import Settings
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.transport import Publisher, Subscription
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session, session
@@ -115,7 +116,7 @@ def echo(options: BusOptions, kind: str) -> None:
 @contextmanager
 def _pair(here: BusOptions, there: BusOptions, kind: str) -> Iterator[End]:
     """Both ends of a way, open."""
-    environment = {**os.environ, **there.to_env(), "PALPATE_RUNTIME": "lockstep"}
+    environment = {**os.environ, **Settings.read().replaced(**there.settings(), runtime="lockstep").to_env()}
     child = subprocess.Popen([sys.executable, "-m", "palpate_benchmarks.wire", kind], env=environment)
     try:
         with session(here) as opened:
@@ -358,7 +359,7 @@ def _free_port() -> int:
 
 if __name__ == "__main__":
     if len(sys.argv) == 2:
-        echo(BusOptions.from_env(), sys.argv[1])
+        echo(BusOptions.from_settings(Settings.read()), sys.argv[1])
     else:
         chosen, place, folder = sys.argv[1], int(sys.argv[3]), Path(sys.argv[4])
         if sys.argv[2] == "pong":

@@ -198,7 +198,7 @@ def _complaint(settings: type[Settings], error: Any) -> str:
     place = str(error["loc"][0])
     name = next((name for name in settings.model_fields if place in (name, variable(name))), place)
     problem = error["msg"].removeprefix("Value error, ") + "; " if error["type"] == "value_error" else ""
-    return f"{variable(name)} is {error['input']!r}: {problem}allowed: {allowed(name)}"
+    return f"{variable(name)} is {error['input']!r}; {problem}allowed: {allowed(name)}"
 
 
 def allowed(name: str) -> str:
@@ -233,8 +233,8 @@ def page() -> str:
         "",
         "Every environment variable that the project reads, made from [`Settings`](../bus/palpate_bus/settings.py) by",
         "`python -m palpate_bus.settings --doc`. `palpate run` and docker-compose.yml set what a service needs; a user",
-        "seldom sets any. A wrong value is refused with the variable, the value and what is allowed. An empty variable counts as not",
-        "set. What is examined, and how, is in the scenario.",
+        "seldom sets any. A wrong value is refused with the variable, the value and what is allowed. An empty variable counts as",
+        "not set. What is examined, and how, is in the scenario.",
         "",
         "| variable | allowed | default | meaning |",
         "|---|---|---|---|",

@@ -16,7 +16,7 @@ from palpate.fuzz.bus_targets import Broken, Target
 from palpate.fuzz.command import fuzz
 from palpate.fuzz.fuzz import Find, all_targets, attempt, campaign, choose, guided, mutate
 from palpate_bus.messages import RecordChunk, codec
-from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_models.load import ScenarioError, load_scenario
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+
 from palpate_bus.settings import PAGE, BusConfigError, Settings, page
 
 SETTINGS = {
@@ -43,7 +44,7 @@ def test_process_reads_its_own_environment_and_a_child_gets_changes(monkeypatch:
         ("PALPATE_RUNTIME", "fast", "lockstep, wallclock"),
         ("PALPATE_RECORD", "maybe", "0, 1"),
         ("PALPATE_RECORD_FILE_MB", "0", "a whole number from 1"),
-        ("PALPATE_PERIODS", "control=soon", "ROLE=MILLISECONDS"),
+        *[("PALPATE_PERIODS", bad, "ROLE=MILLISECONDS") for bad in ("control", "control=0", "control=2.5", "control=5,")],
         ("ROS_DOMAIN_ID", "233", "0 to 232"),
     ],
 )

@@ -18,8 +18,9 @@ from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
-from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_bus.security.denials import DenialReader
+from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import parse_token
 from palpate_bus.wire.rmw import ATTACHMENT_SIZE, AttachmentWriter, WireError, parse_key, topic_key, unpack
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
@@ -175,10 +176,10 @@ _VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MO
 def _options(data: bytes) -> None:
     words = data.decode("utf-8", "surrogateescape").split("\n")
     try:
-        options = BusOptions.from_env(dict(zip(_VARIABLES, words, strict=False)))
+        options = BusOptions.from_settings(Settings.read(dict(zip(_VARIABLES, words, strict=False))))
     except BusConfigError:
         return
-    if BusOptions.from_env(options.to_env()) != options:
+    if BusOptions.from_settings(Settings.read(options.to_env())) != options:
         raise Broken("options: the environment that they make gives others")
 
 

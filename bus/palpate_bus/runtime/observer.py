@@ -13,7 +13,7 @@ import zenoh
 
 from palpate_bus.contract import Topic
 from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.runtime.distributed import Link, RunAborted
+from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Received, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.service import Service
@@ -127,7 +127,7 @@ class ObserverNode:
 
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
-        self._link = Link(member)
+        self._link = ConductorLink(member)
         self._observed = ObservedService(service, member)
 
     def run(self) -> None:

@@ -12,10 +12,10 @@ from typing import Any, Protocol, runtime_checkable
 from palpate_bus.contract import Topic
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import nanoseconds
-from palpate_bus.runtime.distributed import Link, RunAborted
+from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ class RecorderNode:
         self._service: Service = service
         self._recorder: RawRecorder = service
         self._topics = member.rules.topics
-        self._link = Link(member)
+        self._link = ConductorLink(member)
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)

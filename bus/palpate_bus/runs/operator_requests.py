@@ -1,4 +1,4 @@
-"""How an operator's word reaches a run: a query that its conductor answers once the supervisor confirms it.
+"""An operator's request to a run: a query that its conductor answers once the supervisor confirms it.
 
 Asked by `palpate stop`, `release`, `pause`, `resume` and `step`, and by the keys of `palpate dashboard` and `palpate run`.
 """
@@ -28,8 +28,8 @@ class NotAnswered(RuntimeError):
     """No run took the word, or it was refused. The message says which."""
 
 
-def desk_key(domain: int) -> str:
-    """The key on which a run is asked."""
+def request_key(domain: int) -> str:
+    """The key of the query."""
     return f"{domain}/palpate/operator"
 
 
@@ -39,7 +39,7 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
     `ms` is for `step`: the simulated time to grant. Raises NotAnswered.
     """
     payload = json.dumps({"word": word, "reason": reason, "ms": ms})
-    for reply in session.get(desk_key(domain), payload=payload, timeout=2 * CONFIRM_S):
+    for reply in session.get(request_key(domain), payload=payload, timeout=2 * CONFIRM_S):
         if reply.ok is None:
             continue
         answer = json.loads(reply.ok.payload.to_bytes())
