@@ -28,7 +28,7 @@ import zenoh
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import header
-from palpate_bus.security.access import ROUTER
+from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init
 from palpate_bus.settings import Settings
 from palpate_bus.wire.rmw import topic_key
@@ -200,13 +200,12 @@ def measure() -> dict[str, float]:
 
 
 def _secure() -> list[float]:
-    from palpate_bus.security.guard import Guard  # noqa: PLC0415  (it runs as a module too)
-
     with ExitStack() as stack:
         keys = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="palpate-bench-")))
         init(keys, ("robot", "control", ROUTER), days=1)
         where = f"tls/127.0.0.1:{_free_port()}"
-        stack.enter_context(Guard(keys / ROUTER, where))
+        router = BusOptions(mode="router", listen=(where,), tls=keys / ROUTER)
+        stack.enter_context(session(router, access_control(contract())))
         here, there = (BusOptions(mode="client", router=where, tls=keys / role) for role in ("robot", "control"))
         return _round_trips(*stack.enter_context(_pair(here, there, "ours")))
 

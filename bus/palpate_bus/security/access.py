@@ -29,10 +29,8 @@ OPERATOR = "operator"
 WATCHER = "conductor"
 """The role that watches over the contract in a run: it hears every public topic, as a viewer does."""
 ROUTER = "router"
-"""The router's own certificate; it may tell whom it turned away, and nothing else."""
-DENIALS = "palpate/denials"
-"""Where a router is asked whom it turned away (see `guard`)."""
-OPERATOR_DESK = "*/palpate/operator"
+"""The router's own certificate; it may send and get nothing."""
+OPERATOR_REQUESTS = "*/palpate/operator"
 """Where the conductor is asked to stop or release, in any domain."""
 
 _VIEWED = ("palpate/control", "palpate/report/*")
@@ -87,12 +85,10 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
     made.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
         made.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
-    made.allow("conductor", "serves", [OPERATOR_DESK], True, data)
-    made.allow(OPERATOR, "orders", [OPERATOR_DESK], False, data)
+    made.allow("conductor", "serves", [OPERATOR_REQUESTS], True, data)
+    made.allow(OPERATOR, "orders", [OPERATOR_REQUESTS], False, data)
     for member in (*rules.roles, VIEWER, OPERATOR):
         made.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
-        made.allow(member, "asks", [DENIALS], False, data)
-    made.allow(ROUTER, "tells", [DENIALS], True, data)
     return {
         "enabled": True,
         "default_permission": "deny",

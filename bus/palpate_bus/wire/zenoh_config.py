@@ -35,7 +35,7 @@ from __future__ import annotations
 import atexit
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -221,15 +221,19 @@ def mesh(roles: Sequence[str], folder: Path, *, lowlatency: Sequence[str] = ()) 
     }
 
 
-def open_session(options: BusOptions | None = None) -> zenoh.Session:
+def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | None = None) -> zenoh.Session:
     """A zenoh session; by default as the settings say. Close it with `close_session`, or use `session`.
 
-    Raises BusConfigError if a session cannot be opened, for instance because an endpoint is in use.
+    `access` is the access control of a router, see `security.access`. Raises BusConfigError if a session cannot be opened, for
+    instance because an endpoint is in use.
     """
     options = options or BusOptions.from_settings(Settings.read())
     os.environ.setdefault("ZENOH_RUNTIME", POOLS)  # zenoh reads it once, when the first session of a process opens
+    config = zenoh_config(options)
+    if access is not None:
+        config.insert_json5("access_control", json.dumps(access))
     try:
-        opened = zenoh.open(zenoh_config(options))
+        opened = zenoh.open(config)
     except zenoh.ZError as error:
         raise BusConfigError(f"cannot open a zenoh session with {options}: {error}") from error
     atexit.register(close_session, opened)
@@ -254,9 +258,9 @@ def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
 
 
 @contextmanager
-def session(options: BusOptions | None = None) -> Iterator[zenoh.Session]:
-    """A zenoh session for a `with` block."""
-    opened = open_session(options)
+def session(options: BusOptions | None = None, access: Mapping[str, Any] | None = None) -> Iterator[zenoh.Session]:
+    """A zenoh session for a `with` block, as `open_session` opens it."""
+    opened = open_session(options, access)
     try:
         yield opened
     finally:
