@@ -27,7 +27,7 @@ import zenoh
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import NS, header
 from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init
 from palpate_bus.settings import Settings
@@ -159,7 +159,7 @@ def _images(send: Callable[[bytes], None], receive: Callable[[float], bytes | No
     times = []
     due = perf_counter_ns()
     for _ in range(IMAGES):
-        due += 1_000_000_000 // RATE_HZ
+        due += NS // RATE_HZ
         sleep(max(due - perf_counter_ns(), 0) / 1e9)
         send(time_ns().to_bytes(8, "little") + pixels)
         answer = receive(1.0)

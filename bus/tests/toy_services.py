@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from palpate_bus.contract import MS
 from palpate_bus.messages import (
     CameraTrigger,
     ExamState,
@@ -42,7 +43,6 @@ from palpate_bus.run import main
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.transport import Transport
 
-MS = 1_000_000
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]
 END = int(float(os.environ.get("TOY_END_S", "2")) * NS)
 

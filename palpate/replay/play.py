@@ -13,7 +13,7 @@ from palpate_bus.messages.stamps import NS, time_message
 from palpate_bus.recordings import Recording
 from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings
-from palpate_bus.wire.liveliness import GraphWatch, Kind
+from palpate_bus.wire.liveliness import EntityKind, GraphWatch
 from palpate_bus.wire.transport import Sender
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 
@@ -86,7 +86,7 @@ class Player:
         """Raises PlayError when a living service of someone else forbids what is played."""
         self._graph.changes()
         own = str(self._session.zid())
-        alive = {e.node for e in self._graph.alive.values() if e.kind is Kind.NODE and e.zid != own}
+        alive = {e.node for e in self._graph.alive.values() if e.kind is EntityKind.NODE and e.zid != own}
         rules = contract()
         for name in self.topics if alive else ():
             row = rules.topics[name]

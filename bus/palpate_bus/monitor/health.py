@@ -25,7 +25,7 @@ class Violation:
 
 
 @dataclass
-class Seen:
+class SeenViolation:
     """A violation with how often and when it was seen, by the caller's clock [s]."""
 
     violation: Violation

@@ -13,10 +13,9 @@ from palpate_bus.contract import MS, Contract, Topic
 from palpate_bus.contract.checker import Checker, Kind
 from palpate_bus.messages import codec
 from palpate_bus.monitor import pace
-from palpate_bus.monitor.health import Seen, TopicHealth, Violation
+from palpate_bus.monitor.health import SeenViolation, TopicHealth, Violation
 from palpate_bus.monitor.streams import WINDOW_S, Stream
-from palpate_bus.wire.liveliness import Entity
-from palpate_bus.wire.liveliness import Kind as EntityKind
+from palpate_bus.wire.liveliness import Entity, EntityKind
 
 
 class Monitor:
@@ -25,7 +24,7 @@ class Monitor:
     def __init__(self, rules: Contract, wallclock: bool = False) -> None:
         self.rules = rules
         self.wallclock = wallclock
-        self.active: dict[tuple[str, str, Kind, str], Seen] = {}
+        self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
         """Every violation so far, by (topic, sender, kind, field)."""
         self.time = pace.BusTime(0.0, 0, None)
         """How the bus's time moves, as of the last look."""
@@ -117,8 +116,8 @@ class Monitor:
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:
-                    for fault in pace.faults(topic, stream, self.time, self.wallclock, now):
-                        self._note(topic, stream.sender, fault.kind, fault.expected, fault.got, now)
+                    for problem in pace.problems(topic, stream, self.time, self.wallclock, now):
+                        self._note(topic, stream.sender, problem.kind, problem.expected, problem.got, now)
         self._judge_unheard(now)
         news, self._news = self._news, []
         return news
@@ -173,7 +172,7 @@ class Monitor:
             seen.violation = Violation(topic.name, sender, kind, expected, got, path)
             return
         violation = Violation(topic.name, sender, kind, expected, got, path)
-        self.active[key] = Seen(violation, now, now)
+        self.active[key] = SeenViolation(violation, now, now)
         self._news.append(violation)
 
     def _check_sender(self, topic: Topic, sender: str, now: float) -> None:

@@ -21,7 +21,7 @@ from palpate_bus.runtime.lockstep import NEVER, InputBuffer, Received, Sent, Ste
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.output import ServiceOutput
 from palpate_bus.service import Service
-from palpate_bus.wire.transport import Sample
+from palpate_bus.wire.transport import ReceivedSample
 
 log = logging.getLogger(__name__)
 
@@ -159,7 +159,7 @@ class LockstepNode:
         data = self._data[buffer.topic.name]
         advance = self._advances.get(buffer.topic.producer) if buffer.topic.event else None
         waited = False
-        sample: Sample | None = None
+        sample: ReceivedSample | None = None
         while not buffer.ready(t):
             source = data if advance is None or buffer.waits_for_data else advance
             sample = source.get(0)
@@ -179,7 +179,7 @@ class LockstepNode:
             duration = perf_counter_ns() - begin
             self._stepper.blame.waited(buffer.topic.producer, duration, self._now() - sample.sent)
 
-    def _settle(self, producer: str, sample: Sample) -> None:
+    def _settle(self, producer: str, sample: ReceivedSample) -> None:
         advance = self._decode_advance(sample.payload)
         for name, sequence in zip(self._event_topics[producer], advance.sequences, strict=True):
             buffer = self._stepper.buffers.get(name)

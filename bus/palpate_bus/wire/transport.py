@@ -20,7 +20,7 @@ HELLO = 0
 """Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""
 
 
-class Sample(NamedTuple):
+class ReceivedSample(NamedTuple):
     """What came in on a subscription."""
 
     sequence: int
@@ -103,7 +103,7 @@ class Subscription:
         else:
             self._subscriber = session.declare_subscriber(key, handler)
 
-    def get(self, timeout: float | None) -> Sample | None:
+    def get(self, timeout: float | None) -> ReceivedSample | None:
         """The next message; None when `timeout` [s] passes without one. A timeout of 0 does not wait."""
         while True:
             if not timeout and self._queue.empty():  # nobody else takes from it; far cheaper than the exception
@@ -131,7 +131,7 @@ class Subscription:
             if self._decode is not None and decoded(self._decode, payload) is None:
                 self.garbage += 1
                 continue
-            return Sample(sequence, sent, payload)
+            return ReceivedSample(sequence, sent, payload)
 
     def hand_over(self) -> None:
         """Forgets the sender: the next one that is another counts from now on, and nothing that still comes from this one."""
