@@ -1,4 +1,4 @@
-"""How a topic is, and what is wrong with it: what a monitor says."""
+"""The findings of a monitor: the health of each topic, and violations of the contract."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from palpate_bus.contract.checker import Kind
 
 @dataclass(frozen=True)
 class Violation:
-    """One thing that is not as the contract says."""
+    """One violation of the contract."""
 
     topic: str
     sender: str

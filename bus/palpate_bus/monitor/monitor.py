@@ -1,6 +1,6 @@
 """The contract, enforced live: what every topic of a bus does against its row, from the contract alone.
 
-`Monitor` is the judgement, without any transport: give it what was heard (`hear`) and who is there (`see`), and ask it (`look`).
+`Monitor` judges, without any transport: it is given messages (`hear`) and the nodes on the bus (`see`), and is asked (`look`).
 `LiveMonitor` in `live` listens on a bus for it. A violation names topic, sender, what is expected and what came.
 """
 
@@ -19,7 +19,7 @@ from palpate_bus.wire.liveliness import Entity, EntityKind
 
 
 class Monitor:
-    """Judges a bus by the contract. `wallclock` says whether time on it is the wall's (else simulated)."""
+    """Judges a bus by the contract; `wallclock`: the time on it is wall time, not simulated time."""
 
     def __init__(self, rules: Contract, wallclock: bool = False) -> None:
         self.rules = rules
@@ -40,7 +40,7 @@ class Monitor:
         self._news: list[Violation] = []
 
     def listen(self, names: Iterable[str], now: float) -> None:
-        """Says which topics are listened to from now on. What was last known of the others is kept."""
+        """Sets the topics that are listened to from now on. The last findings on the others are kept."""
         chosen = frozenset(names)
         for name in self.listening - chosen:
             if self._streams[name]:
@@ -52,7 +52,7 @@ class Monitor:
         self.listening = chosen
 
     def see(self, entities: Iterable[Entity], now: float) -> None:
-        """Takes who is on the bus (`GraphWatch.alive.values()`): names for senders, types and hashes, who may send what."""
+        """Takes the entities on the bus (`GraphWatch.alive.values()`): they give senders their names, types and hashes."""
         present = list(entities)
         self._nodes = {entity.gid: entity.node for entity in present}
         self._publishers = {}
@@ -151,7 +151,7 @@ class Monitor:
         )  # fmt: skip
 
     def _kept_health(self, kept: TopicHealth) -> TopicHealth:
-        """A topic as it was when it was last listened to, with who is there and what was seen by now."""
+        """A topic as it was when it was last listened to, with its present senders and violations."""
         there = tuple(sorted(self._publishers.get(kept.topic.name, set())))
         return replace(kept, senders=there, violations=self._violations(kept.topic))
 
@@ -197,7 +197,7 @@ class Monitor:
             self._note(topic, stream.sender, Kind.STAMP, expected, f"{stamp} ns", now)
 
     def _judge_unheard(self, now: float) -> None:
-        """Topics whose producer is there but from whom nothing came."""
+        """Notes topics whose producer is on the bus but sent nothing."""
         for name, nodes in self._publishers.items():
             topic = self.rules.topics[name]
             if name not in self.listening:

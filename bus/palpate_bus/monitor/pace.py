@@ -1,8 +1,8 @@
 """Rate, silence and age of a periodic topic against its row, measured in the bus's own time.
 
-A rate is messages by what their own stamps say has passed, so that a run at a third of real time has right rates, and a busy
-monitor judges no worse; in wall-clock mode by their source times. A topic is silent when nothing came while the bus's time, the
-median of all periodic topics' stamps, went on.
+A rate is the number of messages over the time that passed by their own stamps, so that a run at a third of real time has right
+rates and a busy monitor does not misjudge; in wall-clock mode by their source times. A topic is silent when nothing came while
+the time of the bus, the median of all periodic topics' stamps, went on.
 """
 
 from __future__ import annotations

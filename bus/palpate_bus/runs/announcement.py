@@ -35,7 +35,7 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Run:
-    """A run that is on: who started it and how to join its bus."""
+    """A run in progress: the process that started it, and how to join its bus."""
 
     name: str
     """The scenario."""
@@ -49,7 +49,7 @@ class Run:
     out: str = ""
     """The results folder."""
     keys: str | None = None
-    """Of a secure run: the folder of everyone's certificates."""
+    """The folder of all certificates, for a secure run."""
     pid: int = field(default_factory=os.getpid)
     started: float = field(default_factory=time.time)
     """Wall time [s]."""

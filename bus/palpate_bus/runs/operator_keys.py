@@ -6,7 +6,7 @@
 | e | emergency stop: the driver holds the arm safely |
 | r | release: the examination goes on where it was |
 
-Only where standard input is a terminal that is ours; otherwise no key is ever read.
+Keys are read only if standard input is a terminal and this process is in its foreground.
 """
 
 from __future__ import annotations

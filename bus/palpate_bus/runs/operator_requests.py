@@ -25,7 +25,7 @@ PACE = ("pause", "resume", "step")
 
 
 class NotAnswered(RuntimeError):
-    """No run took the word, or it was refused. The message says which."""
+    """No run answered the request, or it was refused. The message says which."""
 
 
 def request_key(domain: int) -> str:
@@ -34,7 +34,7 @@ def request_key(domain: int) -> str:
 
 
 def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0) -> tuple[str, float]:
-    """Says a word of `WORDS` or `PACE` to the run on this bus; returns its answer and how long the confirmation took [ms].
+    """Sends a request of `WORDS` or `PACE` to the run on this bus; returns its answer and how long the confirmation took [ms].
 
     `ms` is for `step`: the simulated time to grant. Raises NotAnswered.
     """
@@ -50,7 +50,7 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
 
 
 def order(session: zenoh.Session, domain: int, word: str, reason: str) -> str:
-    """The same for who only wants to show what came of it: a sentence, also when nobody answered."""
+    """As `ask`, but returns a sentence on the result to show to the operator, also when there was no answer."""
     try:
         answer, after_ms = ask(session, domain, word, reason)
     except NotAnswered as error:

@@ -139,6 +139,6 @@ class Composed:
 
 
 def _schedule(steppers: Sequence[Stepper]) -> tuple[tuple[Stepper, ...], ...]:
-    """Who steps at each tick of a cycle, after which it is the same again."""
+    """The services that step at each tick of one cycle; every cycle is the same."""
     cycle = lcm(*(stepper.role.period // MS for stepper in steppers))
     return tuple(tuple(one for one in steppers if not tick * MS % one.role.period) for tick in range(cycle))

@@ -15,9 +15,9 @@ log = logging.getLogger(__name__)
 PROGRESS_S = 0.2
 """How often a node reports its progress, by wall clock."""
 CONDUCTOR_SILENT_S = 10.0
-"""After this long without a word from the conductor a node leaves."""
+"""A node leaves after this time without a message from the conductor."""
 CONDUCTOR_AWAITED_S = 120.0
-"""The same before its first word: containers on a busy machine start tens of seconds apart."""
+"""The same before its first message: containers on a busy machine start tens of seconds apart."""
 
 
 class RunAborted(RuntimeError):
@@ -25,7 +25,7 @@ class RunAborted(RuntimeError):
 
 
 class ConductorLink:
-    """A node's side of the conversation with the conductor: control in, reports out."""
+    """The service's side: control messages in, reports out."""
 
     def __init__(self, member: Member) -> None:
         self.role = member.role
@@ -35,14 +35,14 @@ class ConductorLink:
         self._sequence = 0
         self._decode = codec.decoder("palpation_msgs/msg/RunControl")
         self._encode = codec.encoder("palpation_msgs/msg/ServiceReport")
-        self._last_word = monotonic()
+        self._last_heard = monotonic()
         self._patience = CONDUCTOR_AWAITED_S
         self._last_report = 0.0
 
     def poll(self, timeout: float | None = None) -> Any | None:
         """The next control message, or None. Raises RunAborted when told so or when the conductor is silent."""
         while (sample := self._control.get(timeout)) is not None:
-            self._last_word = monotonic()
+            self._last_heard = monotonic()
             self._patience = CONDUCTOR_SILENT_S
             try:
                 message = self._decode(sample.payload)
@@ -52,8 +52,8 @@ class ConductorLink:
             if message.command == RunControl.ABORT:
                 raise RunAborted(message.reason)
             return message
-        if monotonic() - self._last_word > self._patience:
-            raise RunAborted(f"no word from the conductor for {self._patience:.0f} s")
+        if monotonic() - self._last_heard > self._patience:
+            raise RunAborted(f"no message from the conductor for {self._patience:.0f} s")
         return None
 
     def report(self, state: int, tick: int, waiting_for: str = "", detail: object = None) -> None:

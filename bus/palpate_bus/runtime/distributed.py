@@ -1,7 +1,7 @@
 """Distributed lockstep: one service a process, over zenoh, conservative synchronisation with no master in the data path.
 
-A node waits until each blocking input has advanced far enough, steps, and sends. The conductor says only how far simulated time
-may go (grants), who was lost, and when to stop. A node never hangs: it leaves when the conductor falls silent.
+A node waits until each blocking input has advanced far enough, steps, and sends. The conductor only says how far simulated time
+may go (grants), which roles were lost, and when to stop. A node never hangs: it leaves when the conductor falls silent.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A role's membership of the bus: its session, its liveliness tokens, and how it publishes and subscribes by the contract.
 
 What it declares shows in the ROS graph (`ros2 node list`, `ros2 topic info`). A peer that publishes or wants a topic of the
-contract with another type or hash can never meet us; that is silent in ROS 2, so `complaints` says it.
+contract with another type or hash never connects with ours. ROS 2 is silent about that, so `complaints` reports it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An observer's process: outside the barrier, it takes what comes and never slows a producer.
+"""The process of an observer: it is outside the barrier, reads what arrives and never slows a producer.
 
 It sees the latest of the periodic topics, and every message of the others. A recorder is driven by `recording`.
 """
@@ -73,7 +73,7 @@ class _Feed:
 
 
 class ObservedService:
-    """A service outside the barrier with its feeds: drained and stepped by whoever owns the thread."""
+    """A service outside the barrier with its feeds: the owner of the thread drains the feeds and steps the service."""
 
     def __init__(self, service: Service, member: Member, lossless: bool = False) -> None:
         """`lossless` keeps every message of every topic, not just the latest of the periodic ones."""

@@ -1,4 +1,4 @@
-"""The recorder's process: it takes the chunks that every service passes on, and says how far it has written.
+"""The process of the recorder: it takes the chunks that every service sends, and reports up to which tick it has written.
 
 The conductor grants at most a second of simulated time beyond that, so nothing is lost: at worst the run is slower.
 """
@@ -47,7 +47,7 @@ class RecorderNode:
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
-        # What observers say (clock, diagnostics, an operator's request) is rare and comes directly; the clock dates the rest.
+        # Messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others.
         observed = [topic for topic, _ in member.rules.inputs(service.role) if member.rules.roles[topic.producer].observer]
         observed.sort(key=lambda topic: topic.name != CLOCK)
         self._observed = [(topic, member.subscription(topic)) for topic in observed]

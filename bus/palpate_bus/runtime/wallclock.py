@@ -1,10 +1,9 @@
 """Wall clock: one service a process, each on its own timer, freshest sample wins: for hardware, real or simulated in real time.
 
 A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
-A late step is counted as an overrun. A critical role has physics, which has to keep time: it catches up tick by tick, up to
-`CATCH_UP`, unless its service drives real hardware, whose physics keeps its own. Whoever else is late, and who is later than
-that, goes on at the present tick: what should have been commanded a while ago helps nobody, and stamps stay on the common
-clock. Nothing waits for anybody. Expiry protects those who depend on a late sample.
+A late step is counted as an overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick
+by tick, unless it is later than `CATCH_UP` or drives real hardware. All others skip to the present tick, since an old command
+helps nobody and stamps must stay on the common clock. No service waits for another; expiry protects the readers of a late sample.
 """
 
 from __future__ import annotations
@@ -94,7 +93,7 @@ class WallClockNode:
     def _await_start(self) -> int:
         """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns].
 
-        The conductor repeats the start, so that who takes a place over in the middle of a run hears it too.
+        The conductor repeats the start, so that a service that takes over a role in the middle of a run hears it too.
         """
         while True:
             message = self._link.poll(HANDSHAKE_POLL_S)

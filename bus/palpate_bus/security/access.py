@@ -1,4 +1,4 @@
-"""zenoh's access control from the contract, for a router: each role may send what it produces and get what it reads, no more.
+"""zenoh's access control for a router, from the contract: a role may send what it produces and get what it reads, no more.
 
     python -m palpate_bus.security.access > access.json5      # the `access_control` part of zenohd's configuration
 
@@ -43,7 +43,7 @@ _WATCH = ["liveliness_query", "declare_liveliness_subscriber"]
 
 
 class _Rules:
-    """Collects rules and who they are for."""
+    """Collects rules and the members that they are for."""
 
     def __init__(self) -> None:
         self.rules: list[dict[str, Any]] = []
@@ -123,7 +123,7 @@ def _internal_sent(row: Internal, role: str) -> list[str]:
 
 
 def _internal_got(row: Internal, role: str) -> list[str]:
-    """Keys of a message of the runtime that `role` may get, whoever sends it."""
+    """Keys of a message of the runtime that `role` may get, from any sender."""
     if row.readers not in ("any", role):
         return []
     return _keys(row.name.replace("<role>", "*"))

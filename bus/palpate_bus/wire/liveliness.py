@@ -1,4 +1,4 @@
-"""Who is on the bus: liveliness tokens as rmw_zenoh has them, so that `ros2 node list` and `ros2 topic info` see our services.
+"""The nodes on the bus: liveliness tokens as rmw_zenoh has them, so that `ros2 node list` and `ros2 topic info` see our services.
 
 A token is a key that exists as long as its process does:
 

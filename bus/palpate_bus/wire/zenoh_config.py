@@ -87,7 +87,7 @@ class BusOptions:
         if self.mode not in ("peer", "client", "router"):
             raise BusConfigError(f"PALPATE_MODE is {self.mode!r}; allowed: peer, client, router")
         if self.mode == "client" and not (self.router or self.connect or self.file):
-            raise BusConfigError("PALPATE_MODE is client, but neither PALPATE_ROUTER nor PALPATE_CONNECT says of whom")
+            raise BusConfigError("PALPATE_MODE is client, but neither PALPATE_ROUTER nor PALPATE_CONNECT is set")
         for endpoint in (*self.listen, *self.connect, *([self.router] if self.router else [])):
             _check_endpoint(endpoint)
             if self.tls is not None and not endpoint.startswith("tls/"):
@@ -241,7 +241,7 @@ def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | 
 
 
 def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
-    """Undeclares what is passed, closes the session and says whether it closed in order; never raises.
+    """Undeclares what is passed, closes the session and returns whether it closed in order; never raises.
 
     A session that is still open when the interpreter ends makes it hang for ten seconds and then print a panic ("close
     operation timed out"), because its close waits for callbacks that need the interpreter. So `open_session` also registers
