@@ -56,19 +56,23 @@ def run_toys(
     environment: Mapping[str, str] | None = None,
     patience: Patience | None = None,
     wallclock: bool = False,
+    faults: Mapping[str, tuple[str, ...]] | None = None,
 ) -> Outcome:
+    """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second)."""
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
         bus = mesh(("conductor", *ROLES), Path(folder), lowlatency=("robot", "control", "tissue"))
         session = open_session(bus["conductor"])
         base = {
             **os.environ,
             **(environment or {}),
-            "PALPATE_SCENARIO": "",
+            "PALPATE_SCENARIO": "none",
             "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         }
         processes = {
             role: subprocess.Popen(
-                [sys.executable, str(TOYS), role], env={**base, **bus[role].to_env()}, stderr=subprocess.DEVNULL
+                [sys.executable, str(TOYS), role, *(faults or {}).get(role, ())],
+                env={**base, **bus[role].to_env()},
+                stderr=subprocess.DEVNULL,
             )
             for role in ROLES
         }
@@ -248,8 +252,7 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
         while (sample := ears[0].get(0)) is not None:
             heard.append((sample.sequence, sample.payload))
 
-    fault = {"PALPATE_FAULT": "robot/status:nan", "PALPATE_FAULT_AT": "1", "PALPATE_FAULT_COUNT": "0", "TOY_END_S": "8"}
-    outcome = run_toys(listen, fault)
+    outcome = run_toys(listen, {"TOY_END_S": "8"}, faults={"robot": ("robot/status", "nan", "1")})
     assert outcome.failure is None
     statuses = {status.name: status for status in codec.decode(heard[-1][1], topic.type).status}
     for name in ("palpate/topic/robot/status", "palpate/robot"):
@@ -296,8 +299,7 @@ def test_wall_clock_runs_the_same_services_to_the_announced_end() -> None:
 
 def test_a_wall_clock_run_of_which_nobody_would_say_the_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("palpate_conductor.grants.EXAM_SILENT_S", 1.0)
-    fault = {"PALPATE_FAULT": "exam/state:drop", "PALPATE_FAULT_AT": "0.5", "PALPATE_FAULT_COUNT": "0", "TOY_END_S": "30"}
-    outcome = run_toys(environment=fault, wallclock=True)
+    outcome = run_toys(environment={"TOY_END_S": "30"}, wallclock=True, faults={"planning": ("exam/state", "drop", "0.5")})
     assert outcome.failure is not None
     assert outcome.failure.startswith("planning has sent nothing on exam/state since 0.")
 

@@ -20,6 +20,7 @@ from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.runtime.distributed import LockstepNode
 from palpate_bus.runtime.member import Member
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions, mesh, session
 
 SIZES = (3, 5, 8)
@@ -89,7 +90,8 @@ def _run(number: int) -> float:
 
 
 def _start(name: str, number: int, options: BusOptions) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, **options.to_env(), "PALPATE_RUNTIME": "lockstep", "PALPATE_RECORD": "0"}
+    settings = Settings.read().replaced(**options.settings(), runtime="lockstep", record=False)
+    environment = {**os.environ, **settings.to_env()}
     return subprocess.Popen([sys.executable, "-m", "palpate_benchmarks.barrier", name, str(number)], env=environment)
 
 

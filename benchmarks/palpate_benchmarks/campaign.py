@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import monotonic
@@ -20,10 +20,10 @@ from palpate.run.distributed import WORKERS, conduct, write_scenario_files
 from palpate.run.forks import Forks
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.result import Progress, RunResult
+from palpate_benchmarks.faulty import CHANGES, InjectedFault, command
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_bus.runtime.faults import CHANGES
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.outcome import Patience, RunFailed
 from palpate_models.load import load_scenario
@@ -61,7 +61,7 @@ class CaseOver(RunFailed):
 
 
 @dataclass(frozen=True)
-class Case:
+class FaultCase:
     """One fault."""
 
     kind: str
@@ -77,7 +77,7 @@ class Case:
 
 
 @dataclass
-class Finding:
+class FaultFinding:
     """What came of a case."""
 
     kind: str
@@ -112,14 +112,14 @@ class Finding:
         )
 
 
-def cases(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[Case]:
+def cases(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
     """All faults of these modes and kinds; `only` keeps roles and topics."""
     topics = [t for t in contract().topics.values() if t.producer in WORKERS and not t.latched and _flows(t)]
     for mode in modes:
         for kind in kinds:
             for where in WORKERS if kind in PROCESS_KINDS else [topic.name for topic in topics]:
                 if not only or where in only:
-                    yield Case(kind, where, mode == "wallclock")
+                    yield FaultCase(kind, where, mode == "wallclock")
 
 
 def _flows(topic: Topic) -> bool:
@@ -131,10 +131,10 @@ def _flows(topic: Topic) -> bool:
 class _Watch:
     """Does the damage at its time and notices what it brings."""
 
-    case: Case
+    case: FaultCase
     local: LocalProcesses
     target: str
-    finding: Finding
+    finding: FaultFinding
     since: float = 0.0
     held: int = 0
     seen_scan: int | None = None
@@ -205,17 +205,18 @@ def forks() -> Forks:
     return Forks(process.command[2] for process in read_processes(compose_file(), WORKERS).values())
 
 
-def run_case(case: Case, folder: Path, forks: Forks | None = None) -> Finding:
+def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> FaultFinding:
     """Runs one case; its logs stay in a folder of its own under `folder`."""
     scenario = load_scenario("rlq_guarding", SETTINGS)
     out = (folder / case.name).resolve()
     files = write_scenario_files(scenario, out)
     processes = read_processes(compose_file(), WORKERS)
     target = case.where if case.kind in PROCESS_KINDS else contract().topics[case.where].producer
-    environment = {**processes[target].environment, **_fault(case)}
-    processes[target] = replace(processes[target], environment=environment)
+    fault = _fault(case)
+    if fault is not None:
+        processes[target] = replace(processes[target], command=command(target, fault))
     extra = {"PALPATE_RUNTIME": "wallclock" if case.wallclock else "lockstep", "PALPATE_RECORD": "0"}
-    finding = Finding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
+    finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
     begin = monotonic()
     local = LocalProcesses(WORKERS, out, files, extra, forks=forks)
     try:
@@ -239,16 +240,17 @@ def run_case(case: Case, folder: Path, forks: Forks | None = None) -> Finding:
     return finding
 
 
-def _fault(case: Case) -> Mapping[str, str]:
+def _fault(case: FaultCase) -> InjectedFault | None:
+    """What the transport of the process does; None where a signal is all the damage."""
     if case.kind in ("kill", "freeze"):
-        return {}
+        return None
     if case.kind == "jump":
-        return {"PALPATE_FAULT": "clock:jump"}
+        return InjectedFault("clock", "jump")
     lasting = case.kind in LASTING or (case.wallclock and case.kind == "drop")
-    return {"PALPATE_FAULT": f"{case.where}:{case.kind}", "PALPATE_FAULT_COUNT": "0" if lasting else "1"}
+    return InjectedFault(case.where, case.kind, count=0 if lasting else 1)
 
 
-def _conclude(finding: Finding, watch: _Watch, result: RunResult) -> None:
+def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
     """How it ended, and what the forces were."""
     collected = result.collected
     last = Progress(0, 0.0, collected, ())
@@ -289,6 +291,6 @@ def _reaction(collected: Any, ended: str) -> str:
     return "none needed" if ended in UNHARMED else "run ended"
 
 
-def as_json(findings: Sequence[Finding]) -> list[dict[str, Any]]:
+def as_json(findings: Sequence[FaultFinding]) -> list[dict[str, Any]]:
     """For a file."""
     return [{**asdict(finding), "good": finding.good} for finding in findings]

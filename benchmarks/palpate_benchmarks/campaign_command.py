@@ -14,7 +14,7 @@ from rich.markup import escape
 from palpate.command_line import EXIT_FAILED, output_file, refuse
 from palpate.report.files import write_text
 from palpate.report.marked import doc_option, write_part
-from palpate_benchmarks.campaign import KINDS, Finding, as_json, cases, forks, run_case
+from palpate_benchmarks.campaign import KINDS, FaultFinding, as_json, cases, forks, run_case
 from palpate_benchmarks.campaign_tables import markdown, table
 from palpate_benchmarks.case_display import CaseDisplay
 
@@ -63,12 +63,12 @@ def faults(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _load(path: Path) -> list[Finding]:
+def _load(path: Path) -> list[FaultFinding]:
     if not path.exists():
         return []
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
-        found = [Finding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
+        found = [FaultFinding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
     except (ValueError, TypeError, AttributeError) as error:
         refuse(f"--out {path}: holds no findings of this command: {error}")
     return [finding for finding in found if finding.injected_s is not None]  # those that never began are tried again

@@ -8,7 +8,7 @@ from statistics import median
 from rich.markup import escape
 from rich.table import Table
 
-from palpate_benchmarks.campaign import KINDS, UNHARMED, Finding
+from palpate_benchmarks.campaign import KINDS, UNHARMED, FaultFinding
 
 COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
 SUMMARY = (
@@ -23,7 +23,7 @@ SUMMARY = (
 )
 
 
-def table(findings: Sequence[Finding]) -> Table:
+def table(findings: Sequence[FaultFinding]) -> Table:
     """For a terminal."""
     shown = Table(*COLUMNS, box=None)
     for finding in _sorted(findings):
@@ -31,7 +31,7 @@ def table(findings: Sequence[Finding]) -> Table:
     return shown
 
 
-def markdown(findings: Sequence[Finding]) -> str:
+def markdown(findings: Sequence[FaultFinding]) -> str:
     """For the documentation: a summary, and every case folded away."""
     good = sum(f.good for f in findings)
     largest = max((f.peak_force_n or 0.0 for f in findings), default=0.0)
@@ -49,7 +49,7 @@ def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[
     return [line(head), "|---" * len(head) + "|", *map(line, rows)]
 
 
-def _summary(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
+def _summary(findings: Sequence[FaultFinding]) -> list[tuple[str, ...]]:
     """One row a mode and kind."""
     rows: list[tuple[str, ...]] = []
     for mode, kind in sorted({(f.mode, f.kind) for f in findings}, key=lambda key: (key[0], KINDS.index(key[1]))):
@@ -74,12 +74,12 @@ def _summary(findings: Sequence[Finding]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _row(finding: Finding) -> tuple[str, ...]:
+def _row(finding: FaultFinding) -> tuple[str, ...]:
     after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
     after = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
     force = f"{finding.peak_force_before_n:.1f}, {after}"
     return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
 
 
-def _sorted(findings: Sequence[Finding]) -> list[Finding]:
+def _sorted(findings: Sequence[FaultFinding]) -> list[FaultFinding]:
     return sorted(findings, key=lambda f: (f.mode, KINDS.index(f.kind), f.where))

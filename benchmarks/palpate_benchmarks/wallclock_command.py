@@ -17,6 +17,7 @@ from palpate.command_line import fail, output_folder
 from palpate.report.archive import read_figures
 from palpate.report.marked import doc_option, write_part
 from palpate.run.inputs import Settings, usable
+from palpate_bus.settings import Settings as BusSettings
 
 FAST = ("robot", "tissue", "control")
 LEGS = (("state to controller", "control", "joint_states"), ("command to robot", "robot", "control/joint_torque"))
@@ -28,7 +29,7 @@ def _run(scenario: str, settings: list[str], folder: Path, rate: int, *options: 
     """The report of a run with the controller at `rate` [Hz]. Raises RuntimeError when it did not complete."""
     words = [word for setting in settings for word in ("--set", setting)]
     command = [sys.executable, "-m", "palpate", "run", scenario, "--quiet", "--no-record", "--out", str(folder)]
-    environment = {**os.environ, "PALPATE_PERIODS": f"control={1000 // rate}"}
+    environment = {**os.environ, **BusSettings.read().replaced(periods={"control": 1000 // rate}).to_env()}
     done = subprocess.run([*command, *options, *words], capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         raise RuntimeError(f"{rate} Hz {' '.join(options)}: status {done.returncode}\n{done.stderr}")

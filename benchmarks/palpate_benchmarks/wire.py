@@ -27,9 +27,10 @@ import zenoh
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, codec
-from palpate_bus.messages.stamps import header
-from palpate_bus.security.access import ROUTER
+from palpate_bus.messages.stamps import NS, header
+from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init
+from palpate_bus.settings import Settings
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.transport import Publisher, Subscription
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session, session
@@ -115,7 +116,7 @@ def echo(options: BusOptions, kind: str) -> None:
 @contextmanager
 def _pair(here: BusOptions, there: BusOptions, kind: str) -> Iterator[End]:
     """Both ends of a way, open."""
-    environment = {**os.environ, **there.to_env(), "PALPATE_RUNTIME": "lockstep"}
+    environment = {**os.environ, **Settings.read().replaced(**there.settings(), runtime="lockstep").to_env()}
     child = subprocess.Popen([sys.executable, "-m", "palpate_benchmarks.wire", kind], env=environment)
     try:
         with session(here) as opened:
@@ -158,7 +159,7 @@ def _images(send: Callable[[bytes], None], receive: Callable[[float], bytes | No
     times = []
     due = perf_counter_ns()
     for _ in range(IMAGES):
-        due += 1_000_000_000 // RATE_HZ
+        due += NS // RATE_HZ
         sleep(max(due - perf_counter_ns(), 0) / 1e9)
         send(time_ns().to_bytes(8, "little") + pixels)
         answer = receive(1.0)
@@ -199,13 +200,12 @@ def measure() -> dict[str, float]:
 
 
 def _secure() -> list[float]:
-    from palpate_bus.security.guard import Guard  # noqa: PLC0415  (it runs as a module too)
-
     with ExitStack() as stack:
         keys = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="palpate-bench-")))
         init(keys, ("robot", "control", ROUTER), days=1)
         where = f"tls/127.0.0.1:{_free_port()}"
-        stack.enter_context(Guard(keys / ROUTER, where))
+        router = BusOptions(mode="router", listen=(where,), tls=keys / ROUTER)
+        stack.enter_context(session(router, access_control(contract())))
         here, there = (BusOptions(mode="client", router=where, tls=keys / role) for role in ("robot", "control"))
         return _round_trips(*stack.enter_context(_pair(here, there, "ours")))
 
@@ -358,7 +358,7 @@ def _free_port() -> int:
 
 if __name__ == "__main__":
     if len(sys.argv) == 2:
-        echo(BusOptions.from_env(), sys.argv[1])
+        echo(BusOptions.from_settings(Settings.read()), sys.argv[1])
     else:
         chosen, place, folder = sys.argv[1], int(sys.argv[3]), Path(sys.argv[4])
         if sys.argv[2] == "pong":

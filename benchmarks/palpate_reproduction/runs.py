@@ -13,7 +13,7 @@ from typing import Final
 
 from palpate.report.archive import completed
 from palpate_bus.runs.announcement import Run, live
-from palpate_bus.wire.liveliness import GraphWatch, Kind
+from palpate_bus.wire.liveliness import EntityKind, GraphWatch
 from palpate_bus.wire.zenoh_config import session
 
 GRAPH: Final = "graph.json"
@@ -124,7 +124,7 @@ def listen(run: Run) -> list[dict[str, str]]:
         rows = [
             {"node": entity.node, "kind": entity.kind.value, "topic": entity.endpoint.topic, "type": entity.endpoint.type}
             for entity in watch.alive.values()
-            if entity.endpoint is not None and entity.kind in (Kind.PUBLISHER, Kind.SUBSCRIPTION)
+            if entity.endpoint is not None and entity.kind in (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
         ]
         watch.close()
     return sorted(rows, key=lambda row: tuple(row.values()))

@@ -6,8 +6,7 @@
     if __name__ == "__main__":
         main("control", create)
 
-Environment: PALPATE_SCENARIO (resolved scenario file), PALPATE_RUNTIME (lockstep or wallclock), PALPATE_OUT (results folder),
-ROS_DOMAIN_ID, and what `zenoh_config` reads.
+What it is told about the run comes from `Settings`, which reads the environment.
 """
 
 from __future__ import annotations
@@ -22,83 +21,78 @@ from typing import Any
 import zenoh
 
 from palpate_bus.contract import MS, Contract, Role, contract
-from palpate_bus.runtime.distributed import LockstepNode, RunAborted
+from palpate_bus.runtime.conductor_link import RunAborted
+from palpate_bus.runtime.distributed import LockstepNode
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObserverNode
 from palpate_bus.runtime.priority import in_the_background
 from palpate_bus.runtime.recording import RawRecorder, RecorderNode
 from palpate_bus.runtime.wallclock import WallClockNode
 from palpate_bus.service import Service
-from palpate_bus.wire.zenoh_config import BusConfigError, close_session, domain_from_env, open_session
+from palpate_bus.settings import BusConfigError, Settings
+from palpate_bus.wire.transport import Transport
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 
 EXIT_FAILED = 3
 RUNTIMES: dict[str, type[LockstepNode] | type[WallClockNode]] = {"lockstep": LockstepNode, "wallclock": WallClockNode}
 
 
 def node_type(
-    service: Service, rules: Contract
+    service: Service, rules: Contract, runtime: str
 ) -> type[LockstepNode] | type[WallClockNode] | type[ObserverNode] | type[RecorderNode]:
-    """What drives a service in this process."""
+    """The node that drives a service in a process of its own; `runtime` is `lockstep` or `wallclock`."""
     if not rules.roles[service.role].observer:
-        return RUNTIMES[runtime()]
+        return RUNTIMES[runtime]
     return RecorderNode if isinstance(service, RawRecorder) else ObserverNode
 
 
 def runtime() -> str:
-    """The runtime that PALPATE_RUNTIME asks for, lockstep by default. Raises ValueError when it is none of ours."""
-    name = os.environ.get("PALPATE_RUNTIME", "lockstep")
-    if name not in RUNTIMES:
-        raise ValueError(f"PALPATE_RUNTIME={name!r}: want one of {', '.join(RUNTIMES)}")
-    return name
+    """The runtime of this process, `lockstep` or `wallclock`."""
+    return Settings.read().runtime
 
 
 def stands_back(role: Role, runtime_name: str) -> bool:
-    """Whether a service gives way to others: an observer, and in lockstep who is not of the 1 kHz loop that all wait for."""
+    """Whether a service gives way to others: observers do, and in lockstep all that are not in the 1 kHz loop."""
     return role.observer or (runtime_name == "lockstep" and role.period > MS)
 
 
-def _scenario() -> str:
-    """The scenario file. Raises BusConfigError when the environment names none."""
-    try:
-        return os.environ["PALPATE_SCENARIO"]
-    except KeyError:
-        raise BusConfigError("PALPATE_SCENARIO is not set; want a scenario file, as `palpate prepare` writes it") from None
-
-
-def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]) -> None:
+def main(
+    role: str,
+    create: Callable[[Any], Service],
+    load: Callable[[str], Any],
+    transport: Callable[[zenoh.Session], Transport] = Transport,
+) -> None:
     """Runs the service of `role` to its end and leaves with status 0, or 3 when the run failed or was aborted.
 
-    `load` reads the scenario file named by PALPATE_SCENARIO; `create` makes the service from it.
+    `load` reads the scenario file that the settings name; `create` makes the service from it. `transport` carries its messages.
     """
-    logging.basicConfig(
-        level=os.environ.get("PALPATE_LOG", "INFO"),
-        format=f"%(asctime)s {role} %(levelname)s %(message)s",
-        stream=sys.stderr,
-    )
     status = 0
     session = None
+    log = logging.getLogger(role)
     try:
+        settings = Settings.read()
+        logging.basicConfig(level=settings.log, format=f"%(asctime)s {role} %(levelname)s %(message)s", stream=sys.stderr)
         rules = contract()
-        domain = domain_from_env()
-        service = create(load(_scenario()))
-        if stands_back(rules.roles[role], runtime()):
+        scenario = settings.required("scenario", "want a scenario file, as `palpate prepare` writes it")
+        service = create(load(str(scenario)))
+        if stands_back(rules.roles[role], settings.runtime):
             in_the_background()
-        session = open_session()
-        member = Member(session, role, rules, domain)
-        node = node_type(service, rules)(service, member)
+        session = open_session(BusOptions.from_settings(settings))
+        member = Member(session, role, rules, settings.domain, transport(session))
+        node = node_type(service, rules, settings.runtime)(service, member)
         gc.freeze()  # else a full collection goes through all that was loaded: 0.06 to 0.17 s in mid-run, now 0.02 ms
         node.run()
         member.leave()
     except RunAborted as aborted:
-        logging.getLogger(role).warning("run ended early: %s", aborted)
+        log.warning("run ended early: %s", aborted)
         status = EXIT_FAILED
     except KeyboardInterrupt:
         status = EXIT_FAILED
     except BusConfigError as error:
-        logging.getLogger(role).error("%s", error)
+        log.error("%s", error)
         status = EXIT_FAILED
     except Exception:
-        logging.getLogger(role).exception("%s failed", role)
+        log.exception("%s failed", role)
         status = EXIT_FAILED
     leave(session, status)
 

@@ -1,4 +1,4 @@
-"""Access control with real sessions: a secure router passes what the rows say, nothing else, and tells whom it denied."""
+"""Access control with real sessions: a secure router passes what the rows say and nothing else."""
 
 import json
 import socket
@@ -12,8 +12,6 @@ import zenoh
 
 from palpate_bus.contract import contract
 from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, watched
-from palpate_bus.security.denials import STRANGER, DenialReader
-from palpate_bus.security.guard import Guard, denials
 from palpate_bus.security.keys import KeysError, certificates, init, members, read
 from palpate_bus.wire.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
 from palpate_bus.wire.rmw import message_key, topic_key
@@ -36,7 +34,8 @@ class Bus:
         self.keys = folder / "keys"
         init(self.keys)
         self.endpoint = f"tls/127.0.0.1:{free_port()}"
-        self.guard = Guard(self.keys / ROUTER, self.endpoint, lambda _: None).__enter__()
+        options = BusOptions(mode="router", listen=(self.endpoint,), tls=self.keys / ROUTER)
+        self.router = open_session(options, access_control(RULES))
         self.sessions: dict[str, zenoh.Session] = {}
 
     def join(self, name: str) -> zenoh.Session:
@@ -72,19 +71,10 @@ class Bus:
         assert open_key in arrived, "the way was never open"
         return key in arrived
 
-    def denied(self, who: str, action: str, topic: str) -> bool:
-        """Whether the router tells a viewer of this attempt, within a moment."""
-        for _ in range(100):
-            found = denials(self.join(VIEWER)) or []
-            if any((d.who, d.action, d.topic) == (who, action, topic) for d in found):
-                return True
-            time.sleep(0.02)
-        return False
-
     def close(self) -> None:
         for opened in self.sessions.values():
             close_session(opened)
-        self.guard.close()
+        close_session(self.router)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +106,6 @@ def test_a_message_passes_where_its_row_says_so(bus: Bus, sender: str, reader: s
 def test_only_the_conductor_may_stop_a_run(bus: Bus) -> None:
     assert bus.passes("conductor", "robot", CONTROL)
     assert not bus.passes("planning", "robot", CONTROL)
-    assert bus.denied("planning", "Put", "palpate/control")
 
 
 def test_a_report_is_of_its_own_role_and_chunks_reach_the_recorder_alone(bus: Bus) -> None:
@@ -128,33 +117,33 @@ def test_a_report_is_of_its_own_role_and_chunks_reach_the_recorder_alone(bus: Bu
     assert not bus.passes("tissue", "planning", chunk)
 
 
-def test_a_torque_by_the_cameras_certificate_is_denied_and_shows(bus: Bus) -> None:
-    bus.join("camera").put(topic_key(RULES.topics["control/joint_torque"], 0), b"x")
-    assert bus.denied("camera", "Put", "control/joint_torque")
-
-
-def test_looking_at_the_truth_is_denied_and_shows(bus: Bus) -> None:
-    subscriber = bus.join("perception").declare_subscriber(topic_key(RULES.topics["truth/phantom"], 0))
-    assert bus.denied("perception", "Declare Subscriber", "truth/phantom")
-    subscriber.undeclare()
-
-
 def test_a_viewer_sends_nothing(bus: Bus) -> None:
-    bus.join(VIEWER).put(topic_key(RULES.topics["operator/request"], 0), b"x")
-    assert bus.denied(VIEWER, "Put", "operator/request")
+    key = topic_key(RULES.topics["operator/request"], 0)
+    heard: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    subscriber = bus.join("supervisor").declare_subscriber(key, zenoh.handlers.Callback(heard.put, indirect=False))
+    end = time.monotonic() + 20
+    while heard.empty() and time.monotonic() < end:  # until the way is open
+        bus.join(VIEWER).put(key, b"viewer")
+        bus.join("conductor").put(key, b"conductor")
+        time.sleep(0.02)
+    for _ in range(5):
+        bus.join(VIEWER).put(key, b"viewer")
+        time.sleep(0.02)
+    subscriber.undeclare()
+    said = {heard.get_nowait().payload.to_bytes() for _ in range(heard.qsize())}
+    assert said == {b"conductor"}
 
 
 @pytest.mark.parametrize(("who", "allowed"), [(OPERATOR, True), (VIEWER, False), ("planning", False)])
 def test_an_operator_may_ask_the_conductor_to_stop(bus: Bus, who: str, allowed: bool) -> None:
-    desk = "0/palpate/operator"
-    queryable = bus.join("conductor").declare_queryable(desk, lambda query: query.reply(desk, b"stopped"))
+    requests = "0/palpate/operator"
+    queryable = bus.join("conductor").declare_queryable(requests, lambda query: query.reply(requests, b"stopped"))
     answered = False
     for _ in range(50 if allowed else 3):
-        answered = any(reply.ok is not None for reply in bus.join(who).get(desk, timeout=0.2))
+        answered = any(reply.ok is not None for reply in bus.join(who).get(requests, timeout=0.2))
         if answered:
             break
     assert answered is allowed
-    assert allowed or bus.denied(who, "Query", desk)
     queryable.undeclare()
 
 
@@ -172,21 +161,15 @@ def test_no_one_lives_under_anothers_name(bus: Bus) -> None:
 
 
 @pytest.mark.parametrize("certificate", [False, True])
-def test_a_stranger_cannot_connect_and_shows(bus: Bus, tmp_path: Path, certificate: bool) -> None:
+def test_a_stranger_cannot_connect(bus: Bus, tmp_path: Path, certificate: bool) -> None:
     """Without a certificate, and with one of an authority of its own."""
     init(tmp_path / "own", ("robot",))
     config = zenoh_config(BusOptions(mode="client", router=bus.endpoint, tls=tmp_path / "own" / "robot"))
     config.insert_json5("transport/link/tls/root_ca_certificate", json.dumps(str(bus.keys / "ca.pem")))
     if not certificate:
         config.insert_json5("transport/link/tls/enable_mtls", "false")
-    before = sum(d.count for d in bus.guard.denials() if d.who == STRANGER)
     with pytest.raises(zenoh.ZError):
         zenoh.open(config)
-    for _ in range(100):
-        if sum(d.count for d in bus.guard.denials() if d.who == STRANGER) > before:
-            return
-        time.sleep(0.02)
-    pytest.fail(f"the router does not tell of the stranger: {bus.guard.denials()}")
 
 
 def test_without_encryption_nobody_connects(bus: Bus) -> None:
@@ -233,34 +216,10 @@ def test_every_row_has_its_rules() -> None:
         assert topic.visibility != "sim" or topic.name not in watched(RULES)
         assert may(VIEWER, "egress", "put", key) is (topic.visibility == "public"), topic.name
         assert not may(VIEWER, "ingress", "put", key)
-        assert not may(ROUTER, "ingress", "put", key)
+    assert ROUTER not in policy
     token = f"{ADMIN_SPACE}/0/ab/0/0/NN/%/%/robot"
     assert may("robot", "ingress", "liveliness_token", token)
     assert not may("camera", "ingress", "liveliness_token", token)
-
-
-def test_the_log_is_read_in_any_pieces() -> None:
-    zid, key = "c0ffee", topic_key(RULES.topics["control/joint_torque"], 0)
-    target = "zenoh::net::routing::interceptor"
-    log = (
-        f"t TRACE rx-0 ThreadId(8) {target}::access_control: {zid} on Interface(lo)+CertCommonName(camera)+{zid} is "
-        f"unauthorized to Put (ingress) on {key}\nt TRACE rx-0 ThreadId(8) {target}: Msg intercepted!\n"
-        f"t TRACE rx-0 ThreadId(8) {target}::access_control: Using cached result: {zid} is unauthorized to Put "
-        f"(ingress) on {key}\n"
-        f"t TRACE rx-1 ThreadId(9) {target}::access_control: Using cached result: {zid} is authorized to Put (ingress) on {key}\n"
-        f"t TRACE rx-0 ThreadId(8) {target}: Msg intercepted!\n"
-        f"t TRACE rx-1 ThreadId(9) {target}::access_control: ab is unauthorized to Put (egress) on {key}\n"
-        f"t TRACE rx-1 ThreadId(9) {target}: Msg intercepted!\n"
-        "t  WARN acc-0 ThreadId(5) zenoh_link_tls::unicast: peer sent no certificates. Hint: increase the limit.\n"
-    ).encode()
-    for size in (1, 7, 100, len(log)):
-        reader = DenialReader()
-        new = [d for i in range(0, len(log), size) for d in reader.feed(log[i : i + size])]
-        assert [(d.who, d.action, d.topic) for d in new] == [
-            ("camera", "Put", "control/joint_torque"),
-            (STRANGER, "Connect", "peer sent no certificates"),
-        ]
-        assert [d.count for d in reader.denials.values()] == [2, 1]
 
 
 def test_keys_are_kept_renewed_and_private(tmp_path: Path) -> None:

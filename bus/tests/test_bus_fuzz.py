@@ -12,16 +12,16 @@ import typer
 from typer.testing import CliRunner
 
 from palpate.command_line import EXIT_BAD_INPUT
-from palpate.fuzz.bus_targets import Broken, Target
+from palpate.fuzz.bus_targets import Broken, FuzzTarget
 from palpate.fuzz.command import fuzz
 from palpate.fuzz.fuzz import Find, all_targets, attempt, campaign, choose, guided, mutate
 from palpate_bus.messages import RecordChunk, codec
-from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_models.load import ScenarioError, load_scenario
 
 
 @pytest.mark.parametrize("target", all_targets(), ids=lambda target: target.name)
-def test_no_input_of_a_small_campaign_breaks_anything(target: Target) -> None:
+def test_no_input_of_a_small_campaign_breaks_anything(target: FuzzTarget) -> None:
     done = campaign([target], 150, seed=20, slow_s=math.inf)
     assert not done.finds, [(find.error, find.data.hex()) for find in done.finds]
 
@@ -36,7 +36,7 @@ def test_a_broken_target_is_found() -> None:
         if len(data) > 8:
             raise Broken("too long")
 
-    done = campaign([Target("long", check, lambda _: [b"12345678"])], 500)
+    done = campaign([FuzzTarget("long", check, lambda _: [b"12345678"])], 500)
     assert [find.error for find in done.finds] == ["Broken: too long"]
     assert len(done.finds[0].data) > 8
 
@@ -58,7 +58,7 @@ def test_what_a_guided_campaign_finds_comes_with_its_input(monkeypatch: pytest.M
         return subprocess.CompletedProcess(command, 77, "", " === Uncaught Python exception: ===\nIndexError: [2]\nTraceback")
 
     monkeypatch.setattr(subprocess, "run", fuzzer)
-    found = guided(Target("mine", lambda _: None, lambda _: [b"seed"]), 10, 0)
+    found = guided(FuzzTarget("mine", lambda _: None, lambda _: [b"seed"]), 10, 0)
     assert found == Find("mine", b"\x01\x02", "IndexError: [2]")
 
 
@@ -111,6 +111,6 @@ def test_a_setting_of_rubbish_is_refused_with_its_words(tmp_path: Path, setting:
 
 
 def test_an_input_that_takes_long_is_a_find() -> None:
-    find = attempt(Target("slow", lambda _: None, lambda _: [b""]), b"x", slow_s=-1.0)
+    find = attempt(FuzzTarget("slow", lambda _: None, lambda _: [b""]), b"x", slow_s=-1.0)
     assert find is not None
     assert "took" in find.error

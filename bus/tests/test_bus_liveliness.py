@@ -12,8 +12,8 @@ from palpate_bus.contract import contract
 from palpate_bus.wire.liveliness import (
     Endpoint,
     Entity,
+    EntityKind,
     GraphWatch,
-    Kind,
     NodeTokens,
     entities,
     gid,
@@ -36,8 +36,8 @@ RULES = contract()
 def test_tokens_of_the_design_document() -> None:
     listener, talker = parse_token(LISTENER), parse_token(TALKER)
     assert (listener.token, talker.token) == (LISTENER, TALKER)
-    assert (listener.kind, listener.node, listener.namespace, listener.endpoint) == (Kind.NODE, "listener", "/", None)
-    assert (talker.domain, talker.node_id, talker.entity_id, talker.kind) == (0, 0, 10, Kind.PUBLISHER)
+    assert (listener.kind, listener.node, listener.namespace, listener.endpoint) == (EntityKind.NODE, "listener", "/", None)
+    assert (talker.domain, talker.node_id, talker.entity_id, talker.kind) == (0, 0, 10, EntityKind.PUBLISHER)
     assert talker.endpoint is not None
     assert (talker.endpoint.topic, talker.endpoint.type) == ("chatter", "std_msgs/msg/String")
     qos = RULES.qos["control"].model_copy(update={"depth": 7})
@@ -70,12 +70,12 @@ def test_garbage_tokens_raise_wire_error_at_most(key: str) -> None:
 
 
 def test_a_different_definition_is_named_with_both_sides() -> None:
-    def entity(kind: Kind, node: str, type_hash: str) -> Entity:
+    def entity(kind: EntityKind, node: str, type_hash: str) -> Entity:
         return Entity(0, "a", 0, 1, kind, node, endpoint=Endpoint("ft/wrench", "geometry_msgs/msg/WrenchStamped", type_hash, ""))
 
-    same = [entity(Kind.PUBLISHER, "robot", "RIHS01_1"), entity(Kind.SUBSCRIPTION, "planning", "RIHS01_1")]
+    same = [entity(EntityKind.PUBLISHER, "robot", "RIHS01_1"), entity(EntityKind.SUBSCRIPTION, "planning", "RIHS01_1")]
     assert mismatches(same) == []
-    (sentence,) = mismatches([*same, entity(Kind.SUBSCRIPTION, "viewer", "RIHS01_2")])
+    (sentence,) = mismatches([*same, entity(EntityKind.SUBSCRIPTION, "viewer", "RIHS01_2")])
     for part in ("ft/wrench", "robot", "viewer", "RIHS01_1", "RIHS01_2"):
         assert part in sentence
 
@@ -105,7 +105,7 @@ def test_watch_sees_roles_come_and_go_and_late_joiners_see_all(tmp_path: Path, l
             assert publisher_gid in {entity.gid for entity in watch.alive.values()}
             late = GraphWatch(watching, domain=5)
             assert _until(lambda: bool(late.changes() or late.roles() == {"robot"}))
-            assert [entity.kind for entity in entities(watching, 5)] == [Kind.NODE, Kind.PUBLISHER]
+            assert [entity.kind for entity in entities(watching, 5)] == [EntityKind.NODE, EntityKind.PUBLISHER]
             assert entities(watching, 6, timeout=0.2) == []
             NodeTokens(robot, "elsewhere", domain=6)
         assert _until(lambda: bool(watch.changes() or watch.gone() == {"robot"}))

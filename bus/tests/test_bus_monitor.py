@@ -20,8 +20,7 @@ from palpate_bus.monitor.diagnostics import RECENT_S, diagnostics
 from palpate_bus.monitor.health import Violation
 from palpate_bus.monitor.monitor import Monitor
 from palpate_bus.testing.strategies import messages
-from palpate_bus.wire.liveliness import Endpoint, Entity, qos_token
-from palpate_bus.wire.liveliness import Kind as EntityKind
+from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token
 
 RULES = contract()
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]

@@ -11,6 +11,7 @@ from queue import Empty, SimpleQueue
 import pytest
 import zenoh
 
+from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, mesh, open_session, session, zenoh_config
 
 
@@ -33,30 +34,30 @@ def heard(publisher: zenoh.Session, subscriber: zenoh.Session, payload: bytes = 
 
 def test_options_survive_the_environment() -> None:
     options = BusOptions(("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"), ("tcp/h:3",), "tcp/r:7447", lowlatency=True, shared_memory=False)
-    assert BusOptions.from_env(options.to_env()) == options
-    assert BusOptions.from_env({}) == BusOptions()
+    assert BusOptions.from_settings(Settings.read(options.to_env())) == options
+    assert BusOptions.from_settings(Settings.read({})) == BusOptions()
 
 
 def test_wall_clock_neither_waits_long_nor_uses_the_low_latency_transport() -> None:
-    options = BusOptions.from_env({"PALPATE_LOWLATENCY": "1", "PALPATE_RUNTIME": "wallclock"})
+    options = BusOptions.from_settings(Settings.read({"PALPATE_LOWLATENCY": "1", "PALPATE_RUNTIME": "wallclock"}))
     assert not options.lowlatency
     assert options.drop_wait_us < BusOptions().drop_wait_us
-    assert BusOptions.from_env({"PALPATE_LOWLATENCY": "1", "PALPATE_RUNTIME": "lockstep"}).lowlatency
+    assert BusOptions.from_settings(Settings.read({"PALPATE_LOWLATENCY": "1", "PALPATE_RUNTIME": "lockstep"})).lowlatency
 
 
 @pytest.mark.parametrize(
     ("environment", "message"),
     [
-        ({"PALPATE_MODE": "boss"}, "PALPATE_MODE is 'boss'; allowed are peer, client and router"),
+        ({"PALPATE_MODE": "boss"}, "PALPATE_MODE is 'boss'; allowed: peer, client, router"),
         ({"PALPATE_MODE": "client"}, "neither PALPATE_ROUTER nor PALPATE_CONNECT"),
         ({"PALPATE_LISTEN": "7447"}, "endpoint '7447' is not <protocol>/<address>"),
-        ({"PALPATE_LOWLATENCY": "maybe"}, "PALPATE_LOWLATENCY is 'maybe'; allowed are 0 and 1"),
+        ({"PALPATE_LOWLATENCY": "maybe"}, "PALPATE_LOWLATENCY is 'maybe'; allowed: 0, 1"),
         ({"PALPATE_CONNECT": "unixsock-stream/" + "x" * 120}, "at most 107 bytes; choose a shorter folder"),
     ],
 )
 def test_what_cannot_work_is_refused_by_name(environment: dict[str, str], message: str) -> None:
     with pytest.raises(BusConfigError, match=message):
-        BusOptions.from_env(environment)
+        BusOptions.from_settings(Settings.read(environment))
 
 
 def test_a_broken_configuration_file_is_named(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from palpate_bus.runs.announcement import Announcement, Run
-from palpate_bus.runs.joining import BUS, NoBus, find, find_all
+from palpate_bus.runs.joining import NoBus, find, find_all
 from palpate_bus.wire.zenoh_config import TLS_FILES
 
 ENDPOINTS = {"robot": "tcp/127.0.0.1:17999"}
@@ -18,7 +18,7 @@ ENDPOINTS = {"robot": "tcp/127.0.0.1:17999"}
 @pytest.fixture(autouse=True)
 def _alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
-    for name in (*BUS, "ROS_DOMAIN_ID"):
+    for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG", "ROS_DOMAIN_ID"):
         monkeypatch.delenv(name, raising=False)
 
 

@@ -11,7 +11,9 @@ import time
 from typing import Any
 
 import numpy as np
+import zenoh
 
+from palpate_bus.contract import MS
 from palpate_bus.messages import (
     CameraTrigger,
     ExamState,
@@ -39,8 +41,8 @@ from palpate_bus.messages import (
 from palpate_bus.messages.stamps import NS, duration_message, header
 from palpate_bus.run import main
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.wire.transport import Transport
 
-MS = 1_000_000
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]
 END = int(float(os.environ.get("TOY_END_S", "2")) * NS)
 
@@ -193,5 +195,16 @@ class Supervisor(Service):
 EVERY = (Robot, Control, Tissue, Planning, Assessment, Camera, Perception, Supervisor)
 TOYS: dict[str, type[Service]] = {toy.role: toy for toy in EVERY}
 
+
+def transport(session: zenoh.Session) -> Transport:
+    """The usual one, or with `TOPIC KIND SECONDS` on the command line one that has this fault from that simulated second on."""
+    if len(sys.argv) == 2:
+        return Transport(session)
+    from palpate_benchmarks.faulty import FaultyTransport, InjectedFault
+
+    topic, kind, seconds = sys.argv[2:]
+    return FaultyTransport(session, InjectedFault(topic, kind, count=0, at=round(float(seconds) * NS)))
+
+
 if __name__ == "__main__":
-    main(sys.argv[1], lambda _: TOYS[sys.argv[1]](), lambda _: None)
+    main(sys.argv[1], lambda _: TOYS[sys.argv[1]](), lambda _: None, transport)

@@ -13,8 +13,8 @@ from time import monotonic, sleep
 from palpate_bus.contract import contract
 from palpate_bus.messages import RunControl, codec
 from palpate_bus.runs.announcement import Run, live
-from palpate_bus.runs.desk import order
 from palpate_bus.runs.operator_keys import OperatorKeys
+from palpate_bus.runs.operator_requests import order
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import IDLE_S, ObservedService
 from palpate_bus.wire.zenoh_config import session

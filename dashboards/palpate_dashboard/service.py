@@ -5,7 +5,6 @@ It sends nothing, so nothing that it does can change a run; it skips what it is 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -18,6 +17,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import RobotStatus
 from palpate_bus.messages.codec import Message
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, patient, plots, words
 from palpate_dashboard.columns import Columns
 from palpate_dashboard.force_depth import ForceDepth, ForceDepthPlane
@@ -320,10 +320,9 @@ class DashboardService(Service):
 def create(scenario: Scenario) -> DashboardService:
     """The dashboard of a run.
 
-    The run's folder is in the environment variable PALPATE_OUT; PALPATE_VIEWER, if set, says how to show it live (see
-    `Live.parse`). Raises ValueError if the first is missing or the second not understood.
+    The setting `out` is the run's folder; `viewer` says how to show it live (see `Live.parse`). Raises ValueError if the first is
+    missing or the second not understood.
     """
-    out = os.environ.get("PALPATE_OUT")
-    if not out:
-        raise ValueError(f"PALPATE_OUT is not set; the dashboard writes $PALPATE_OUT/{FILE}, so give it the run's folder")
-    return DashboardService(scenario, Path(out) / FILE, Live.parse(os.environ.get("PALPATE_VIEWER", "")))
+    settings = Settings.read()
+    out = settings.required("out", f"the dashboard writes $PALPATE_OUT/{FILE}, so give it the run's folder")
+    return DashboardService(scenario, out / FILE, Live.parse(settings.viewer or ""))

@@ -4,7 +4,7 @@
 
 Position and tool axis take five of seven joints; what is left (elbow swivel and spin about the tool) is chosen by
 optimisation: far from joint limits, little torque at the pressing force, far from singularities, elbow high, smooth
-along the path. `python -m palpate_models.placement` finds the base placement by the same costs.
+along the path. `python -m palpate_models.placement_base` finds the base placement by the same costs.
 """
 
 from __future__ import annotations
@@ -222,14 +222,3 @@ def _judge(batch: Batch, q: Array, refined: bool) -> PostureSequence:
         residual=residual,
         refined=refined,
     )
-
-
-def _main() -> None:
-    """Prints the best base placement for the default scenario, and what the present one achieves."""
-    from palpate_models import placement_base  # noqa: PLC0415 - it needs this module
-
-    print(placement_base.report())
-
-
-if __name__ == "__main__":
-    _main()

@@ -158,3 +158,7 @@ def report() -> str:
             postures = plan_redundancy(robot, *targets, np.asarray(HOME))
             lines.append(f"{label:8} {height:8}  {describe(robot, postures)}")
     return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(report())

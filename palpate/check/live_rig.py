@@ -21,7 +21,7 @@ from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.joining import NoBus
-from palpate_bus.wire.liveliness import GraphWatch, Kind, NodeTokens, gid
+from palpate_bus.wire.liveliness import EntityKind, GraphWatch, NodeTokens, gid
 from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key
 from palpate_bus.wire.transport import Publisher, Subscription
 
@@ -109,7 +109,7 @@ class LiveRig(Rig):
         self.graph.changes()
         ours = str(self._session.zid())
         ends = [e for e in self.graph.alive.values() if e.node == self.role.name and e.zid != ours and e.endpoint is not None]
-        sent = {e.endpoint.topic: e.endpoint for e in ends if e.kind is Kind.PUBLISHER and e.endpoint is not None}
+        sent = {e.endpoint.topic: e.endpoint for e in ends if e.kind is EntityKind.PUBLISHER and e.endpoint is not None}
         for topic in self.rules.outputs(self.role.name):
             end = sent.pop(topic.name, None)
             wanted = f"{topic.type} {topic.type_hash[:15]}"

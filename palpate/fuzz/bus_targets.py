@@ -1,4 +1,4 @@
-"""What is fuzzed: everything of the bus that takes bytes or words from others, with what must hold for any of them.
+"""What is fuzzed of the bus: everything that takes bytes or words from others, with what must hold for any of them.
 
 A target is a callable on bytes. It returns quietly when the input was refused with the error that is documented, or accepted
 consistently; anything else that it raises is a find. `seeds()` gives valid inputs to start from.
@@ -18,15 +18,15 @@ from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
-from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
-from palpate_bus.security.denials import DenialReader
+from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
+from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import parse_token
 from palpate_bus.wire.rmw import ATTACHMENT_SIZE, AttachmentWriter, WireError, parse_key, topic_key, unpack
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
 
 
 @dataclass(frozen=True)
-class Target:
+class FuzzTarget:
     """A function under test and valid inputs of it."""
 
     name: str
@@ -38,19 +38,19 @@ class Broken(AssertionError):
     """A property does not hold for an input that was accepted."""
 
 
-def targets() -> list[Target]:
+def targets() -> list[FuzzTarget]:
     """All targets of the bus."""
-    return [*_codecs(), ATTACHMENT, KEY, TOKEN, CHUNK, OPTIONS, DENIAL_LOG]
+    return [*_codecs(), ATTACHMENT, KEY, TOKEN, CHUNK, OPTIONS]
 
 
 # -- messages
 
 
-def _codecs() -> Iterator[Target]:
+def _codecs() -> Iterator[FuzzTarget]:
     rules = contract()
     names = sorted({row.type for row in rules.topics.values()} | {row.type for row in rules.internal.values()})
     for name in names:
-        yield Target(f"codec:{name}", _codec_check(name), partial(_payloads, name))
+        yield FuzzTarget(f"codec:{name}", _codec_check(name), partial(_payloads, name))
 
 
 def _codec_check(name: str) -> Callable[[bytes], None]:
@@ -113,7 +113,7 @@ def _scalar(base: str, rng: random.Random) -> Any:
     return rng.randint(int(limits.min), int(limits.max))
 
 
-# -- attachment, keys, tokens, chunks, options, the router's log
+# -- attachment, keys, tokens, chunks, options
 
 
 def _attachment(data: bytes) -> None:
@@ -125,7 +125,7 @@ def _attachment(data: bytes) -> None:
         raise Broken("attachment: packing what was unpacked changes it")
 
 
-ATTACHMENT = Target(
+ATTACHMENT = FuzzTarget(
     "attachment", _attachment, lambda rng: [AttachmentWriter(rng.randbytes(16)).pack(rng.randrange(2**62), rng.randrange(2**62))]
 )
 
@@ -140,7 +140,7 @@ def _key(data: bytes) -> None:
         raise Broken("key: parsing what was written changes it")
 
 
-KEY = Target("key", _key, lambda _: [topic_key(topic, 3).encode() for topic in contract().topics.values()])
+KEY = FuzzTarget("key", _key, lambda _: [topic_key(topic, 3).encode() for topic in contract().topics.values()])
 
 
 def _token(data: bytes) -> None:
@@ -155,7 +155,7 @@ def _token(data: bytes) -> None:
 _ENDPOINT = (
     "@ros2_lv/0/a1b2/0/3/MP/%/%/robot/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_" + 64 * "a" + "/::,1:,:,:,,"
 )
-TOKEN = Target("token", _token, lambda _: [b"@ros2_lv/0/a1b2/0/0/NN/%/%/robot", _ENDPOINT.encode()])
+TOKEN = FuzzTarget("token", _token, lambda _: [b"@ros2_lv/0/a1b2/0/0/NN/%/%/robot", _ENDPOINT.encode()])
 
 
 def _chunk(data: bytes) -> None:
@@ -166,7 +166,7 @@ def _chunk(data: bytes) -> None:
         return
 
 
-CHUNK = Target("chunk", _chunk, lambda rng: [random_payload(CHUNK_TYPE, rng) for _ in range(4)])
+CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [random_payload(CHUNK_TYPE, rng) for _ in range(4)])
 
 
 _VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MODE", "PALPATE_LOWLATENCY", "PALPATE_TLS")
@@ -175,34 +175,15 @@ _VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MO
 def _options(data: bytes) -> None:
     words = data.decode("utf-8", "surrogateescape").split("\n")
     try:
-        options = BusOptions.from_env(dict(zip(_VARIABLES, words, strict=False)))
+        options = BusOptions.from_settings(Settings.read(dict(zip(_VARIABLES, words, strict=False))))
     except BusConfigError:
         return
-    if BusOptions.from_env(options.to_env()) != options:
+    if BusOptions.from_settings(Settings.read(options.to_env())) != options:
         raise Broken("options: the environment that they make gives others")
 
 
-OPTIONS = Target(
+OPTIONS = FuzzTarget(
     "options",
     _options,
     lambda _: [b"tcp/127.0.0.1:7501,unixsock-stream//run/a.sock\ntcp/a:1\ntcp/host:7447\npeer\n1", b"\n\ntls/h:1\nclient\n0\n/k"],
 )
-
-
-def _denial_log(data: bytes) -> None:
-    whole, pieces = DenialReader(), DenialReader()
-    list(whole.feed(data + b"\n"))
-    for index in range(0, len(data), 7):
-        list(pieces.feed(data[index : index + 7]))
-    list(pieces.feed(b"\n"))
-    if [d.sentence for d in whole.denials.values()] != [d.sentence for d in pieces.denials.values()]:
-        raise Broken("denials: a log read in pieces says something else")
-
-
-_LOG = (
-    b"t TRACE rx-0 ThreadId(8) zenoh::net::routing::interceptor::access_control: ab on Interface(lo)+CertCommonName(camera)+ab "
-    b"is unauthorized to Put (ingress) on 0/a/b::msg::dds_::C_/RIHS01_x\n"
-    b"t TRACE rx-0 ThreadId(8) zenoh::net::routing::interceptor: Msg intercepted!\n"
-    b"t  WARN acc-0 ThreadId(5) zenoh_link_tls::unicast: peer sent no certificates. Hint: more.\n"
-)
-DENIAL_LOG = Target("denials", _denial_log, lambda _: [_LOG])

@@ -34,8 +34,3 @@ def fuzz(
     rate = sum(done.inputs.values()) / done.seconds
     print(f"{sum(done.inputs.values())} inputs, {len(chosen)} targets, seed {seed}: {len(done.finds)} finds, {rate:.0f} inputs/s")
     raise typer.Exit(EXIT_FAILED if done.finds else 0)
-
-
-def main() -> None:
-    """`python -m palpate.fuzz.fuzz`."""
-    typer.run(fuzz)

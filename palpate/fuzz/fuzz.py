@@ -1,9 +1,8 @@
-"""Fuzzing of all that takes bytes or words from others: `palpate fuzz`, or `python -m palpate.fuzz.fuzz`.
+"""Fuzzing of everything that takes bytes or words from others.
 
     palpate fuzz --inputs 1000000            mutations of valid inputs, shared out among the targets; same seed, same inputs
     palpate fuzz --inputs 100000 --coverage  guided by coverage, with Google's atheris (`pip install atheris`)
 
-Other packages add targets by the entry-point group `palpate.fuzz`: a function that returns a list of `fuzz_targets.Target`.
 A find is printed with its input in hexadecimal and the exception; it belongs into a test, and then it is fixed.
 """
 
@@ -16,17 +15,17 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
-from importlib.metadata import entry_points
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, thread_time
 
-from palpate.fuzz.bus_targets import Target, targets
+from palpate.fuzz import bus_targets, scenario_targets
+from palpate.fuzz.bus_targets import FuzzTarget
 
 SLOW_S = 1.0
-"""An input that takes more processor time is a find too: it would hold up a service."""
+"""An input that takes more processor time [s] is a find too, since it would hold up a service."""
 KEPT = 64
-"""Inputs kept for splicing, a target."""
+"""How many inputs of a target are kept for splicing."""
 _EDGES = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\0\0\xf0\x7f")
 
 
@@ -40,7 +39,7 @@ class Find:
 
 
 @dataclass
-class Campaign:
+class FuzzCampaign:
     """What a campaign did."""
 
     seed: int
@@ -76,7 +75,7 @@ def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
     return bytes(changed)
 
 
-def attempt(target: Target, data: bytes, slow_s: float = SLOW_S) -> Find | None:
+def attempt(target: FuzzTarget, data: bytes, slow_s: float = SLOW_S) -> Find | None:
     """Runs one input."""
     begin = thread_time()
     try:
@@ -88,15 +87,15 @@ def attempt(target: Target, data: bytes, slow_s: float = SLOW_S) -> Find | None:
 
 
 def campaign(
-    chosen: Sequence[Target],
+    chosen: Sequence[FuzzTarget],
     inputs: int,
     seed: int = 0,
     tell: Callable[[str], None] = lambda _: None,
     most: int = 100,
     slow_s: float = SLOW_S,
-) -> Campaign:
-    """`inputs` in all, shared out among the targets; each target stops after `most` finds, of which one a kind is kept."""
-    done = Campaign(seed)
+) -> FuzzCampaign:
+    """Runs `inputs` inputs, shared out among the targets. A target stops after `most` finds; one of each kind is kept."""
+    done = FuzzCampaign(seed)
     begin = perf_counter()
     for index, target in enumerate(chosen):
         rng = random.Random(f"{seed} {target.name}")
@@ -124,15 +123,12 @@ def campaign(
     return done
 
 
-def all_targets() -> list[Target]:
-    """The bus's targets and those of the other installed packages."""
-    found = targets()
-    for point in sorted(entry_points(group="palpate.fuzz"), key=lambda point: point.name):
-        found += point.load()()
-    return found
+def all_targets() -> list[FuzzTarget]:
+    """The readers of the bus and of scenarios."""
+    return [*bus_targets.targets(), *scenario_targets.targets()]
 
 
-def guided(target: Target, inputs: int, seed: int) -> Find | None:
+def guided(target: FuzzTarget, inputs: int, seed: int) -> Find | None:
     """Fuzzes one target in a process of its own with atheris, from its valid inputs on; returns its first find, if any."""
     with TemporaryDirectory(prefix="palpate-fuzz-") as scratch:
         corpus, broken = Path(scratch, "corpus"), Path(scratch, "broken")
@@ -151,9 +147,9 @@ def guided(target: Target, inputs: int, seed: int) -> Find | None:
         return Find(target.name, data, error[1] if error else said.strip()[-500:])
 
 
-def guided_campaign(chosen: Sequence[Target], inputs: int, seed: int, tell: Callable[[str], None]) -> Campaign:
+def guided_campaign(chosen: Sequence[FuzzTarget], inputs: int, seed: int, tell: Callable[[str], None]) -> FuzzCampaign:
     """Up to `inputs` for each target; one ends with its first find."""
-    done = Campaign(seed)
+    done = FuzzCampaign(seed)
     begin = perf_counter()
     for target in chosen:
         find = guided(target, inputs, seed)
@@ -165,16 +161,10 @@ def guided_campaign(chosen: Sequence[Target], inputs: int, seed: int, tell: Call
     return done
 
 
-def choose(patterns: Sequence[str]) -> list[Target]:
+def choose(patterns: Sequence[str]) -> list[FuzzTarget]:
     """The targets whose names match one of the patterns; all without any. Raises ValueError naming a pattern without a match."""
     known = all_targets()
     for pattern in patterns:
         if not any(fnmatch(target.name, pattern) for target in known):
             raise ValueError(f"no target {pattern!r}; targets are {', '.join(target.name for target in known)}")
     return [target for target in known if not patterns or any(fnmatch(target.name, p) for p in patterns)]
-
-
-if __name__ == "__main__":
-    from palpate.fuzz.command import main
-
-    main()

@@ -11,15 +11,12 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
-import zenoh
-
 from palpate.live import graph
 from palpate.live.joining import Joined
 from palpate_bus.contract import Contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.live import LiveMonitor
 from palpate_bus.runs.announcement import versions
-from palpate_bus.security.guard import denials
 from palpate_bus.wire.liveliness import mismatches
 
 POLL_S = 0.04
@@ -96,7 +93,6 @@ def diagnose(bus: Joined, rules: Contract, live: LiveMonitor) -> Diagnosis:
     found = list(live.graph.alive.values())
     findings = [
         *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(rules, live), *_waiting(live),
-        *turned_away(bus.session),
     ]  # fmt: skip
     differing = mismatches(found)
     findings += [Finding("types", Level.BAD, sentence) for sentence in differing]
@@ -134,16 +130,6 @@ def _endpoints(bus: Joined, live: LiveMonitor) -> list[Finding]:
     findings.append(Finding("endpoints", Level.WARN if deaf else Level.OK, text))
     findings += [Finding("endpoints", Level.WARN, f"{role} does not answer at {run.endpoints[role]}") for role in deaf]
     return findings
-
-
-def turned_away(session: zenoh.Session) -> list[Finding]:
-    """Whom a secure router denied something, one finding an attempt's kind; nothing where no router tells."""
-    attempts = denials(session)
-    if attempts is None:
-        return []
-    if not attempts:
-        return [Finding("access", Level.OK, "the router turned nobody away")]
-    return [Finding("access", Level.BAD, denial.sentence) for denial in attempts]
 
 
 def _shared_memory(bus: Joined) -> list[Finding]:

@@ -8,7 +8,7 @@ from time import monotonic
 
 from palpate.live.joining import Joined
 from palpate_bus.contract import Contract
-from palpate_bus.wire.liveliness import Entity, GraphWatch, Kind
+from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 
 
 @dataclass
@@ -61,11 +61,11 @@ def topics(found: Iterable[Entity]) -> dict[str, LiveTopic]:
     by_name: dict[str, LiveTopic] = {}
     for entity in found:
         end = entity.endpoint
-        if end is None or entity.kind not in (Kind.PUBLISHER, Kind.SUBSCRIPTION):
+        if end is None or entity.kind not in (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION):
             continue
         topic = by_name.setdefault(end.topic, LiveTopic(end.topic))
         topic.types.add((end.type, end.type_hash))
-        if entity.kind is Kind.PUBLISHER:
+        if entity.kind is EntityKind.PUBLISHER:
             topic.publishers.append(entity.node)
             topic.qos.add(end.qos)
         else:
@@ -82,7 +82,7 @@ def nodes(found: Iterable[Entity]) -> dict[str, LiveNode]:
         end = entity.endpoint
         if end is None:
             continue
-        kept = {Kind.PUBLISHER: node.publishes, Kind.SUBSCRIPTION: node.subscribes}.get(entity.kind, node.services)
+        kept = {EntityKind.PUBLISHER: node.publishes, EntityKind.SUBSCRIPTION: node.subscribes}.get(entity.kind, node.services)
         kept.append(end.topic)
     return dict(sorted(by_name.items()))
 

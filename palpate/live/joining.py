@@ -12,7 +12,7 @@ import typer
 import zenoh
 
 from palpate_bus.contract import Contract
-from palpate_bus.runs.joining import NoBus, Target, find
+from palpate_bus.runs.joining import BusTarget, NoBus, find
 from palpate_bus.security.access import public
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, session
 
@@ -33,7 +33,7 @@ class Joined:
     """A bus that was joined."""
 
     session: zenoh.Session
-    target: Target
+    target: BusTarget
 
     @property
     def domain(self) -> int:

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from palpate.command_line import EXIT_FAILED, refuse, say
-from palpate_bus.runs.desk import NotAnswered, ask
 from palpate_bus.runs.joining import NoBus, find, find_all
+from palpate_bus.runs.operator_requests import NotAnswered, ask
 from palpate_bus.wire.zenoh_config import BusConfigError, session
 
 MEET_S = 1.0

@@ -12,9 +12,10 @@ from palpate_bus.messages import Clock, codec
 from palpate_bus.messages.stamps import NS, time_message
 from palpate_bus.recordings import Recording
 from palpate_bus.runtime.member import Member
-from palpate_bus.wire.liveliness import GraphWatch, Kind
-from palpate_bus.wire.transport import Publisher
-from palpate_bus.wire.zenoh_config import BusOptions, close_session, domain_from_env, open_session
+from palpate_bus.settings import Settings
+from palpate_bus.wire.liveliness import EntityKind, GraphWatch
+from palpate_bus.wire.transport import Sender
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 """Where a replay is to be found when the environment names no endpoint: where ROS 2's rmw_zenoh looks for its router."""
@@ -54,7 +55,7 @@ class Player:
         self.where = f"on {', '.join(options.listen)}" if options.listen else "on the bus of the environment"
         self._session = open_session(options)
         try:
-            domain = domain_from_env()
+            domain = Settings.read().domain
             self._graph = GraphWatch(self._session, domain)
             begin = monotonic_ns()
             while monotonic_ns() - begin < LOOK_NS:  # peers that are there find us within retries of a tenth of a second
@@ -63,7 +64,7 @@ class Player:
             clock = [CLOCK] if CLOCK not in recording.types and topics is None else []
             members: dict[str, Member] = {}
             self._members = members  # a member that is let go takes its tokens along
-            self._publishers: dict[str, Publisher] = {}
+            self._publishers: dict[str, Sender] = {}
             for name in (*self.topics, *clock):
                 row = rules.topics[name]
                 if row.producer not in members:
@@ -85,7 +86,7 @@ class Player:
         """Raises PlayError when a living service of someone else forbids what is played."""
         self._graph.changes()
         own = str(self._session.zid())
-        alive = {e.node for e in self._graph.alive.values() if e.kind is Kind.NODE and e.zid != own}
+        alive = {e.node for e in self._graph.alive.values() if e.kind is EntityKind.NODE and e.zid != own}
         rules = contract()
         for name in self.topics if alive else ():
             row = rules.topics[name]
@@ -166,7 +167,7 @@ def _chosen(recording: Recording, rules: Contract, topics: Collection[str] | Non
 
 
 def _options(listen: str | None) -> BusOptions:
-    options = BusOptions.from_env()
+    options = BusOptions.from_settings(Settings.read())
     if listen:
         return BusOptions(listen=(listen,), connect=options.connect, router=options.router)
     if not (options.listen or options.connect or options.router or options.file):

@@ -134,7 +134,7 @@ def run(
                 result = run_composed(chosen, folder.resolve(), display.tell, observers, own)
             else:
                 pace = 1.0 if realtime else None
-                with SecureBus(folder.resolve(), keys) if secure else nullcontext() as bus:
+                with SecureBus(keys) if secure else nullcontext() as bus:
                     result = run_distributed(
                         chosen, folder.resolve(), display.tell, observers, pace, wallclock, None, bus, own, handover, absent
                     )

@@ -18,7 +18,8 @@ from palpate.run.secure import SecureBus
 from palpate.run.takeover import keep_places
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
-from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, domain_from_env, open_session
+from palpate_bus.settings import Settings
+from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.outcome import Patience, RunFailed
@@ -132,7 +133,7 @@ def conduct(
     """
     begin = perf_counter() if begin is None else begin
     collector = Collector(tree=tree)
-    domain = domain_from_env()
+    domain = Settings.read().domain
     rules = contract()
     conductor = Conductor(session, rules, domain, roles, collector, patience, realtime, SIM_LIMIT, wallclock, handover_s)
 

@@ -22,7 +22,8 @@ from palpate.__main__ import FIXED
 from palpate.run.forks import Child, Forks
 from palpate.run.secure import SecureBus
 from palpate_bus.runs.announcement import Announcement, Run
-from palpate_bus.wire.zenoh_config import domain_from_env, mesh
+from palpate_bus.settings import Settings
+from palpate_bus.wire.zenoh_config import mesh
 
 COMPOSE = "docker-compose.yml"
 BARRIER = ("robot", "control", "tissue")
@@ -143,7 +144,7 @@ class LocalProcesses:
         if secure is not None:
             self.bus = {role: secure.options(role) for role in bus}
             endpoints = dict.fromkeys(bus, secure.endpoint)
-        domain = domain_from_env()
+        domain = Settings.read().domain
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
         self._announcement = Announcement(
             Run(

@@ -12,8 +12,8 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn
 from palpate.run.result import Progress as RunProgress
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runs.desk import WORDS
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
+from palpate_bus.runs.operator_requests import WORDS
 
 PHASES = {
     getattr(ExamState, f"PHASE_{name}"): name.lower()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import logging
 import shutil
 import socket
 import tempfile
@@ -11,31 +9,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from palpate_bus.security.access import ROUTER
-from palpate_bus.security.denials import Denial
-from palpate_bus.security.guard import Guard
+from palpate_bus.contract import contract
+from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init, read
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
-
-log = logging.getLogger(__name__)
-
-DENIALS_FILE = "denials.json"
-"""In the folder of the run, written at its end when the router turned anyone away."""
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, open_session
 
 
 class SecureBus:
     """A secure router for one run; use it as a context manager."""
 
-    def __init__(self, out: Path, keys: Path | None = None) -> None:
+    def __init__(self, keys: Path | None = None) -> None:
         """`keys`: a folder made by `palpate keys init`; without it, keys are made for this run alone.
 
         Raises BusConfigError when the folder lacks a member or a certificate has expired.
         """
-        self._out = out
         self._own = None if keys else Path(tempfile.mkdtemp(prefix="palpate-keys-"))
         self.keys = (keys or self._own or Path()).resolve()
         self.endpoint = f"tls/127.0.0.1:{_free_port()}"
-        self.denials: list[Denial] = []
 
     def options(self, role: str) -> BusOptions:
         """How a role joins."""
@@ -53,18 +43,15 @@ class SecureBus:
         try:
             if self._own is not None:
                 init(self._own, days=2)
-            self._guard = Guard(self.keys / ROUTER, self.endpoint).__enter__()
+            options = BusOptions(mode="router", listen=(self.endpoint,), tls=self.keys / ROUTER)
+            self._router = open_session(options, access_control(contract()))
         except BaseException:
             self._throw_away()
             raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.denials = self._guard.denials()
-        self._guard.close()
-        if self.denials:
-            text = json.dumps([denial.as_dict() for denial in self.denials], indent=2)
-            (self._out / DENIALS_FILE).write_text(text + "\n", encoding="utf-8")
+        close_session(self._router)
         self._throw_away()
 
     def _throw_away(self) -> None:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Mapping
 from enum import StrEnum
 from functools import cache
 from importlib import resources
@@ -15,6 +15,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from palpate_bus.messages import codec
+from palpate_bus.settings import Settings
 
 MS = 1_000_000
 """Nanoseconds in a millisecond."""
@@ -194,23 +195,20 @@ def parse(text: str) -> Contract:
     return Contract.model_validate(raw)
 
 
-def with_periods(text: str, periods: str) -> str:
-    """A contract's text with other periods of roles: `periods` is "role=ms,...", as in "control=5". For experiments.
+def with_periods(text: str, periods: Mapping[str, int]) -> str:
+    """A contract's text with other periods of roles: `periods` gives them by role [ms]. For experiments.
 
-    A role's periodic topics that would come more often than it steps come at each of its steps. Raises ValueError that names the
-    entry and what is wanted.
+    A role's periodic topics that would come more often than it steps come at each of its steps. Raises ValueError that names a
+    role that there is not.
     """
     document = yaml.safe_load(text)
-    for entry in periods.split(","):
-        role, _, number = (part.strip() for part in entry.partition("="))
-        if role not in document["roles"] or not number.isdigit() or int(number) < 1:
-            raise ValueError(
-                f"PALPATE_PERIODS: {entry!r}: want ROLE=MILLISECONDS with ROLE one of {', '.join(document['roles'])}"
-            )
-        document["roles"][role]["period_ms"] = int(number)
+    for role, period_ms in periods.items():
+        if role not in document["roles"]:
+            raise ValueError(f"PALPATE_PERIODS: there is no role {role!r}; roles are {', '.join(document['roles'])}")
+        document["roles"][role]["period_ms"] = period_ms
         for topic in document["topics"].values():
             if topic["producer"] == role and "period_ms" in topic:
-                topic["period_ms"] = -(-topic["period_ms"] // int(number)) * int(number)
+                topic["period_ms"] = -(-topic["period_ms"] // period_ms) * period_ms
     return yaml.safe_dump(document, sort_keys=False)
 
 
@@ -218,5 +216,5 @@ def with_periods(text: str, periods: str) -> str:
 def contract() -> Contract:
     """The contract of this installation; PALPATE_PERIODS may set other periods, see `with_periods`."""
     text = resources.files("palpate_bus.contract").joinpath("contract.yaml").read_text(encoding="utf-8")
-    periods = os.environ.get("PALPATE_PERIODS")
+    periods = Settings.read().periods
     return parse(with_periods(text, periods) if periods else text)

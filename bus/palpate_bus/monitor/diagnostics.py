@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, codec
 from palpate_bus.messages.stamps import header
-from palpate_bus.monitor.health import Seen, TopicHealth
+from palpate_bus.monitor.health import SeenViolation, TopicHealth
 
 RECENT_S = 3.0
 """A violation that was last seen longer ago than this is over: a warning, no error any more."""
@@ -14,18 +14,18 @@ PREFIX = "palpate/topic/"
 """Before the topic's name: ROS tools group by path."""
 
 
-def topic_statuses(health: Iterable[TopicHealth], active: Iterable[Seen], now: float) -> list[codec.Message]:
+def topic_statuses(health: Iterable[TopicHealth], active: Iterable[SeenViolation], now: float) -> list[codec.Message]:
     """A status a topic. ERROR while the contract is violated, WARN when it was, STALE when nobody sends the topic.
 
     `now` [s] is the monitor's clock.
     """
-    by_topic: dict[str, list[Seen]] = {}
+    by_topic: dict[str, list[SeenViolation]] = {}
     for seen in active:
         by_topic.setdefault(seen.violation.topic, []).append(seen)
     return [_status(row, sorted(by_topic.get(row.topic.name, []), key=lambda seen: seen.last), now) for row in health]
 
 
-def _status(row: TopicHealth, found: list[Seen], now: float) -> codec.Message:
+def _status(row: TopicHealth, found: list[SeenViolation], now: float) -> codec.Message:
     level, message = _judged(row, found, now)
     values = [KeyValue("sent_by", ", ".join(row.senders))]
     if row.heard:
@@ -38,7 +38,7 @@ def _status(row: TopicHealth, found: list[Seen], now: float) -> codec.Message:
     return DiagnosticStatus(level, f"{PREFIX}{row.topic.name}", message, row.topic.producer, values)
 
 
-def _judged(row: TopicHealth, found: list[Seen], now: float) -> tuple[int, str]:
+def _judged(row: TopicHealth, found: list[SeenViolation], now: float) -> tuple[int, str]:
     """Level and words."""
     if found:
         worst = found[-1]
@@ -55,10 +55,10 @@ def _judged(row: TopicHealth, found: list[Seen], now: float) -> tuple[int, str]:
     return DiagnosticStatus.OK, "rests" if rests else "as the contract says"
 
 
-def _how_often(seen: Seen) -> str:
+def _how_often(seen: SeenViolation) -> str:
     return "once" if seen.count == 1 else f"{seen.count} times"
 
 
-def diagnostics(health: Iterable[TopicHealth], active: Iterable[Seen], t: int, now: float) -> codec.Message:
+def diagnostics(health: Iterable[TopicHealth], active: Iterable[SeenViolation], t: int, now: float) -> codec.Message:
     """The statuses as `diagnostic_msgs/DiagnosticArray` stamped `t` [ns]."""
     return DiagnosticArray(header(t), topic_statuses(health, active, now))

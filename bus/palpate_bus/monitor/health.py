@@ -1,4 +1,4 @@
-"""How a topic is, and what is wrong with it: what a monitor says."""
+"""The findings of a monitor: the health of each topic, and violations of the contract."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from palpate_bus.contract.checker import Kind
 
 @dataclass(frozen=True)
 class Violation:
-    """One thing that is not as the contract says."""
+    """One violation of the contract."""
 
     topic: str
     sender: str
@@ -25,7 +25,7 @@ class Violation:
 
 
 @dataclass
-class Seen:
+class SeenViolation:
     """A violation with how often and when it was seen, by the caller's clock [s]."""
 
     violation: Violation

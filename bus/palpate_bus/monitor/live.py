@@ -1,4 +1,4 @@
-"""A monitor on a bus: listens to every topic of the contract under any type, to who is there, and to what services report.
+"""A monitor on a bus: it listens to every topic of the contract under any type, to liveliness tokens and to reports of services.
 
     with session(run.options()) as bus:
         monitor = LiveMonitor(bus, contract(), run.domain, wallclock=run.runtime == "wallclock")
@@ -47,7 +47,7 @@ class RoleReport:
 
 
 class LiveMonitor:
-    """A `Monitor` with ears. `topics` limits it to some; by default it hears all. See `listen`."""
+    """A `Monitor` that listens to a bus, to all topics or to `topics` only; see `listen`."""
 
     def __init__(
         self, session: zenoh.Session, rules: Contract, domain: int, topics: Iterable[str] | None = None, wallclock: bool = False
@@ -58,7 +58,7 @@ class LiveMonitor:
         self.offsets: dict[str, float] = {}
         """Smallest age [ms] of a message by topic: negative when the sender's clock is ahead of ours."""
         self._session, self._domain = session, domain
-        self._ears: dict[str, _Ear] = {}
+        self._listeners: dict[str, _Listener] = {}
         self.listen(rules.topics if topics is None else topics)
         report, control = "palpation_msgs/msg/ServiceReport", "palpation_msgs/msg/RunControl"
         self._reports: Any = session.declare_subscriber(
@@ -72,10 +72,10 @@ class LiveMonitor:
     def listen(self, topics: Iterable[str]) -> None:
         """Listens to `topics` and no others from now on."""
         chosen = set(topics)
-        for name in self._ears.keys() - chosen:
-            self._ears.pop(name).close()
-        for name in chosen - self._ears.keys():
-            self._ears[name] = _Ear(self._session, self.monitor.rules.topics[name], self._domain)
+        for name in self._listeners.keys() - chosen:
+            self._listeners.pop(name).close()
+        for name in chosen - self._listeners.keys():
+            self._listeners[name] = _Listener(self._session, self.monitor.rules.topics[name], self._domain)
         self.monitor.listen(chosen, monotonic())
 
     def poll(self) -> list[Violation]:
@@ -85,18 +85,18 @@ class LiveMonitor:
         self.monitor.see(self.graph.alive.values(), now)
         self._hear_control()
         self._hear_reports(now)
-        for ear in self._ears.values():
-            for sent, sequence, gid, payload in ear.drain(self.monitor, now):
-                self.monitor.hear(ear.topic.name, sent, sequence, gid, payload, now)
+        for listener in self._listeners.values():
+            for sent, sequence, gid, payload in listener.drain(self.monitor, now):
+                self.monitor.hear(listener.topic.name, sent, sequence, gid, payload, now)
                 age = (time_ns() - sent) / 1e6
-                self.offsets[ear.topic.name] = min(age, self.offsets.get(ear.topic.name, age))
+                self.offsets[listener.topic.name] = min(age, self.offsets.get(listener.topic.name, age))
         return self.monitor.look(monotonic(), time_ns())
 
     def close(self) -> None:
         """Stops listening."""
         self.graph.close()
-        for ear in self._ears.values():
-            ear.close()
+        for listener in self._listeners.values():
+            listener.close()
         self._reports.undeclare()
         self._control.undeclare()
 
@@ -119,7 +119,7 @@ class LiveMonitor:
                 self.reports[message.role] = RoleReport(message.state, int(message.tick), message.waiting_for, now)
 
 
-class _Ear:
+class _Listener:
     """Listens to one topic under any type and hash."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:

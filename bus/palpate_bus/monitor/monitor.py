@@ -1,6 +1,6 @@
 """The contract, enforced live: what every topic of a bus does against its row, from the contract alone.
 
-`Monitor` is the judgement, without any transport: give it what was heard (`hear`) and who is there (`see`), and ask it (`look`).
+`Monitor` judges, without any transport: it is given messages (`hear`) and the nodes on the bus (`see`), and is asked (`look`).
 `LiveMonitor` in `live` listens on a bus for it. A violation names topic, sender, what is expected and what came.
 """
 
@@ -13,19 +13,18 @@ from palpate_bus.contract import MS, Contract, Topic
 from palpate_bus.contract.checker import Checker, Kind
 from palpate_bus.messages import codec
 from palpate_bus.monitor import pace
-from palpate_bus.monitor.health import Seen, TopicHealth, Violation
+from palpate_bus.monitor.health import SeenViolation, TopicHealth, Violation
 from palpate_bus.monitor.streams import WINDOW_S, Stream
-from palpate_bus.wire.liveliness import Entity
-from palpate_bus.wire.liveliness import Kind as EntityKind
+from palpate_bus.wire.liveliness import Entity, EntityKind
 
 
 class Monitor:
-    """Judges a bus by the contract. `wallclock` says whether time on it is the wall's (else simulated)."""
+    """Judges a bus by the contract; `wallclock`: the time on it is wall time, not simulated time."""
 
     def __init__(self, rules: Contract, wallclock: bool = False) -> None:
         self.rules = rules
         self.wallclock = wallclock
-        self.active: dict[tuple[str, str, Kind, str], Seen] = {}
+        self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
         """Every violation so far, by (topic, sender, kind, field)."""
         self.time = pace.BusTime(0.0, 0, None)
         """How the bus's time moves, as of the last look."""
@@ -41,7 +40,7 @@ class Monitor:
         self._news: list[Violation] = []
 
     def listen(self, names: Iterable[str], now: float) -> None:
-        """Says which topics are listened to from now on. What was last known of the others is kept."""
+        """Sets the topics that are listened to from now on. The last findings on the others are kept."""
         chosen = frozenset(names)
         for name in self.listening - chosen:
             if self._streams[name]:
@@ -53,7 +52,7 @@ class Monitor:
         self.listening = chosen
 
     def see(self, entities: Iterable[Entity], now: float) -> None:
-        """Takes who is on the bus (`GraphWatch.alive.values()`): names for senders, types and hashes, who may send what."""
+        """Takes the entities on the bus (`GraphWatch.alive.values()`): they give senders their names, types and hashes."""
         present = list(entities)
         self._nodes = {entity.gid: entity.node for entity in present}
         self._publishers = {}
@@ -117,8 +116,8 @@ class Monitor:
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:
-                    for fault in pace.faults(topic, stream, self.time, self.wallclock, now):
-                        self._note(topic, stream.sender, fault.kind, fault.expected, fault.got, now)
+                    for problem in pace.problems(topic, stream, self.time, self.wallclock, now):
+                        self._note(topic, stream.sender, problem.kind, problem.expected, problem.got, now)
         self._judge_unheard(now)
         news, self._news = self._news, []
         return news
@@ -152,7 +151,7 @@ class Monitor:
         )  # fmt: skip
 
     def _kept_health(self, kept: TopicHealth) -> TopicHealth:
-        """A topic as it was when it was last listened to, with who is there and what was seen by now."""
+        """A topic as it was when it was last listened to, with its present senders and violations."""
         there = tuple(sorted(self._publishers.get(kept.topic.name, set())))
         return replace(kept, senders=there, violations=self._violations(kept.topic))
 
@@ -173,7 +172,7 @@ class Monitor:
             seen.violation = Violation(topic.name, sender, kind, expected, got, path)
             return
         violation = Violation(topic.name, sender, kind, expected, got, path)
-        self.active[key] = Seen(violation, now, now)
+        self.active[key] = SeenViolation(violation, now, now)
         self._news.append(violation)
 
     def _check_sender(self, topic: Topic, sender: str, now: float) -> None:
@@ -198,7 +197,7 @@ class Monitor:
             self._note(topic, stream.sender, Kind.STAMP, expected, f"{stamp} ns", now)
 
     def _judge_unheard(self, now: float) -> None:
-        """Topics whose producer is there but from whom nothing came."""
+        """Notes topics whose producer is on the bus but sent nothing."""
         for name, nodes in self._publishers.items():
             topic = self.rules.topics[name]
             if name not in self.listening:

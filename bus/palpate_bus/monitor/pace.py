@@ -1,8 +1,8 @@
 """Rate, silence and age of a periodic topic against its row, measured in the bus's own time.
 
-A rate is messages by what their own stamps say has passed, so that a run at a third of real time has right rates, and a busy
-monitor judges no worse; in wall-clock mode by their source times. A topic is silent when nothing came while the bus's time, the
-median of all periodic topics' stamps, went on.
+A rate is the number of messages over the time that passed by their own stamps, so that a run at a third of real time has right
+rates and a busy monitor does not misjudge; in wall-clock mode by their source times. A topic is silent when nothing came while
+the time of the bus, the median of all periodic topics' stamps, went on.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class BusTime(NamedTuple):
         return self.passed / 1e9 / self.seconds if self.now is not None else None
 
 
-class Fault(NamedTuple):
+class PaceProblem(NamedTuple):
     """What is wrong with the pace of a stream."""
 
     kind: Kind
@@ -67,7 +67,7 @@ def bus_time(streams: Iterable[Stream], wallclock: bool) -> BusTime:
     return BusTime(seconds, int(progress), int(median(newest)))
 
 
-def faults(topic: Topic, stream: Stream, time: BusTime, wallclock: bool, now: float) -> Iterator[Fault]:
+def problems(topic: Topic, stream: Stream, time: BusTime, wallclock: bool, now: float) -> Iterator[PaceProblem]:
     """What is wrong with rate and age of a periodic topic's stream; `now` [s] is the clock by which it is marked."""
     own = stream.passed()
     if now - stream.began < GRACE_S or own.seconds < GRACE_S:
@@ -75,14 +75,14 @@ def faults(topic: Topic, stream: Stream, time: BusTime, wallclock: bool, now: fl
     wanted = f"{1000 / topic.period_ms:g} {'Hz' if wallclock else 'Hz of simulated time'}"
     if not own.messages:
         if is_due(topic, time) and time.passed > SILENCE_NS:
-            yield Fault(Kind.SILENT, wanted, f"nothing for {own.seconds:.1f} s")
+            yield PaceProblem(Kind.SILENT, wanted, f"nothing for {own.seconds:.1f} s")
         return
     spent = own.sent if wallclock else own.stamps
     if spent:
         off = abs(own.messages - spent / topic.period)
         if off > LEAST_OFF and off > RATE_TOLERANCE * spent / topic.period:
             unit = wanted.partition(" ")[2]
-            yield Fault(Kind.RATE, wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
+            yield PaceProblem(Kind.RATE, wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
     yield from _age(topic, stream, time, wallclock)
 
 
@@ -91,14 +91,14 @@ def is_due(topic: Topic, time: BusTime) -> bool:
     return time.passed / topic.period > LEAST_OFF
 
 
-def _age(topic: Topic, stream: Stream, time: BusTime, wallclock: bool) -> Iterator[Fault]:
+def _age(topic: Topic, stream: Stream, time: BusTime, wallclock: bool) -> Iterator[PaceProblem]:
     if topic.max_age_ms is None or len(stream.ages) < AGES:
         return
     if wallclock:
         age = median(stream.ages)
         if age > topic.max_age_ms + topic.period_ms:
-            yield Fault(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{age:.0f} ms")
+            yield PaceProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{age:.0f} ms")
     elif stream.stamp is not None and time.now is not None:
         behind = (time.now - stream.stamp) / MS - topic.period_ms
         if behind > topic.max_age_ms + SLACK_MS * max(time.progress or 0.0, 1.0):
-            yield Fault(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{behind:.0f} ms behind the others")
+            yield PaceProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{behind:.0f} ms behind the others")

@@ -1,1 +1,1 @@
-"""The runs of this machine: announced by who starts them, found by tools and operators in other terminals."""
+"""The runs of this machine: how they are announced, found and operated from other terminals."""

@@ -1,11 +1,7 @@
 """Where the runs of this machine are, so that a tool in another terminal finds the bus of a run without guessing.
 
-Who starts a run announces it: one small JSON file a run in `folder()`, which only its user can read. The file is locked as long
+Whoever starts a run announces it by a small JSON file in `folder()`, which only its user can read. The file is locked as long
 as its writer lives, so a run that was killed leaves a file that nobody holds; `live` removes those.
-
-| variable | meaning |
-|---|---|
-| `PALPATE_RUNS` | the folder; by default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<user id>` |
 """
 
 from __future__ import annotations
@@ -21,6 +17,7 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions
 
 PACKAGES = ("palpate", "eclipse-zenoh", "rosbags", "numpy")
@@ -38,7 +35,7 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Run:
-    """A run that is on: who started it and how to join its bus."""
+    """A run in progress: the process that started it, and how to join its bus."""
 
     name: str
     """The scenario."""
@@ -52,7 +49,7 @@ class Run:
     out: str = ""
     """The results folder."""
     keys: str | None = None
-    """Of a secure run: the folder of everyone's certificates."""
+    """The folder of all certificates, for a secure run."""
     pid: int = field(default_factory=os.getpid)
     started: float = field(default_factory=time.time)
     """Wall time [s]."""
@@ -87,10 +84,10 @@ class Announcement:
 
 def folder() -> Path:
     """The folder of announcements, made when it is not there. Raises OSError when it is another user's."""
-    named = os.environ.get("PALPATE_RUNS")
+    named = Settings.read().runs
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if named:
-        path = Path(named)
+        path = named
     elif runtime and os.access(runtime, os.W_OK):
         path = Path(runtime) / "palpate"
     else:

@@ -1,21 +1,18 @@
-"""Which bus a user means who comes from another terminal.
+"""Finds the bus that a tool in another terminal should join.
 
-In this order: `--connect`; `--run`; what the environment says (PALPATE_CONNECT, PALPATE_ROUTER, PALPATE_ZENOH_CONFIG); the runs
-that are announced on this machine (`runs`).
+The first of these that names one: `--connect`; `--run`; PALPATE_CONNECT, PALPATE_ROUTER or PALPATE_ZENOH_CONFIG; the runs that
+are announced on this machine.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from palpate_bus.runs.announcement import Run, folder, live, matching
 from palpate_bus.security.access import OPERATOR
-from palpate_bus.wire.zenoh_config import BusOptions, domain_from_env
-
-BUS = ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG")
-"""Variables that name a bus."""
+from palpate_bus.settings import Settings
+from palpate_bus.wire.zenoh_config import BusOptions
 
 
 class NoBus(RuntimeError):
@@ -23,7 +20,7 @@ class NoBus(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Target:
+class BusTarget:
     """A bus to join."""
 
     options: BusOptions
@@ -41,14 +38,16 @@ class Target:
         return self.run.options(OPERATOR) if self.run else self.options
 
 
-def find_all(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> list[Target]:
-    """Every bus that the user may mean, at least one. Raises NoBus, and BusConfigError for an environment that cannot work."""
-    if connect or (chosen is None and any(os.environ.get(name) for name in BUS)):
-        options = BusOptions(connect=tuple(connect)) if connect else BusOptions.from_env()
-        return [Target(options, domain_from_env() if domain is None else domain)]
+def find_all(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> list[BusTarget]:
+    """Every bus that the user may mean, at least one. Raises NoBus, and BusConfigError for settings that cannot work."""
+    settings = Settings.read()
+    named = settings.connect or settings.router or settings.zenoh_config
+    if connect or (chosen is None and named):
+        options = BusOptions(connect=tuple(connect)) if connect else BusOptions.from_settings(settings)
+        return [BusTarget(options, settings.domain if domain is None else domain)]
     found = matching(chosen)
     if found:
-        return [Target(run.options(), run.domain if domain is None else domain, run) for run in found]
+        return [BusTarget(run.options(), run.domain if domain is None else domain, run) for run in found]
     if chosen is not None:
         raise NoBus(f"no run {chosen!r} is on; on are: {_names(live()) or 'none'}")
     raise NoBus(
@@ -57,7 +56,7 @@ def find_all(connect: Sequence[str] | None = None, chosen: str | None = None, do
     )
 
 
-def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> Target:
+def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> BusTarget:
     """The one bus that the user means. Raises NoBus, also where it could be several, and BusConfigError."""
     found = find_all(connect, chosen, domain)
     if len(found) > 1:

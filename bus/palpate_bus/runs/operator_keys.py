@@ -1,4 +1,4 @@
-"""An operator's hand on a run: single keys of the terminal in which it is watched.
+"""Single keys by which an operator stops or releases a run, in the terminal that shows it.
 
 | key | |
 |---|---|
@@ -6,7 +6,7 @@
 | e | emergency stop: the driver holds the arm safely |
 | r | release: the examination goes on where it was |
 
-Only where standard input is a terminal that is ours; otherwise no key is ever read.
+Keys are read only if standard input is a terminal and this process is in its foreground.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Any, Self
 
 KEYS = {"s": "soft-stop", "e": "stop", "r": "release"}
-"""Words of `desk` by key."""
+"""Words of `operator_requests` by key."""
 HINT = "keys: s soft stop, e emergency stop, r release"
 
 

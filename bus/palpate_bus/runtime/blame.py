@@ -1,4 +1,4 @@
-"""Where a service's wall time goes: compute, encoding, decoding, sending, transport and waiting for others."""
+"""Where the wall time of a service goes: computing, encoding, decoding, sending, transport and waiting for others."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass(slots=True)
 class Blame:
-    """Accumulated wall time [ns] of one service, and on whom it waited."""
+    """Accumulated wall time [ns] of one service, and for which roles it waited."""
 
     compute: int = 0
     """Inside `step`, without decoding."""

@@ -11,8 +11,8 @@ from math import lcm
 from typing import Any
 
 from palpate_bus.contract import MS, Contract, Topic, contract
+from palpate_bus.runtime.failure import described
 from palpate_bus.runtime.lockstep import OutputPort, Received, Sent, Stepper, run_hash
-from palpate_bus.runtime.suspects import failure
 from palpate_bus.service import Service
 
 Tap = Callable[[Topic, bytes, int, int], None]
@@ -29,7 +29,7 @@ class ServiceFailed(RuntimeError):
     def __init__(self, stepper: Stepper, t: int, cause: Exception) -> None:
         self.role = stepper.role.name
         self.t = t
-        self.why = failure(cause, stepper.buffers.values())
+        self.why = described(cause, stepper.buffers.values())
         """The cause, with the inputs that are not as they should be."""
         super().__init__(f"{self.role} failed at tick {t / 1e9:.3f} s: {self.why}")
 
@@ -95,7 +95,7 @@ class Composed:
             except Exception as error:
                 if not stepper.role.observer or stepper.role.name == CONDUCTOR:
                     raise ServiceFailed(stepper, t, error) from error
-                self._leave_out(stepper.role.name, t, failure(error, stepper.buffers.values()))
+                self._leave_out(stepper.role.name, t, described(error, stepper.buffers.values()))
                 self._schedule = _schedule(tuple(one for role, one in self.steppers.items() if role not in self.lost))
                 continue
             if sent:
@@ -139,6 +139,6 @@ class Composed:
 
 
 def _schedule(steppers: Sequence[Stepper]) -> tuple[tuple[Stepper, ...], ...]:
-    """Who steps at each tick of a cycle, after which it is the same again."""
+    """The services that step at each tick of one cycle; every cycle is the same."""
     cycle = lcm(*(stepper.role.period // MS for stepper in steppers))
     return tuple(tuple(one for one in steppers if not tick * MS % one.role.period) for tick in range(cycle))

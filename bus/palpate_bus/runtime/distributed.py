@@ -1,95 +1,32 @@
 """Distributed lockstep: one service a process, over zenoh, conservative synchronisation with no master in the data path.
 
-A node waits until each blocking input has advanced far enough, steps, and sends. The conductor says only how far simulated time
-may go (grants), who was lost, and when to stop. A node never hangs: it leaves when the conductor falls silent.
+A node waits until each blocking input has advanced far enough, steps, and sends. The conductor only says how far simulated time
+may go (grants), which roles were lost, and when to stop. A node never hangs: it leaves when the conductor falls silent.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 from contextlib import suppress
-from time import monotonic, perf_counter_ns, time_ns
+from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
 
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.messages import Advance, RunControl, ServiceReport, codec
+from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
+from palpate_bus.runtime.failure import described
 from palpate_bus.runtime.lockstep import NEVER, InputBuffer, Received, Sent, Stepper
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.outlet import Outlet
-from palpate_bus.runtime.suspects import failure
+from palpate_bus.runtime.output import ServiceOutput
 from palpate_bus.service import Service
-from palpate_bus.wire.transport import Sample
+from palpate_bus.wire.transport import ReceivedSample
 
 log = logging.getLogger(__name__)
 
 POLL_S = 0.05
 """How often a waiting node looks for control messages."""
-PROGRESS_S = 0.2
-"""How often a node reports its progress, by wall clock."""
-CONDUCTOR_SILENT_S = 10.0
-"""After this long without a word from the conductor a node leaves."""
-CONDUCTOR_AWAITED_S = 120.0
-"""The same before its first word: containers on a busy machine start tens of seconds apart."""
-
-
-class RunAborted(RuntimeError):
-    """The conductor ended the run, or fell silent."""
-
-
-class Link:
-    """A node's side of the conversation with the conductor: control in, reports out."""
-
-    def __init__(self, member: Member) -> None:
-        self.role = member.role
-        self._member = member
-        self._control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
-        self._report = member.internal_publisher(f"palpate/report/{member.role}", "palpation_msgs/msg/ServiceReport", "event")
-        self._sequence = 0
-        self._decode = codec.decoder("palpation_msgs/msg/RunControl")
-        self._encode = codec.encoder("palpation_msgs/msg/ServiceReport")
-        self._last_word = monotonic()
-        self._patience = CONDUCTOR_AWAITED_S
-        self._last_report = 0.0
-
-    def poll(self, timeout: float | None = None) -> Any | None:
-        """The next control message, or None. Raises RunAborted when told so or when the conductor is silent."""
-        while (sample := self._control.get(timeout)) is not None:
-            self._last_word = monotonic()
-            self._patience = CONDUCTOR_SILENT_S
-            try:
-                message = self._decode(sample.payload)
-            except codec.CodecError:
-                self._control.garbage += 1
-                continue
-            if message.command == RunControl.ABORT:
-                raise RunAborted(message.reason)
-            return message
-        if monotonic() - self._last_word > self._patience:
-            raise RunAborted(f"no word from the conductor for {self._patience:.0f} s")
-        return None
-
-    def report(self, state: int, tick: int, waiting_for: str = "", detail: object = None) -> None:
-        """Sends a report now."""
-        self._sequence += 1
-        self._last_report = monotonic()
-        text = "" if detail is None else json.dumps(detail)
-        message = ServiceReport(state, self.role, tick, waiting_for, text)
-        self._report.put(self._encode(message), self._sequence)
-
-    def progress(self, tick: int, waiting_for: str = "") -> None:
-        """Reports progress if the last report is old enough."""
-        if monotonic() - self._last_report > PROGRESS_S:
-            for complaint in self._member.complaints():
-                log.error("%s", complaint)
-            self.report(ServiceReport.PROGRESS, tick, waiting_for)
-
-    @property
-    def garbage(self) -> int:
-        """Undecodable control messages."""
-        return self._control.garbage
 
 
 class LockstepNode:
@@ -100,8 +37,9 @@ class LockstepNode:
         self._service = service
         self._stepper = Stepper(service, rules)
         self._role = self._stepper.role
-        self._link = Link(member)
-        self._outlet = Outlet(member)
+        self._now = member.transport.now
+        self._link = ConductorLink(member)
+        self._output = ServiceOutput(member)
         self._data = {name: member.subscription(buffer.topic) for name, buffer in self._stepper.buffers.items()}
         advance_type = "palpation_msgs/msg/Advance"
         producers = sorted({b.topic.producer for b in self._stepper.buffers.values() if b.edge.blocking and not b.topic.periodic})
@@ -127,8 +65,8 @@ class LockstepNode:
         try:
             self._handshake()
             latched = self._stepper.start()
-            self._outlet.send(latched)
-            self._outlet.record(latched, 0)
+            self._output.send(latched)
+            self._output.record(latched, 0)
             self._loop()
             self._report_end()
         except RunAborted:
@@ -136,8 +74,8 @@ class LockstepNode:
             raise
         except Exception as error:
             with suppress(Exception):
-                self._outlet.flush(self._tick)  # what others have heard belongs in the recording
-            words = failure(error, self._stepper.buffers.values())
+                self._output.flush(self._tick)  # what others have heard belongs in the recording
+            words = described(error, self._stepper.buffers.values())
             self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
             with suppress(Exception):
                 self._service.finish()  # what it has open is closed
@@ -154,7 +92,7 @@ class LockstepNode:
             if message is None:
                 continue
             if message.command == RunControl.HELLO:
-                self._outlet.hello()
+                self._output.hello()
                 if self._advance_publisher is not None:
                     self._advance_publisher.hello()
                 missing = [s.key.split("/RIHS01")[0] for s in inputs if not s.heard]
@@ -176,7 +114,7 @@ class LockstepNode:
     def _loop(self) -> None:
         t = 0
         period = self._role.period
-        stepper, outlet, blocking = self._stepper, self._outlet, self._blocking
+        stepper, output, blocking = self._stepper, self._output, self._blocking
         while True:
             if t > self._horizon and not self._await_horizon(t):
                 return
@@ -188,11 +126,11 @@ class LockstepNode:
             everything: list[Sent] = []
             for sent in stepper.parts(t):
                 start = perf_counter_ns()
-                outlet.send(sent)
+                output.send(sent)
                 stepper.blame.send += perf_counter_ns() - start
                 everything += sent
             start = perf_counter_ns()
-            outlet.record(everything, t)
+            output.record(everything, t)
             if self._advance_publisher is not None:
                 self._advance_sequence += 1
                 sequences = [stepper.ports[name].sequence for name in self._own_events]
@@ -221,7 +159,7 @@ class LockstepNode:
         data = self._data[buffer.topic.name]
         advance = self._advances.get(buffer.topic.producer) if buffer.topic.event else None
         waited = False
-        sample: Sample | None = None
+        sample: ReceivedSample | None = None
         while not buffer.ready(t):
             source = data if advance is None or buffer.waits_for_data else advance
             sample = source.get(0)
@@ -239,9 +177,9 @@ class LockstepNode:
                 self._settle(buffer.topic.producer, sample)
         if waited and sample is not None:
             duration = perf_counter_ns() - begin
-            self._stepper.blame.waited(buffer.topic.producer, duration, time_ns() - sample.sent)
+            self._stepper.blame.waited(buffer.topic.producer, duration, self._now() - sample.sent)
 
-    def _settle(self, producer: str, sample: Sample) -> None:
+    def _settle(self, producer: str, sample: ReceivedSample) -> None:
         advance = self._decode_advance(sample.payload)
         for name, sequence in zip(self._event_topics[producer], advance.sequences, strict=True):
             buffer = self._stepper.buffers.get(name)
@@ -256,7 +194,7 @@ class LockstepNode:
 
     def _report_end(self) -> None:
         """Reports digests, blame and the service's own facts, and waits for the conductor's receipt."""
-        self._outlet.flush(self._tick)
+        self._output.flush(self._tick)
         facts = dict(self._service.finish())
         subscriptions = (*self._data.values(), *self._advances.values())
         detail = {

@@ -1,7 +1,7 @@
 """A role's membership of the bus: its session, its liveliness tokens, and how it publishes and subscribes by the contract.
 
 What it declares shows in the ROS graph (`ros2 node list`, `ros2 topic info`). A peer that publishes or wants a topic of the
-contract with another type or hash can never meet us; that is silent in ROS 2, so `complaints` says it.
+contract with another type or hash never connects with ours. ROS 2 is silent about that, so `complaints` reports it.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ import zenoh
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages import codec
-from palpate_bus.runtime.faults import faulty
 from palpate_bus.wire.liveliness import GraphWatch, NodeTokens, mismatches
 from palpate_bus.wire.rmw import message_key, topic_key
-from palpate_bus.wire.transport import Publisher, Subscription
+from palpate_bus.wire.transport import Sender, Subscription, Transport
 
 CHECK_S = 0.5
 """How often the graph is looked at."""
@@ -24,8 +23,12 @@ CHECK_S = 0.5
 class Member:
     """One role on the bus."""
 
-    def __init__(self, session: zenoh.Session, role: str, rules: Contract, domain: int) -> None:
+    def __init__(
+        self, session: zenoh.Session, role: str, rules: Contract, domain: int, transport: Transport | None = None
+    ) -> None:
+        """`transport` carries its messages; by default zenoh does, as the contract says."""
         self.session = session
+        self.transport = transport or Transport(session)
         self.role = role
         self.rules = rules
         self.domain = domain
@@ -35,32 +38,30 @@ class Member:
         self._checked = 0.0
         self._changed = False
 
-    def publisher(self, topic: Topic) -> Publisher:
+    def publisher(self, topic: Topic) -> Sender:
         """A publisher of a topic of the contract."""
         qos = self.rules.qos[topic.qos]
-        publisher: Publisher = faulty(
-            Publisher(self.session, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos)), topic
-        )
-        return publisher
+        return self.transport.publisher(topic.name, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos))
 
     def subscription(self, topic: Topic, history: bool = False) -> Subscription:
         """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
         self._tokens.subscription(topic, self.rules.qos[topic.qos])
         decode = codec.decoder(topic.type) if topic.open else None
-        return Subscription(self.session, topic_key(topic, self.domain), history, decode)
+        return self.transport.subscription(topic_key(topic, self.domain), history, decode)
 
     def observed(self, topic: Topic) -> str:
         """Declares a subscription that the caller makes; returns the key."""
         self._tokens.subscription(topic, self.rules.qos[topic.qos])
         return topic_key(topic, self.domain)
 
-    def internal_publisher(self, name: str, type_name: str, qos: str) -> Publisher:
+    def internal_publisher(self, name: str, type_name: str, qos: str) -> Sender:
         """A publisher of the runtime's own messages."""
-        return Publisher(self.session, message_key(name, type_name, self.domain), self.rules.qos[qos], self._tokens.node.gid)
+        key = message_key(name, type_name, self.domain)
+        return self.transport.publisher(name, key, self.rules.qos[qos], self._tokens.node.gid)
 
     def internal_subscription(self, name: str, type_name: str) -> Subscription:
         """A subscription to the runtime's own messages."""
-        return Subscription(self.session, message_key(name, type_name, self.domain))
+        return self.transport.subscription(message_key(name, type_name, self.domain))
 
     def complaints(self) -> list[str]:
         """New mismatches of message types on the bus, each said once; looks at most every `CHECK_S`."""

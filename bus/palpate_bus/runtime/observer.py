@@ -1,4 +1,4 @@
-"""An observer's process: outside the barrier, it takes what comes and never slows a producer.
+"""The process of an observer: it is outside the barrier, reads what arrives and never slows a producer.
 
 It sees the latest of the periodic topics, and every message of the others. A recorder is driven by `recording`.
 """
@@ -13,7 +13,7 @@ import zenoh
 
 from palpate_bus.contract import Topic
 from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.runtime.distributed import Link, RunAborted
+from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Received, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.service import Service
@@ -73,7 +73,7 @@ class _Feed:
 
 
 class ObservedService:
-    """A service outside the barrier with its feeds: drained and stepped by whoever owns the thread."""
+    """A service outside the barrier with its feeds: the owner of the thread drains the feeds and steps the service."""
 
     def __init__(self, service: Service, member: Member, lossless: bool = False) -> None:
         """`lossless` keeps every message of every topic, not just the latest of the periodic ones."""
@@ -127,7 +127,7 @@ class ObserverNode:
 
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
-        self._link = Link(member)
+        self._link = ConductorLink(member)
         self._observed = ObservedService(service, member)
 
     def run(self) -> None:

@@ -1,4 +1,4 @@
-"""Who gives way on a machine with fewer cores than services: the calling thread, and the threads that it starts later."""
+"""Priorities for a machine with fewer cores than services, of the calling thread and of the threads that it starts later."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def give_way(niceness: int) -> None:
 
 
 def by_period(period: int) -> int:
-    """Niceness of a service on its own timer: who steps more seldom [ns] gives way (rate-monotonic)."""
+    """Niceness of a service on its own timer: the longer its period [ns], the lower its priority (rate-monotonic)."""
     return next((niceness for least, niceness in _BY_PERIOD if period >= least), 0)
 
 
 def in_the_background() -> None:
     """Puts the calling thread behind others, and the threads that it starts later: call it before zenoh starts its own.
 
-    As batch work they take no core from who is running when they wake, which with the usual policy costs a tick milliseconds; and
-    with a small weight they still go on where others load the machine. SCHED_IDLE would not: a viewer did not even start.
+    As batch work they do not preempt a running thread when they wake, which otherwise costs a tick milliseconds. With little
+    weight they still make progress on a loaded machine; with SCHED_IDLE a viewer did not even start.
     """
     with suppress(OSError, AttributeError):  # Linux
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -1,4 +1,4 @@
-"""The recorder's process: it takes the chunks that every service passes on, and says how far it has written.
+"""The process of the recorder: it takes the chunks that every service sends, and reports up to which tick it has written.
 
 The conductor grants at most a second of simulated time beyond that, so nothing is lost: at worst the run is slower.
 """
@@ -12,10 +12,10 @@ from typing import Any, Protocol, runtime_checkable
 from palpate_bus.contract import Topic
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import nanoseconds
-from palpate_bus.runtime.distributed import Link, RunAborted
+from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.spool import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
@@ -43,11 +43,11 @@ class RecorderNode:
         self._service: Service = service
         self._recorder: RawRecorder = service
         self._topics = member.rules.topics
-        self._link = Link(member)
+        self._link = ConductorLink(member)
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
-        # What observers say (clock, diagnostics, an operator's request) is rare and comes directly; the clock dates the rest.
+        # Messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others.
         observed = [topic for topic, _ in member.rules.inputs(service.role) if member.rules.roles[topic.producer].observer]
         observed.sort(key=lambda topic: topic.name != CLOCK)
         self._observed = [(topic, member.subscription(topic)) for topic in observed]

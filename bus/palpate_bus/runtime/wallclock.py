@@ -1,29 +1,29 @@
 """Wall clock: one service a process, each on its own timer, freshest sample wins: for hardware, real or simulated in real time.
 
 A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
-A late step is counted as an overrun. A critical role has physics, which has to keep time: it catches up tick by tick, up to
-`CATCH_UP`, unless its service drives real hardware, whose physics keeps its own. Whoever else is late, and who is later than
-that, goes on at the present tick: what should have been commanded a while ago helps nobody, and stamps stay on the common
-clock. Nothing waits for anybody. Expiry protects those who depend on a late sample.
+A late step is counted as an overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick
+by tick, unless it is later than `CATCH_UP` or drives real hardware. All others skip to the present tick, since an old command
+helps nobody and stamps must stay on the common clock. No service waits for another; expiry protects the readers of a late sample.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import suppress
-from time import monotonic_ns, perf_counter_ns, sleep, time_ns
+from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
 
 from palpate_bus.contract import MS, Edge
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
-from palpate_bus.runtime.ages import Ages
-from palpate_bus.runtime.distributed import Link, RunAborted
+from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
+from palpate_bus.runtime.failure import described
+from palpate_bus.runtime.latency import LatencyHistogram
 from palpate_bus.runtime.lockstep import NEVER, Received, Sent, Stepper
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.outlet import Outlet
+from palpate_bus.runtime.output import ServiceOutput
 from palpate_bus.runtime.priority import by_period, give_way
-from palpate_bus.runtime.suspects import failure
 from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
@@ -35,15 +35,15 @@ READ_NS = 100_000
 """Two clocks read within this time [ns] were read at once."""
 
 
-def _on_monotonic_clock(wall: int) -> int:
-    """A wall time [ns] on this process's monotonic clock [ns].
+def _on_monotonic_clock(wall: int, now: Callable[[], int]) -> int:
+    """A wall time [ns] on this process's monotonic clock [ns]; `now` reads the wall clock.
 
     Read again when the process was set aside between the readings: that would put this service ahead of the others for good.
     """
     while True:
-        before, now, after = monotonic_ns(), time_ns(), monotonic_ns()
+        before, read, after = monotonic_ns(), now(), monotonic_ns()
         if after - before < READ_NS:
-            return (before + after) // 2 + wall - now
+            return (before + after) // 2 + wall - read
 
 
 class WallClockNode:
@@ -52,8 +52,9 @@ class WallClockNode:
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
         self._stepper = Stepper(service, member.rules, strict=False)
-        self._link = Link(member)
-        self._outlet = Outlet(member)
+        self._now = member.transport.now
+        self._link = ConductorLink(member)
+        self._output = ServiceOutput(member)
         self._data = {
             name: member.subscription(buffer.topic, history=buffer.topic.latched)
             for name, buffer in self._stepper.buffers.items()
@@ -63,7 +64,7 @@ class WallClockNode:
         self.undecodable = 0
         self.overruns = 0
         self.skips = 0
-        self._ages = {name: Ages() for name in self._data}
+        self._ages = {name: LatencyHistogram() for name in self._data}
         self._end: int | None = None
         self._tick = NEVER
 
@@ -73,8 +74,8 @@ class WallClockNode:
             give_way(by_period(self._stepper.role.period))
             epoch = self._await_start()
             latched = self._stepper.start()
-            self._outlet.send(latched)
-            self._outlet.record(latched, 0)
+            self._output.send(latched)
+            self._output.record(latched, 0)
             self._loop(epoch)
             self._finish()
         except RunAborted:
@@ -82,8 +83,8 @@ class WallClockNode:
             raise
         except Exception as error:
             with suppress(Exception):
-                self._outlet.flush(self._tick)  # what others have heard belongs in the recording
-            words = failure(error, self._stepper.buffers.values())
+                self._output.flush(self._tick)  # what others have heard belongs in the recording
+            words = described(error, self._stepper.buffers.values())
             self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
             with suppress(Exception):
                 self._service.finish()  # what it has open is closed
@@ -92,7 +93,7 @@ class WallClockNode:
     def _await_start(self) -> int:
         """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns].
 
-        The conductor repeats the start, so that who takes a place over in the middle of a run hears it too.
+        The conductor repeats the start, so that a service that takes over a role in the middle of a run hears it too.
         """
         while True:
             message = self._link.poll(HANDSHAKE_POLL_S)
@@ -100,7 +101,7 @@ class WallClockNode:
             if message is None:
                 continue
             if message.command == RunControl.HELLO:
-                self._outlet.hello()
+                self._output.hello()
                 missing = [
                     name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
                 ]
@@ -108,7 +109,7 @@ class WallClockNode:
             elif message.command == RunControl.GRANT and message.last:
                 raise RunAborted("the run is already ending")
             elif message.command == RunControl.GRANT:
-                return _on_monotonic_clock(int(message.tick))
+                return _on_monotonic_clock(int(message.tick), self._now)
 
     def _obey(self, message: Any) -> None:
         if message.command == RunControl.LOST:
@@ -141,10 +142,10 @@ class WallClockNode:
             everything: list[Sent] = []
             for sent in self._stepper.parts(t):
                 start = perf_counter_ns()
-                self._outlet.send(sent)
+                self._output.send(sent)
                 self._stepper.blame.send += perf_counter_ns() - start
                 everything += sent
-            self._outlet.record(everything, t)
+            self._output.record(everything, t)
             self._tick = t
             while (message := self._link.poll()) is not None:
                 self._obey(message)
@@ -165,7 +166,7 @@ class WallClockNode:
         return max(0, (monotonic_ns() - epoch) // period * period)
 
     def _receive(self, t: int) -> None:
-        now = time_ns()
+        now = self._now()
         for name, buffer in self._stepper.buffers.items():
             data = self._data[name]
             while (sample := data.get(0)) is not None:
@@ -188,7 +189,7 @@ class WallClockNode:
                 buffer.deliver(received)
 
     def _finish(self) -> None:
-        self._outlet.flush(self._tick)
+        self._output.flush(self._tick)
         facts = dict(self._service.finish())
         detail = {
             "digests": {},

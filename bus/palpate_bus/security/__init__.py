@@ -1,1 +1,1 @@
-"""Who may do what: certificates, access rules derived from the contract, and a router that enforces them."""
+"""Certificates, and the access rules of a router, derived from the contract."""

@@ -1,4 +1,4 @@
-"""zenoh's access control from the contract, for a router: each role may send what it produces and get what it reads, no more.
+"""zenoh's access control for a router, from the contract: a role may send what it produces and get what it reads, no more.
 
     python -m palpate_bus.security.access > access.json5      # the `access_control` part of zenohd's configuration
 
@@ -29,10 +29,8 @@ OPERATOR = "operator"
 WATCHER = "conductor"
 """The role that watches over the contract in a run: it hears every public topic, as a viewer does."""
 ROUTER = "router"
-"""The router's own certificate; it may tell whom it turned away, and nothing else."""
-DENIALS = "palpate/denials"
-"""Where a router is asked whom it turned away (see `guard`)."""
-OPERATOR_DESK = "*/palpate/operator"
+"""The router's own certificate; it may send and get nothing."""
+OPERATOR_REQUESTS = "*/palpate/operator"
 """Where the conductor is asked to stop or release, in any domain."""
 
 _VIEWED = ("palpate/control", "palpate/report/*")
@@ -45,7 +43,7 @@ _WATCH = ["liveliness_query", "declare_liveliness_subscriber"]
 
 
 class _Rules:
-    """Collects rules and who they are for."""
+    """Collects rules and the members that they are for."""
 
     def __init__(self) -> None:
         self.rules: list[dict[str, Any]] = []
@@ -87,12 +85,10 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
     made.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
         made.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
-    made.allow("conductor", "serves", [OPERATOR_DESK], True, data)
-    made.allow(OPERATOR, "orders", [OPERATOR_DESK], False, data)
+    made.allow("conductor", "serves", [OPERATOR_REQUESTS], True, data)
+    made.allow(OPERATOR, "orders", [OPERATOR_REQUESTS], False, data)
     for member in (*rules.roles, VIEWER, OPERATOR):
         made.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
-        made.allow(member, "asks", [DENIALS], False, data)
-    made.allow(ROUTER, "tells", [DENIALS], True, data)
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -127,7 +123,7 @@ def _internal_sent(row: Internal, role: str) -> list[str]:
 
 
 def _internal_got(row: Internal, role: str) -> list[str]:
-    """Keys of a message of the runtime that `role` may get, whoever sends it."""
+    """Keys of a message of the runtime that `role` may get, from any sender."""
     if row.readers not in ("any", role):
         return []
     return _keys(row.name.replace("<role>", "*"))

@@ -4,7 +4,7 @@
     <folder>/<name>/ca.pem, cert.pem, key.pem   what one member needs, and all that it is given (PALPATE_TLS=<folder>/<name>)
 
 Keys are ECDSA on P-256 (RFC 5480), certificates X.509 version 3 (RFC 5280). The name is the subject's common name, by which a
-router knows its members (`access.py`). Needs the `cryptography` package: `pip install palpate-bus[secure]`.
+router knows its members (`access.py`). Needs the `cryptography` package: `pip install palpate[secure]`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class KeysError(ValueError):
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a certificate says."""
+    """The contents of a certificate."""
 
     name: str
     path: Path
@@ -56,7 +56,7 @@ class Certificate:
 
 
 def members() -> tuple[str, ...]:
-    """Everybody who gets a certificate: roles, the router, a viewer, who may only read, and an operator, who may also stop."""
+    """The names that get a certificate: all roles, the router, a viewer (may only read) and an operator (may also stop)."""
     return (*contract().roles, ROUTER, VIEWER, OPERATOR)
 
 
@@ -84,7 +84,7 @@ def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), day
 
 
 def read(path: Path) -> Certificate:
-    """What the certificate in a PEM file says. Raises KeysError."""
+    """Reads the certificate in a PEM file. Raises KeysError."""
     try:
         loaded = x509.load_pem_x509_certificate(path.read_bytes())
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Who is on the bus: liveliness tokens as rmw_zenoh has them, so that `ros2 node list` and `ros2 topic info` see our services.
+"""The nodes on the bus: liveliness tokens as rmw_zenoh has them, so that `ros2 node list` and `ros2 topic info` see our services.
 
 A token is a key that exists as long as its process does:
 
@@ -32,7 +32,7 @@ _PARTS_OF_NODE = 9
 _PARTS_OF_ENDPOINT = 13
 
 
-class Kind(StrEnum):
+class EntityKind(StrEnum):
     """What an entity of the ROS graph is."""
 
     NODE = "NN"
@@ -60,7 +60,7 @@ class Entity:
     zid: str
     node_id: int
     entity_id: int
-    kind: Kind
+    kind: EntityKind
     node: str
     namespace: str = "/"
     enclave: str = "/"
@@ -113,12 +113,12 @@ def parse_token(key: str) -> Entity:
         raise WireError(f"no liveliness token: {key!r}")
     _, domain, zid, node_id, entity_id, kind, enclave, namespace, node, *endpoint = parts
     try:
-        entity_kind = Kind(kind)
+        entity_kind = EntityKind(kind)
         numbers = int(domain), int(node_id), int(entity_id)
     except ValueError as error:
         raise WireError(f"liveliness token {key!r}: {error}") from error
     described = None
-    if entity_kind is not Kind.NODE:
+    if entity_kind is not EntityKind.NODE:
         if len(parts) < _PARTS_OF_ENDPOINT:
             raise WireError(f"liveliness token {key!r} lacks topic, type, hash or QoS")
         topic, dds, type_hash, qos = endpoint[:4]
@@ -137,18 +137,18 @@ class NodeTokens:
     def __init__(self, session: zenoh.Session, role: str, domain: int) -> None:
         self._liveliness = session.liveliness()
         self._ids = count(1)
-        self.node = Entity(domain, str(session.zid()), 0, 0, Kind.NODE, role)
+        self.node = Entity(domain, str(session.zid()), 0, 0, EntityKind.NODE, role)
         self._tokens: list[Any] = [self._liveliness.declare_token(self.node.token)]
 
     def publisher(self, topic: Topic, qos: Qos) -> bytes:
         """Declares a publisher of a topic and returns its GID, for the attachments."""
-        return self._declare(Kind.PUBLISHER, topic, qos)
+        return self._declare(EntityKind.PUBLISHER, topic, qos)
 
     def subscription(self, topic: Topic, qos: Qos) -> bytes:
         """Declares a subscription to a topic and returns its GID."""
-        return self._declare(Kind.SUBSCRIPTION, topic, qos)
+        return self._declare(EntityKind.SUBSCRIPTION, topic, qos)
 
-    def _declare(self, kind: Kind, topic: Topic, qos: Qos) -> bytes:
+    def _declare(self, kind: EntityKind, topic: Topic, qos: Qos) -> bytes:
         endpoint = Endpoint(topic.name, topic.type, topic.type_hash, qos_token(qos))
         node = self.node
         entity = Entity(node.domain, node.zid, node.node_id, next(self._ids), kind, node.node, endpoint=endpoint)
@@ -209,7 +209,7 @@ class GraphWatch:
 
     def roles(self) -> frozenset[str]:
         """Names of the nodes that live, as of the last `changes`."""
-        return frozenset(entity.node for entity in self.alive.values() if entity.kind is Kind.NODE)
+        return frozenset(entity.node for entity in self.alive.values() if entity.kind is EntityKind.NODE)
 
     def gone(self) -> frozenset[str]:
         """Names of the nodes that lived and are gone, as of the last `changes`."""
@@ -226,7 +226,7 @@ def mismatches(entities: Iterable[Entity]) -> list[str]:
     found = set()
     for publisher, sent in endpoints:
         for subscription, wanted in endpoints:
-            if publisher.kind is not Kind.PUBLISHER or subscription.kind is not Kind.SUBSCRIPTION:
+            if publisher.kind is not EntityKind.PUBLISHER or subscription.kind is not EntityKind.SUBSCRIPTION:
                 continue
             if sent.topic == wanted.topic and (sent.type, sent.type_hash) != (wanted.type, wanted.type_hash):
                 found.add(

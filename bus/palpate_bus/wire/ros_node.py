@@ -47,7 +47,7 @@ class RosPublisher:
 
 
 class RosSubscription:
-    """The newest messages of a ROS topic, from whoever publishes it."""
+    """The newest messages of a ROS topic, from any publisher."""
 
     def __init__(self, session: zenoh.Session, key: str, type_name: str, *, latched: bool = False) -> None:
         self._decode = codec.decoder(type_name)

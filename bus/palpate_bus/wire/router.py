@@ -9,7 +9,9 @@ import logging
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, session
 
@@ -20,16 +22,20 @@ log = logging.getLogger(__name__)
 
 
 def serve(
-    listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = (), ready: Callable[[str], None] = log.info
+    listen: Sequence[str] = (DEFAULT_ENDPOINT,),
+    ready: Callable[[str], None] = log.info,
+    tls: Path | None = None,
+    access: Mapping[str, Any] | None = None,
 ) -> None:
-    """Routes until SIGINT or SIGTERM; call it from the main thread. `connect` names other routers.
+    """Routes until SIGINT or SIGTERM; call it from the main thread.
 
-    `ready` is told, once, where it listens. Raises BusConfigError when it cannot listen there.
+    `ready` is told, once, where it listens. `tls` is the router's folder of certificates, `access` its access control. Raises
+    BusConfigError when it cannot listen there.
     """
     stop = threading.Event()
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with session(BusOptions(mode="router", listen=tuple(listen), connect=tuple(connect))) as router:
+        with session(BusOptions(mode="router", listen=tuple(listen), tls=tls), access) as router:
             ready(f"router {router.zid()} listens on {', '.join(listen)}")
             while not stop.wait(1.0):  # in slices, so that signals are handled on every platform
                 pass

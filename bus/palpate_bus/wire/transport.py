@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from time import time_ns
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import zenoh
 
@@ -20,7 +20,7 @@ HELLO = 0
 """Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""
 
 
-class Sample(NamedTuple):
+class ReceivedSample(NamedTuple):
     """What came in on a subscription."""
 
     sequence: int
@@ -29,11 +29,26 @@ class Sample(NamedTuple):
     payload: bytes
 
 
+class Sender(Protocol):
+    """The sending end of a topic."""
+
+    def put(self, payload: bytes, sequence: int) -> None:
+        """Sends a message."""
+
+    def hello(self) -> None:
+        """Sends the empty message that tests the edge."""
+
+    def close(self) -> None:
+        """Undeclares it."""
+
+
 class Publisher:
     """Sends on one key with the QoS of the contract."""
 
-    def __init__(self, session: zenoh.Session, key: str, qos: Qos, gid: bytes) -> None:
+    def __init__(self, session: zenoh.Session, key: str, qos: Qos, gid: bytes, now: Callable[[], int] = time_ns) -> None:
+        """`now` gives the wall time [ns] that each message carries."""
         self.key = key
+        self._now = now
         options: dict[str, Any] = {
             "priority": getattr(zenoh.Priority, qos.priority),
             "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),
@@ -50,7 +65,7 @@ class Publisher:
 
     def put(self, payload: bytes, sequence: int) -> None:
         """Sends a message."""
-        self._publisher.put(payload, attachment=self._pack(sequence, time_ns()))
+        self._publisher.put(payload, attachment=self._pack(sequence, self._now()))
 
     def hello(self) -> None:
         """Sends the empty message that tests the edge."""
@@ -88,7 +103,7 @@ class Subscription:
         else:
             self._subscriber = session.declare_subscriber(key, handler)
 
-    def get(self, timeout: float | None) -> Sample | None:
+    def get(self, timeout: float | None) -> ReceivedSample | None:
         """The next message; None when `timeout` [s] passes without one. A timeout of 0 does not wait."""
         while True:
             if not timeout and self._queue.empty():  # nobody else takes from it; far cheaper than the exception
@@ -116,7 +131,7 @@ class Subscription:
             if self._decode is not None and decoded(self._decode, payload) is None:
                 self.garbage += 1
                 continue
-            return Sample(sequence, sent, payload)
+            return ReceivedSample(sequence, sent, payload)
 
     def hand_over(self) -> None:
         """Forgets the sender: the next one that is another counts from now on, and nothing that still comes from this one."""
@@ -126,6 +141,28 @@ class Subscription:
     def close(self) -> None:
         """Undeclares the subscriber."""
         self._subscriber.undeclare()
+
+
+class Transport:
+    """A member's way onto the bus: its publishers, its subscriptions and its wall clock.
+
+    The runtimes are given theirs, so that a test can hand them one that loses, changes or delays messages.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+
+    def now(self) -> int:
+        """The wall time [ns]."""
+        return time_ns()
+
+    def publisher(self, topic: str, key: str, qos: Qos, gid: bytes) -> Sender:
+        """The sending end of a topic; `key` is its key on the bus."""
+        return Publisher(self.session, key, qos, gid, self.now)
+
+    def subscription(self, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None) -> Subscription:
+        """The receiving end of a key, see `Subscription`."""
+        return Subscription(self.session, key, history, decode)
 
 
 def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:

@@ -1,19 +1,7 @@
-"""How processes find each other on the bus: zenoh's configuration from environment variables or arguments.
+"""How processes find each other on the bus: zenoh's configuration from the settings, or from arguments.
 
-| variable | meaning |
-|---|---|
-| `PALPATE_LISTEN` | endpoints to listen on, comma-separated, e.g. `unixsock-stream//run/robot.sock` or `tcp/127.0.0.1:7501` |
-| `PALPATE_CONNECT` | endpoints of peers, comma-separated; those not there yet are tried again until they are |
-| `PALPATE_ROUTER` | endpoint of a router, e.g. `tcp/host:7447`: peers find each other through it and then talk directly |
-| `PALPATE_MODE` | `peer` (default) or `client` (everything through the router: for a service behind NAT) |
-| `PALPATE_LOWLATENCY` | `1`: the low-latency transport, see below; not in wall-clock mode |
-| `PALPATE_SHARED_MEMORY` | `0`: none (default on: messages over 3 KiB between processes of one host go through it) |
-| `PALPATE_TLS` | folder with `ca.pem`, `cert.pem`, `key.pem` (`palpate keys init`): mutual TLS, endpoints are `tls/host:port` |
-| `PALPATE_RUNTIME` | `wallclock`: a publisher does not wait for a reader that does not keep up, see below |
-| `ZENOH_RUNTIME` | zenoh's own: its thread pools, see below |
-| `PALPATE_ZENOH_CONFIG` | a zenoh configuration file (JSON5), used as it is; nothing else above applies |
-
-Nothing is ever found by multicast: a run must not meet another run's peers on the same network.
+Nothing is ever found by multicast: a run must not meet another run's peers on the same network. zenoh itself reads one variable,
+`ZENOH_RUNTIME`, for its thread pools, see below.
 
 **Low-latency transport.** zenoh's usual transport hands every message to a transmission task; the low-latency one writes it
 to the socket in the caller's thread. It has no priorities, no fragments (so a message over 64 KiB needs shared memory) and no
@@ -55,6 +43,9 @@ from typing import Any
 
 import zenoh
 
+from palpate_bus.settings import BusConfigError as BusConfigError  # noqa: PLC0414  # others import it from here, too
+from palpate_bus.settings import Settings, variable
+
 UNIX_PATH_MAX = 107
 """Longest path of a unix socket [bytes] on Linux (sun_path less its NUL)."""
 
@@ -62,24 +53,16 @@ _PRIORITIES = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
 TLS_FILES = ("ca.pem", "cert.pem", "key.pem")
-"""What `PALPATE_TLS` names a folder of."""
+"""The files in the folder that `tls` names."""
 POOLS = "(rx: (handover: net), acc: (handover: net), net: (worker_threads: 2))"
 """`ZENOH_RUNTIME` where the environment has none: sockets are read by the threads that watch them."""
 LOCKSTEP_DROP_WAIT_US = 1_000_000
 WALL_CLOCK_DROP_WAIT_US = 1_000
 
 
-DOMAIN_MAX = 232
-"""Of ROS 2 with the default port range of DDS; zenoh itself knows no limit."""
-
-
-class BusConfigError(ValueError):
-    """A bus configuration that cannot work. Names the variable or field, its value and what is allowed."""
-
-
 @dataclass(frozen=True)
 class BusOptions:
-    """How a process joins the bus. `BusOptions.from_env()` reads the variables in the module's table."""
+    """How a process joins the bus. `BusOptions.from_settings` takes them from the settings."""
 
     listen: tuple[str, ...] = ()
     """Endpoints to listen on."""
@@ -102,9 +85,9 @@ class BusOptions:
 
     def __post_init__(self) -> None:
         if self.mode not in ("peer", "client", "router"):
-            raise BusConfigError(f"PALPATE_MODE is {self.mode!r}; allowed are peer, client and router")
+            raise BusConfigError(f"PALPATE_MODE is {self.mode!r}; allowed: peer, client, router")
         if self.mode == "client" and not (self.router or self.connect or self.file):
-            raise BusConfigError("PALPATE_MODE is client, but neither PALPATE_ROUTER nor PALPATE_CONNECT says of whom")
+            raise BusConfigError("PALPATE_MODE is client, but neither PALPATE_ROUTER nor PALPATE_CONNECT is set")
         for endpoint in (*self.listen, *self.connect, *([self.router] if self.router else [])):
             _check_endpoint(endpoint)
             if self.tls is not None and not endpoint.startswith("tls/"):
@@ -116,60 +99,39 @@ class BusOptions:
                 raise BusConfigError(f"PALPATE_TLS is {self.tls}: no {name} in it; `palpate keys init` makes such folders")
 
     @classmethod
-    def from_env(cls, environ: Mapping[str, str] = os.environ) -> BusOptions:
-        """The options that the environment asks for. Raises BusConfigError that names the variable."""
-        file = environ.get("PALPATE_ZENOH_CONFIG")
-        wall_clock = environ.get("PALPATE_RUNTIME") == "wallclock"
+    def from_settings(cls, settings: Settings) -> BusOptions:
+        """The options that the settings ask for. Raises BusConfigError that names the variable."""
+        wallclock = settings.runtime == "wallclock"
         return cls(
-            listen=_split(environ.get("PALPATE_LISTEN", "")),
-            connect=_split(environ.get("PALPATE_CONNECT", "")),
-            router=environ.get("PALPATE_ROUTER") or None,
-            mode=environ.get("PALPATE_MODE") or "peer",
-            lowlatency=_flag(environ, "PALPATE_LOWLATENCY", default=False) and not wall_clock,
-            shared_memory=_flag(environ, "PALPATE_SHARED_MEMORY", default=True),
-            drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wall_clock else LOCKSTEP_DROP_WAIT_US,
-            file=Path(file) if file else None,
-            tls=Path(environ["PALPATE_TLS"]) if environ.get("PALPATE_TLS") else None,
+            listen=settings.listen,
+            connect=settings.connect,
+            router=settings.router,
+            mode=settings.mode,
+            lowlatency=settings.lowlatency and not wallclock,
+            shared_memory=settings.shared_memory,
+            tls=settings.tls,
+            drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wallclock else LOCKSTEP_DROP_WAIT_US,
+            file=settings.zenoh_config,
         )
 
-    def to_env(self) -> dict[str, str]:
-        """The variables that make `from_env` return these options in another process; empty ones undo inherited ones.
-
-        `drop_wait_us` is not among them: the other process takes it from PALPATE_RUNTIME.
-        """
+    def settings(self) -> dict[str, Any]:
+        """These options as fields for `Settings.replaced`. `drop_wait_us` is none of them: it follows from the runtime."""
         return {
-            "PALPATE_LISTEN": ",".join(self.listen),
-            "PALPATE_CONNECT": ",".join(self.connect),
-            "PALPATE_ROUTER": self.router or "",
-            "PALPATE_MODE": self.mode,
-            "PALPATE_LOWLATENCY": str(int(self.lowlatency)),
-            "PALPATE_SHARED_MEMORY": str(int(self.shared_memory)),
-            "PALPATE_ZENOH_CONFIG": str(self.file) if self.file else "",
-            "PALPATE_TLS": str(self.tls) if self.tls else "",
+            "listen": self.listen,
+            "connect": self.connect,
+            "router": self.router,
+            "mode": self.mode,
+            "lowlatency": self.lowlatency,
+            "shared_memory": self.shared_memory,
+            "tls": self.tls,
+            "zenoh_config": self.file,
         }
 
-
-def domain_from_env(environ: Mapping[str, str] = os.environ) -> int:
-    """The ROS domain, ROS_DOMAIN_ID, 0 by default. Raises BusConfigError."""
-    text = environ.get("ROS_DOMAIN_ID") or "0"
-    if not (text.isascii() and text.isdigit() and int(text) <= DOMAIN_MAX):
-        raise BusConfigError(f"ROS_DOMAIN_ID is {text!r}; want a whole number from 0 to {DOMAIN_MAX}")
-    return int(text)
-
-
-def _split(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(",") if part.strip())
-
-
-def _flag(environ: Mapping[str, str], name: str, *, default: bool) -> bool:
-    value = environ.get(name, "").strip().lower()
-    if not value:
-        return default
-    if value in ("1", "true", "yes", "on"):
-        return True
-    if value in ("0", "false", "no", "off"):
-        return False
-    raise BusConfigError(f"{name} is {value!r}; allowed are 0 and 1")
+    def to_env(self) -> dict[str, str]:
+        """The variables that make another process join like this; empty ones undo inherited ones."""
+        fields = self.settings()
+        environment = Settings.read({}).replaced(**fields).to_env()
+        return {variable(name): environment[variable(name)] for name in fields}
 
 
 def _check_endpoint(endpoint: str) -> None:
@@ -190,12 +152,12 @@ def zenoh_config(options: BusOptions) -> zenoh.Config:
         except zenoh.ZError as error:
             raise BusConfigError(f"PALPATE_ZENOH_CONFIG is {options.file}: {error}") from error
     config = zenoh.Config()
-    for key, value in _settings(options).items():
+    for key, value in _zenoh_settings(options).items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
-def _settings(options: BusOptions) -> dict[str, Any]:
+def _zenoh_settings(options: BusOptions) -> dict[str, Any]:
     connect = [*options.connect, *([options.router] if options.router else [])]
     listen = list(options.listen)
     if not listen and options.mode == "peer" and options.router:
@@ -259,15 +221,19 @@ def mesh(roles: Sequence[str], folder: Path, *, lowlatency: Sequence[str] = ()) 
     }
 
 
-def open_session(options: BusOptions | None = None) -> zenoh.Session:
-    """A zenoh session; by default as the environment says. Close it with `close_session`, or use `session`.
+def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | None = None) -> zenoh.Session:
+    """A zenoh session; by default as the settings say. Close it with `close_session`, or use `session`.
 
-    Raises BusConfigError if a session cannot be opened, for instance because an endpoint is in use.
+    `access` is the access control of a router, see `security.access`. Raises BusConfigError if a session cannot be opened, for
+    instance because an endpoint is in use.
     """
-    options = options or BusOptions.from_env()
+    options = options or BusOptions.from_settings(Settings.read())
     os.environ.setdefault("ZENOH_RUNTIME", POOLS)  # zenoh reads it once, when the first session of a process opens
+    config = zenoh_config(options)
+    if access is not None:
+        config.insert_json5("access_control", json.dumps(access))
     try:
-        opened = zenoh.open(zenoh_config(options))
+        opened = zenoh.open(config)
     except zenoh.ZError as error:
         raise BusConfigError(f"cannot open a zenoh session with {options}: {error}") from error
     atexit.register(close_session, opened)
@@ -275,7 +241,7 @@ def open_session(options: BusOptions | None = None) -> zenoh.Session:
 
 
 def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
-    """Undeclares what is passed, closes the session and says whether it closed in order; never raises.
+    """Undeclares what is passed, closes the session and returns whether it closed in order; never raises.
 
     A session that is still open when the interpreter ends makes it hang for ten seconds and then print a panic ("close
     operation timed out"), because its close waits for callbacks that need the interpreter. So `open_session` also registers
@@ -292,9 +258,9 @@ def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
 
 
 @contextmanager
-def session(options: BusOptions | None = None) -> Iterator[zenoh.Session]:
-    """A zenoh session for a `with` block."""
-    opened = open_session(options)
+def session(options: BusOptions | None = None, access: Mapping[str, Any] | None = None) -> Iterator[zenoh.Session]:
+    """A zenoh session for a `with` block, as `open_session` opens it."""
+    opened = open_session(options, access)
     try:
         yield opened
     finally:

@@ -15,7 +15,7 @@ import zenoh
 
 from palpate_bus.contract import Contract
 from palpate_bus.monitor.diagnostics import topic_statuses
-from palpate_bus.monitor.health import Seen
+from palpate_bus.monitor.health import SeenViolation
 from palpate_bus.monitor.live import LiveMonitor
 from palpate_bus.security.access import WATCHER, watched
 
@@ -59,7 +59,7 @@ class ContractWatch:
         monitor = self._live.monitor
         return topic_statuses(monitor.health(), monitor.active.values(), monotonic())
 
-    def of(self, sender: str) -> list[Seen]:
+    def of(self, sender: str) -> list[SeenViolation]:
         """What a sender violated so far, the latest last."""
         found = (seen for seen in self._live.monitor.active.values() if seen.violation.sender == sender)
         return sorted(found, key=lambda seen: seen.last)

@@ -12,7 +12,7 @@ from time import monotonic, time_ns
 
 from palpate_bus.contract import MS
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runs.desk import PACE
+from palpate_bus.runs.operator_requests import PACE
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_conductor.outcome import RunFailed
 

@@ -1,4 +1,4 @@
-"""Where an operator's word reaches a run: a queryable of the conductor (`palpate_bus.runs.desk` asks it).
+"""Where an operator's word reaches a run: a queryable of the conductor (`palpate_bus.runs.operator_requests` asks it).
 
 The conductor passes the word on as `operator/request` and answers once the supervisor confirms it, so that the operator knows.
 """
@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from palpate_bus.messages import SupervisorState
-from palpate_bus.runs.desk import CONFIRM_S, PACE, WORDS, desk_key
+from palpate_bus.runs.operator_requests import CONFIRM_S, PACE, WORDS, request_key
 
 
 @dataclass
@@ -38,7 +38,7 @@ class OperatorDesk:
         `pace(word, ms)` does a word of `desk.PACE` and says what came of it, or raises ValueError with why not.
         """
         self._pace = pace
-        self._key = desk_key(domain)
+        self._key = request_key(domain)
         self._send = send
         self._asked: SimpleQueue[Any] = SimpleQueue()
         self._pending: list[_Pending] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from functools import cache
 from math import isfinite
@@ -17,6 +16,7 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
 from palpate_planning.exam import Exam
@@ -180,4 +180,4 @@ def _let_the_worker_give_way() -> None:
 
 def create(scenario: Scenario) -> PlanningService:
     """The service for a scenario, of which it may know the exam input."""
-    return PlanningService(exam_input(scenario), lockstep=os.environ.get("PALPATE_RUNTIME", "lockstep") == "lockstep")
+    return PlanningService(exam_input(scenario), lockstep=Settings.read().runtime == "lockstep")

@@ -6,7 +6,6 @@ bytes as they came, so that nothing is decoded and none is skipped.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_models.scenario import Scenario
 from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
 
@@ -80,16 +80,12 @@ class RecorderService(Service):
 
 
 def create(scenario: Scenario) -> RecorderService:
-    """The recorder of a run; the run's folder is in the environment variable PALPATE_OUT.
+    """The recorder of a run; its folder and the size of its files come from the settings `out` and `record_file_mb`.
 
-    PALPATE_RECORD_FILE_MB is the size at which a new file is begun. Raises ValueError if that is no number above zero, or if
-    PALPATE_OUT is not set. The scenario does not matter: the recorder writes what the bus carries.
+    Raises BusConfigError if the folder is missing. The scenario does not matter: the recorder writes what the bus carries.
     """
     del scenario
-    out = os.environ.get("PALPATE_OUT")
-    if not out:
-        raise ValueError(f"PALPATE_OUT is not set; the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder")
-    size = os.environ.get("PALPATE_RECORD_FILE_MB", "")
-    if size and not (size.isdigit() and int(size) > 0):
-        raise ValueError(f"PALPATE_RECORD_FILE_MB is {size!r}; want a whole number of megabytes above 0")
-    return RecorderService(Path(out) / FOLDER, int(size) * 1_000_000 if size else FILE_BYTES)
+    settings = Settings.read()
+    out = settings.required("out", f"the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder")
+    size = settings.record_file_mb
+    return RecorderService(out / FOLDER, FILE_BYTES if size is None else size * 1_000_000)

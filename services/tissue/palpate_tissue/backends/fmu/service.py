@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import tempfile
 from collections.abc import Mapping
 from importlib import resources
@@ -17,6 +16,7 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
@@ -112,8 +112,8 @@ def host(role: str, *arguments: Any, **options: Any) -> FmuService:
 
 def chosen_role() -> str:
     """The role of this process: that of the map that PALPATE_FMU_MAP names, or tissue."""
-    path = os.environ.get("PALPATE_FMU_MAP")
-    return load_map(Path(path)).role if path else "tissue"
+    path = Settings.read().fmu_map
+    return load_map(path).role if path else "tissue"
 
 
 def packaged_map(name: str) -> FmuMap:
@@ -127,15 +127,15 @@ def create(scenario: Scenario) -> FmuService:
 
     By default the abdomen of the scenario, built here, in the role of the tissue.
     """
-    file, path = os.environ.get("PALPATE_FMU"), os.environ.get("PALPATE_FMU_MAP")
-    table = load_map(Path(path)) if path else None
-    if file is None or file == "":
+    settings = Settings.read()
+    table = load_map(settings.fmu_map) if settings.fmu_map else None
+    if settings.fmu is None:
         if table is not None and table.role != "tissue":
             raise MapError(f"PALPATE_FMU is not set: which FMU plays the role {table.role}?")
         with tempfile.TemporaryDirectory() as folder:
             fmu_file = build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()])
             return _host(fmu_file, table, scenario)
-    return _host(Path(file), table, scenario)
+    return _host(settings.fmu, table, scenario)
 
 
 def _host(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:

@@ -5,18 +5,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate_bus.messages.codec import CodecError
-from palpate_bus.runtime.spool import CHUNK_PERIOD, Recorded, Spool, unpack_chunk
+from palpate_bus.runtime.record_chunks import CHUNK_PERIOD, ChunkMessage, ChunkWriter, unpack_chunk
 
 TOPICS = ("joint_states", "ft/wrench")
 messages = st.lists(
-    st.builds(Recorded, st.sampled_from(TOPICS), st.binary(max_size=300), st.integers(0, 2**40), st.integers(0, 2**32 - 1)),
+    st.builds(ChunkMessage, st.sampled_from(TOPICS), st.binary(max_size=300), st.integers(0, 2**40), st.integers(0, 2**32 - 1)),
     max_size=40,
 )
 
 
 @given(messages)
-def test_what_goes_in_comes_out(sent: list[Recorded]) -> None:
-    spool = Spool("robot", TOPICS)
+def test_what_goes_in_comes_out(sent: list[ChunkMessage]) -> None:
+    spool = ChunkWriter("robot", TOPICS)
     for message in sent:
         spool.add(message.topic, message.payload, message.stamp, message.sequence)
     tick, received = unpack_chunk(spool.chunk(7))
@@ -25,7 +25,7 @@ def test_what_goes_in_comes_out(sent: list[Recorded]) -> None:
 
 
 def test_a_chunk_is_due_once_a_period() -> None:
-    spool = Spool("robot", TOPICS)
+    spool = ChunkWriter("robot", TOPICS)
     assert not spool.due(CHUNK_PERIOD - 1)
     assert spool.due(CHUNK_PERIOD)
     spool.chunk(CHUNK_PERIOD)

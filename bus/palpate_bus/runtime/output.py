@@ -1,4 +1,4 @@
-"""What a service sends: one publisher a topic, and the chunks for the recorder when the run has one."""
+"""The sending side of a service: a publisher for each of its topics, and chunks for the recorder if the run has one."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ from collections.abc import Sequence
 
 from palpate_bus.runtime.lockstep import Sent
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.spool import CHUNK_TYPE, Spool, recording
+from palpate_bus.runtime.record_chunks import CHUNK_TYPE, ChunkWriter
+from palpate_bus.settings import Settings
 
 
-class Outlet:
-    """The sending side of a node."""
+class ServiceOutput:
+    """Sends what a service produces."""
 
     def __init__(self, member: Member) -> None:
         role = member.role
         self._publishers = {topic.name: member.publisher(topic) for topic in member.rules.outputs(role)}
         self._chunks = member.internal_publisher(f"palpate/record/{role}", CHUNK_TYPE, "event")
         self._chunk_sequence = 0
-        self._spool = Spool(role, tuple(self._publishers)) if recording() else None
+        self._writer = ChunkWriter(role, tuple(self._publishers)) if Settings.read().record else None
 
     def hello(self) -> None:
-        """Tests every edge."""
+        """Sends the empty message that tests the edge on every topic."""
         for publisher in self._publishers.values():
             publisher.hello()
         self._chunks.hello()
@@ -33,15 +34,15 @@ class Outlet:
 
     def record(self, sent: Sequence[Sent], t: int) -> None:
         """Passes what a step at `t` [ns] sent on to the recorder, if the run has one."""
-        spool = self._spool
-        if spool is not None:
+        writer = self._writer
+        if writer is not None:
             for port, payload, sequence in sent:
-                spool.add(port.topic.name, payload, t, sequence)
-            if spool.due(t):
+                writer.add(port.topic.name, payload, t, sequence)
+            if writer.due(t):
                 self.flush(t)
 
     def flush(self, t: int) -> None:
         """Passes on what the recorder has not got yet."""
-        if self._spool is not None:
+        if self._writer is not None:
             self._chunk_sequence += 1
-            self._chunks.put(self._spool.chunk(t), self._chunk_sequence)
+            self._chunks.put(self._writer.chunk(t), self._chunk_sequence)

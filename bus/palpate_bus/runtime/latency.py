@@ -1,14 +1,14 @@
-"""How old messages were when they were looked at: a histogram, so that hours of 1 kHz cost no memory."""
+"""Latency of messages, from sending to reception: a histogram, so that hours at 1 kHz take no memory."""
 
 from __future__ import annotations
 
 BIN_NS = 20_000
 BINS = 5_000
-"""Ages from 0 to 0.1 s are told apart by `BIN_NS`; what is older counts in the last bin, and in the largest age."""
+"""Latencies from 0 to 0.1 s are told apart by `BIN_NS`; a longer one counts in the last bin and in `worst`."""
 
 
-class Ages:
-    """Ages of the messages of one topic [ns]."""
+class LatencyHistogram:
+    """Latencies of the messages of one topic [ns]."""
 
     __slots__ = ("_bins", "count", "total", "worst")
 
@@ -18,16 +18,16 @@ class Ages:
         self.total = 0
         self.worst = 0
 
-    def add(self, age: int) -> None:
-        """Takes an age; clocks of two machines may make it negative, which counts as none."""
-        self._bins[min(max(age, 0) // BIN_NS, BINS - 1)] += 1
+    def add(self, latency: int) -> None:
+        """Counts a latency [ns]. Clocks of two machines may make it negative, which counts as zero."""
+        self._bins[min(max(latency, 0) // BIN_NS, BINS - 1)] += 1
         self.count += 1
-        self.total += age
-        self.worst = max(self.worst, age)
+        self.total += latency
+        self.worst = max(self.worst, latency)
 
-    def quantile(self, part: float) -> int:
-        """The age [ns] that this part of the messages does not exceed, to within a bin; 0 when there was none."""
-        left = part * self.count
+    def quantile(self, fraction: float) -> int:
+        """The latency [ns] that this fraction of the messages does not exceed, to within a bin; 0 without any message."""
+        left = fraction * self.count
         for index, number in enumerate(self._bins):
             left -= number
             if left <= 0 and number:

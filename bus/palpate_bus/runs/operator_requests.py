@@ -1,4 +1,4 @@
-"""How an operator's word reaches a run: a query that its conductor answers once the supervisor confirms it.
+"""An operator's request to a run: a query that its conductor answers once the supervisor confirms it.
 
 Asked by `palpate stop`, `release`, `pause`, `resume` and `step`, and by the keys of `palpate dashboard` and `palpate run`.
 """
@@ -25,21 +25,21 @@ PACE = ("pause", "resume", "step")
 
 
 class NotAnswered(RuntimeError):
-    """No run took the word, or it was refused. The message says which."""
+    """No run answered the request, or it was refused. The message says which."""
 
 
-def desk_key(domain: int) -> str:
-    """The key on which a run is asked."""
+def request_key(domain: int) -> str:
+    """The key of the query."""
     return f"{domain}/palpate/operator"
 
 
 def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0) -> tuple[str, float]:
-    """Says a word of `WORDS` or `PACE` to the run on this bus; returns its answer and how long the confirmation took [ms].
+    """Sends a request of `WORDS` or `PACE` to the run on this bus; returns its answer and how long the confirmation took [ms].
 
     `ms` is for `step`: the simulated time to grant. Raises NotAnswered.
     """
     payload = json.dumps({"word": word, "reason": reason, "ms": ms})
-    for reply in session.get(desk_key(domain), payload=payload, timeout=2 * CONFIRM_S):
+    for reply in session.get(request_key(domain), payload=payload, timeout=2 * CONFIRM_S):
         if reply.ok is None:
             continue
         answer = json.loads(reply.ok.payload.to_bytes())
@@ -50,7 +50,7 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
 
 
 def order(session: zenoh.Session, domain: int, word: str, reason: str) -> str:
-    """The same for who only wants to show what came of it: a sentence, also when nobody answered."""
+    """As `ask`, but returns a sentence on the result to show to the operator, also when there was no answer."""
     try:
         answer, after_ms = ask(session, domain, word, reason)
     except NotAnswered as error:

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from palpate_bus.runtime.ages import BIN_NS, Ages
+from palpate_bus.runtime.latency import BIN_NS, LatencyHistogram
 
 
 def test_quantiles_are_those_of_the_values_to_within_a_bin() -> None:
     values = (np.random.default_rng(1).lognormal(0.0, 0.7, 5000) * 1e6).astype(int).tolist()
-    ages = Ages()
+    ages = LatencyHistogram()
     for value in values:
         ages.add(value)
     for part in (0.5, 0.99):
@@ -20,7 +20,7 @@ def test_quantiles_are_those_of_the_values_to_within_a_bin() -> None:
 
 
 def test_none_and_the_odd_ones() -> None:
-    ages = Ages()
+    ages = LatencyHistogram()
     assert ages.as_ms() == {"mean": 0.0, "p50": 0.0, "p99": 0.0, "max": 0.0}
     ages.add(-5_000_000)
     assert ages.quantile(0.99) == 0

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+import signal
 
 import numpy as np
 import pytest
 
+from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointTorqueCommand, codec
-from palpate_bus.messages.stamps import duration_message, header, nanoseconds
-from palpate_bus.runtime import faults
-from palpate_bus.runtime.faults import Fault, FaultError, FaultySender, faulty
+from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
+from palpate_bus.wire.zenoh_config import BusOptions, session
 
 TOPIC = contract().topics["control/joint_torque"]
 
@@ -37,7 +37,7 @@ def payload() -> bytes:
 
 def sent(kind: str, count: int = 1, messages: int = 5) -> list[tuple[int, bytes]]:
     out = Sent()
-    sender = FaultySender(out, TOPIC, Fault(TOPIC.name, kind, at=2_000_000, count=count), None)
+    sender = FaultySender(out, TOPIC, InjectedFault(TOPIC.name, kind, count, at=2_000_000), lambda: False)
     for sequence in range(1, messages + 1):
         sender.put(payload(), sequence)
     return out.messages
@@ -67,19 +67,28 @@ def test_corrupt_changes_bytes_and_truncate_takes_them() -> None:
         codec.decode(sent("truncate")[2][1], TOPIC.type)
 
 
-def test_without_the_variable_nothing_is_wrapped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("PALPATE_FAULT", raising=False)
-    sender: Any = Sent()
-    assert faulty(sender, TOPIC) is sender
-    monkeypatch.setenv("PALPATE_FAULT", "joint_states:nan")
-    monkeypatch.setenv("PALPATE_FAULT_AT", "1.5")
-    assert faulty(sender, TOPIC) is sender, "another topic's fault"
-    monkeypatch.setenv("PALPATE_FAULT", f"{TOPIC.name}:nan")
-    assert isinstance(faulty(sender, TOPIC), FaultySender)
+def test_a_transport_is_faulty_in_its_topic_only_and_from_the_signal_on() -> None:
+    qos = contract().qos["control"]
+    with session(BusOptions()) as opened:
+        transport = FaultyTransport(opened, InjectedFault(TOPIC.name, "nan", at=0))
+        assert isinstance(transport.publisher(TOPIC.name, "a", qos, bytes(16)), FaultySender)
+        assert not isinstance(transport.publisher("joint_states", "b", qos, bytes(16)), FaultySender)
+        late = FaultyTransport(opened, InjectedFault("clock", "jump"))
+        before = late.now()
+        assert before < late.now() < before + NS
+        signal.raise_signal(signal.SIGUSR1)
+        assert JUMP_NS <= late.now() - before < 2 * JUMP_NS
 
 
-@pytest.mark.parametrize("text", ["nan", "joint_states:melt", ":nan"])
-def test_a_fault_that_is_none_says_what_is_allowed(text: str) -> None:
-    with pytest.raises(FaultError, match="duplicate"):
-        Fault.from_env({"PALPATE_FAULT": text})
-    assert set(faults.CHANGES) < set(faults.KINDS)
+@pytest.mark.parametrize(
+    ("topic", "kind", "at", "allowed"),
+    [
+        ("joint_states", "melt", None, "duplicate"),
+        ("joint_stakes", "nan", None, "joint_states"),
+        ("joint_states", "jump", None, "clock"),
+        ("exam/findings", "nan", 0, "joint_states"),
+    ],
+)
+def test_a_fault_that_is_none_says_what_is_allowed(topic: str, kind: str, at: int | None, allowed: str) -> None:
+    with pytest.raises(ValueError, match=allowed):
+        InjectedFault(topic, kind, at=at)

@@ -1,4 +1,4 @@
-"""Recording without a second stream of every message: a service collects what it sent and passes it on in chunks.
+"""Chunks for the recorder: a service collects the messages that it sent and passes them on together.
 
 At 1 kHz a subscriber of every topic would cost each producer another send a message and the recorder a wake-up each. A chunk
 every 50 simulated milliseconds carries the same bytes.
@@ -6,7 +6,6 @@ every 50 simulated milliseconds carries the same bytes.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -23,12 +22,7 @@ _encode = codec.encoder(CHUNK_TYPE)
 _decode = codec.decoder(CHUNK_TYPE)
 
 
-def recording() -> bool:
-    """Whether this run has a recorder (PALPATE_RECORD)."""
-    return os.environ.get("PALPATE_RECORD", "0") == "1"
-
-
-class Recorded(NamedTuple):
+class ChunkMessage(NamedTuple):
     """One message out of a chunk."""
 
     topic: str
@@ -37,8 +31,8 @@ class Recorded(NamedTuple):
     sequence: int
 
 
-class Spool:
-    """Collects the messages of one role."""
+class ChunkWriter:
+    """Collects what one role sends and makes chunks of it."""
 
     def __init__(self, role: str, topics: tuple[str, ...]) -> None:
         self._role = role
@@ -76,7 +70,7 @@ class Spool:
         return _encode(message)
 
 
-def unpack_chunk(payload: bytes) -> tuple[int, Iterator[Recorded]]:
+def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
     """The tick [ns] that a chunk covers, and its messages. Raises CodecError when it is none, or not one piece."""
     chunk = _decode(payload)
     data = chunk.data.tobytes()
@@ -88,10 +82,10 @@ def unpack_chunk(payload: bytes) -> tuple[int, Iterator[Recorded]]:
     if columns[0] and max(columns[0]) >= len(chunk.topics):
         raise codec.CodecError(f"{CHUNK_TYPE}: a message of topic {max(columns[0])} of {len(chunk.topics)}")
 
-    def messages() -> Iterator[Recorded]:
+    def messages() -> Iterator[ChunkMessage]:
         begin = 0
         for topic, stamp, sequence, length in zip(*columns, strict=True):
-            yield Recorded(chunk.topics[topic], data[begin : begin + length], stamp, sequence)
+            yield ChunkMessage(chunk.topics[topic], data[begin : begin + length], stamp, sequence)
             begin += length
 
     return int(chunk.tick), messages()

@@ -1,4 +1,4 @@
-"""Which input a failed service may have stumbled over: who reads bad data fails, but who sent them is at fault."""
+"""Why a service failed: its error, and which of its inputs break the contract, since then their producer is at fault."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from palpate_bus.messages.codec import CodecError, Message
 from palpate_bus.runtime.lockstep import InputBuffer, Received
 
 
-def failure(error: BaseException, buffers: Iterable[InputBuffer]) -> str:
-    """An error in words, with each input that does not keep to its row of the contract and who sends it."""
+def described(error: BaseException, buffers: Iterable[InputBuffer]) -> str:
+    """An error as text, followed by each input that breaks its row of the contract and the role that sends it."""
     words = [f"{type(error).__name__}: {error}"]
     with suppress(Exception):  # whatever is wrong with an input must not hide the error
-        words += suspects(buffers)
+        words += invalid_inputs(buffers)
     return "; ".join(words)
 
 
-def suspects(buffers: Iterable[InputBuffer]) -> list[str]:
+def invalid_inputs(buffers: Iterable[InputBuffer]) -> list[str]:
     """A sentence for each topic whose newest messages cannot be decoded or have values that the contract does not allow."""
     found = []
     for buffer in buffers:
