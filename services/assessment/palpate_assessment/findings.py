@@ -19,8 +19,8 @@ from scipy.stats import norm
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.inversion import Z90, Observations, Posterior
 from palpate_assessment.prior import Field
+from palpate_models.frames import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CANDIDATE_RATIO = 1.5

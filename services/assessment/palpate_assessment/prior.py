@@ -13,12 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_assessment.grid import MapGrid
-
-Array = NDArray[np.float64]
-
+from palpate_models.frames import Array
 
 _NEGLIGIBLE = 1e-5
 """Modes of a component below this part of its greatest are left out: they hold less than 1e-3 of its variance."""
