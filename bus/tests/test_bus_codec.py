@@ -26,7 +26,7 @@ FAST = settings(max_examples=30, suppress_health_check=[HealthCheck.too_slow], d
 
 def test_the_fast_topics_have_codecs_of_their_own() -> None:
     fast = {row.type for row in contract().topics.values() if row.period_ms == 1 and not row.latched}
-    assert fast == STRUCT_CODECS.keys()
+    assert fast <= STRUCT_CODECS.keys()
 
 
 @pytest.mark.parametrize("name", TYPES)

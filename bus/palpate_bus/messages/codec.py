@@ -1,6 +1,6 @@
 """ROS 2 messages to and from little-endian CDR with its four-byte encapsulation header.
 
-The types of the 1 kHz topics have codecs of their own (`struct_codecs`); rosbags does the rest. The bytes are the same.
+The types of the control loop have codecs of their own (`struct_codecs`); rosbags does the rest. The bytes are the same.
 """
 
 from __future__ import annotations
@@ -81,8 +81,10 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
 
 
 def _rosbags_encoder(name: str) -> Callable[[Message], bytes]:
+    has_arrays = bool(_array_fields(name) or _fields_with_arrays(name))
+
     def encode(message: Message) -> bytes:
-        return bytes(store.serialize_cdr(_with_fitted_arrays(message, name), name))
+        return bytes(store.serialize_cdr(_with_fitted_arrays(message, name) if has_arrays else message, name))
 
     return encode
 
