@@ -34,7 +34,7 @@ MODES: Final = (("idle", (120, 130, 145)), ("active", (70, 190, 90)), ("safe hol
 """Driver modes by number (RobotStatus.MODE_*)."""
 
 LEVEL_COLORS: Final = ((70, 190, 90), (240, 200, 60), (220, 40, 40), (120, 130, 145))
-"""Of `words.LEVELS`."""
+"""In the order of `words.LEVELS`."""
 _LOG_LEVELS: Final = {"warning": "WARN", "ERROR": "ERROR"}
 
 JOINT_COLORS: Final = (
@@ -118,7 +118,7 @@ class Plots:
         self._add("plots/pace/real_time_factor", t, real_time_factor)
 
     def blame(self, t: int, share: Array) -> None:
-        """Of the waits that were seen, the part [1] that each of `BLAMED` was waited for, shape (k,)."""
+        """The part [1] of the observed waits that each of `BLAMED` was waited for, shape (k,)."""
         self._columns.add("plots/blame/roles", scalars, t, 100.0 * share)
 
     def state(self, t: int, path: str, name: str) -> bool:

@@ -256,14 +256,7 @@ class DashboardService(Service):
         if not self._is_due("text", t, TEXT_PERIOD):
             return
         self._due["text"] = t + TEXT_PERIOD
-        names = ("in_contact", "steady", "force_limited", "view_blocked")
-        flags = [name.replace("_", " ") for name in names if getattr(message, name)]
-        counts = (message.target_index, message.target_count, message.targets_skipped)
-        depth_mm = 1e3 * message.depth
-        page = words.status(
-            self._name, phase, message.message, counts, depth_mm, message.normal_force, flags, self._robot, self._pace
-        )
-        self._plots.document(t, "text/status", page)
+        self._plots.document(t, "text/status", words.status(self._name, phase, message, self._robot, self._pace))
 
     def _indentation(self, t: int, message: Message) -> None:
         self._pressed_n = message.normal_force

@@ -37,7 +37,7 @@ class Assessment:
     stiffness: Array
     """Median of k_w [N/m^3], shape (n,)."""
     lower: Array
-    """Of the 90 % band."""
+    """Lower end of the 90 % band."""
     upper: Array
     scanned: Mask
     """Within reach of a sample, shape (n,)."""

@@ -87,7 +87,7 @@ class Observations:
     steep: Array
     """d log F / d depth [1/m], shape (m,)."""
     squared_distance: Array
-    """Of the samples from each other [m^2], shape (m, m)."""
+    """Squared distances between the samples [m^2], shape (m, m)."""
     relative: Array
     """Noise of the force over the force [1], shape (m,)."""
     footprint: Array
@@ -97,7 +97,7 @@ class Observations:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of the noise, shape (m, m)."""
+        """Covariance of the noise, shape (m, m)."""
         return self.noise.covariance(self.steep, self.squared_distance, self.relative, self.spread)
 
 

@@ -126,7 +126,7 @@ class _Part:
         return block if self._envelope is None else block * self._envelope
 
     def _components(self, within: Array, modes: Array) -> Iterator[tuple[Array, Array, Array]]:
-        """Of each component: Bx, and its share of `within` as (m, ky, nx) and of `modes` as (m, ky, kx)."""
+        """Yields for each component Bx, and its share of `within` as (m, ky, nx) and of `modes` as (m, ky, kx)."""
         row = begin = 0
         for ky, along_x in zip(self._ky, self._along_x, strict=True):
             end = begin + ky * along_x.shape[1]

@@ -24,7 +24,7 @@ from palpate_models.scenario import ExamInput, Scenario
 
 FRAME = contract().topics["assessment/map"].frame or ""
 PITCH = 0.005
-"""Of the final map's grid [m]: a third of the footprint's radius."""
+"""Pitch of the final map's grid [m]: a third of the footprint's radius."""
 MARGIN = 0.020
 """The map's grid goes this far beyond the examined region [m]: what the footprint reaches."""
 GROWING_PITCH = 0.008
