@@ -14,17 +14,15 @@ from palpate_bus.messages import (
     IndentationTruth,
     PalpationSample,
     PhantomTruth,
+    Point,
+    Pose,
+    Quaternion,
     StiffnessMap,
     SurfaceMesh,
+    Vector3,
 )
-from palpate_bus.messages.codec import message_type
 from palpate_bus.messages.stamps import header
 from palpate_conductor.collector import Collected
-
-_Point: Any = message_type("geometry_msgs/msg/Point")
-_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
-_Pose: Any = message_type("geometry_msgs/msg/Pose")
-_Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
 
 LESION, FOUND, RADIUS = (-0.05, -0.05), (-0.046, -0.05), 0.03
 P_WA = (0.56, 0.0, 0.93)
@@ -51,7 +49,7 @@ def phantom() -> Any:
     background = np.full(len(vertices), 1.7e5)
     stiffness = background * (1 + 3 * np.clip(0.5 - beyond / 0.008, 0, 1))
     lesion = np.where(beyond < 0, 0, -1).astype(np.int32)
-    pose = _Pose(_Point(*P_WA), _Quaternion(0.0, 0.0, 0.0, 1.0))
+    pose = Pose(Point(*P_WA), Quaternion(0.0, 0.0, 0.0, 1.0))
     return PhantomTruth(mesh(vertices, triangles, "abdomen"), stiffness, background, lesion, pose)
 
 
@@ -76,7 +74,7 @@ def stiffness_map() -> Any:
 
 
 def findings(final: bool = True) -> Any:
-    one = Finding(_Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999)
+    one = Finding(Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999)
     return Findings(header(60_000_000_000, "abdomen"), [one], final)
 
 
@@ -85,8 +83,8 @@ def samples() -> list[Any]:
     return [
         PalpationSample(
             header=header(k * 100_000_000, "abdomen"),
-            position=_Point(float(x), float(y), 0.0),
-            normal=_Vector3(0.0, 0.0, 1.0),
+            position=Point(float(x), float(y), 0.0),
+            normal=Vector3(0.0, 0.0, 1.0),
             depth=0.01,
             normal_force=2.0 + 0.01 * k,
             tangential_speed=0.03,
@@ -113,8 +111,8 @@ def exam_states(measured_error: float) -> list[Any]:
             depth_setpoint=0.01,
             depth=0.01 + measured_error,
             normal_force=2.5,
-            surface_point=_Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
-            surface_normal=_Vector3(0.0, 0.0, 1.0),
+            surface_point=Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
+            surface_normal=Vector3(0.0, 0.0, 1.0),
             end_tick=-1,
         )
         for k in range(100)
@@ -130,7 +128,7 @@ def indentation(depth_error: float) -> list[Any]:
             tangential_force=0.5,
             peak_force=7.2 if k == 50 else 2.5,
             contacts=20,
-            surface_point=_Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
+            surface_point=Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
             stiffness=6.8e5,
         )
         for k in range(100)

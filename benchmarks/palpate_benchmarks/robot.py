@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
-from palpate_bus.messages.codec import message_type
+from palpate_bus.messages import JointTorqueCommand, Vector3, Wrench, WrenchStamped
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
@@ -47,18 +46,14 @@ def measure(steps: int = 2000) -> dict[str, float]:
 
     service = create(scenario)
     inbox = HandInbox()
-    command: Any = message_type("palpation_msgs/msg/JointTorqueCommand")
-    wrench: Any = message_type("geometry_msgs/msg/WrenchStamped")
-    parts: Any = message_type("geometry_msgs/msg/Wrench")
-    vector: Any = message_type("geometry_msgs/msg/Vector3")
-    contacts = [wrench(header(0, "world"), parts(vector(0.0, 0.0, f), vector(0.0, 0.0, 0.0))) for f in (2.5, -2.5)]
+    contacts = [WrenchStamped(header(0, "world"), Wrench(Vector3(0.0, 0.0, f), Vector3(0.0, 0.0, 0.0))) for f in (2.5, -2.5)]
     tick = 0
     torque = np.zeros(7)
 
     def service_step() -> None:
         nonlocal tick
         inbox.messages["sim/contact_wrench"] = contacts[tick // _MS % 2]
-        inbox.messages["control/joint_torque"] = command(header(tick), torque, duration_message(50 * _MS), "")
+        inbox.messages["control/joint_torque"] = JointTorqueCommand(header(tick), torque, duration_message(50 * _MS), "")
         tick += _MS
         service.step(tick, inbox)
 

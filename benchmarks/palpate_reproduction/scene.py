@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_bus.messages.geometry import transform_matrix
 from palpate_dashboard import arrays, palette, patient
 from palpate_dashboard.geometry import Carry, VertexNormals, creased
 from palpate_dashboard.replay import RecordedInbox, messages
@@ -103,7 +104,7 @@ class Stage:
     def _robot(self, moment: Moment) -> list[Body]:
         bodies = []
         for item in moment.link_poses.transforms:
-            X = arrays.matrix(arrays.transform(item.transform))
+            X = transform_matrix(item.transform)
             for vertices, triangles, normals, rgba in self._links.get(item.child_frame_id, ()):
                 color = [255.0 * channel for channel in rgba]
                 bodies.append(_body(apply(X, vertices.astype(np.float64)), triangles, normals @ X[:3, :3].T, color))

@@ -27,7 +27,7 @@ class RecordingError(ValueError):
     """A recording that cannot be used. Names file, topic, what was found and what is needed."""
 
 
-class Recorded(NamedTuple):
+class RecordedMessage(NamedTuple):
     """One recorded message."""
 
     stamp: int
@@ -55,7 +55,7 @@ class Recording:
     scenario: str | None
     """Scenario as YAML, when the file carries one."""
 
-    def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[Recorded]:
+    def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[RecordedMessage]:
         """Messages of `topics` in order of their stamps, from `begin` to `end` [ns], both included.
 
         Raises RecordingError when a file breaks off.
@@ -67,7 +67,8 @@ class Recording:
             streams = [stack.enter_context(file.open("rb")) for file in self.files]
             readers = [make_reader(stream).iter_messages(topics=names, starting_at=begin, ending_at=end) for stream in streams]
             each = [
-                (Recorded(m.log_time, channel.topic[1:], m.data, m.sequence) for _, channel, m in reader) for reader in readers
+                (RecordedMessage(m.log_time, channel.topic[1:], m.data, m.sequence) for _, channel, m in reader)
+                for reader in readers
             ]
             try:
                 yield from each[0] if len(each) == 1 else heapq.merge(*each, key=attrgetter("stamp"))

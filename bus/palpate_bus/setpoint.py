@@ -5,18 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.contract.checker import Checker
-from palpate_bus.messages import ImpedanceSetpoint
-from palpate_bus.messages.geometry import pose_message, rotation, twist, twist_message, vector, wrench, wrench_message
+from palpate_bus.contract.conformance import Checker
+from palpate_bus.messages import Duration, ImpedanceSetpoint
+from palpate_bus.messages.geometry import Array, pose_message, rotation, twist, twist_message, vector, wrench, wrench_message
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
-
-Array = NDArray[np.float64]
 
 TOPIC = "planning/setpoint"
 
@@ -57,7 +51,7 @@ class Setpoint:
     joint_stiffness: Array
     """JOINT: of the joints; CARTESIAN: of the null-space posture [N m/rad], shape (7,)."""
 
-    def message(self) -> Any:
+    def message(self) -> ImpedanceSetpoint:
         """`palpation_msgs/ImpedanceSetpoint`, valid for as long as the contract says."""
         return ImpedanceSetpoint(
             header=header(self.stamp, "world"),
@@ -74,8 +68,8 @@ class Setpoint:
         )
 
     @classmethod
-    def from_message(cls, message: Any) -> Setpoint:
-        """Of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field, its value and what is allowed."""
+    def from_message(cls, message: ImpedanceSetpoint) -> Setpoint:
+        """The set-point in a message. Raises ValueError that names the field, its value and what is allowed."""
         for wrong in _checker()(message):
             raise ValueError(f"{TOPIC}: {wrong.field} = {wrong.got}: must be {wrong.expected}")
         if message.mode not in tuple(ControlMode):
@@ -105,5 +99,5 @@ def _checker() -> Checker:
 
 
 @cache
-def _validity() -> Any:
+def _validity() -> Duration:
     return duration_message((contract().topics[TOPIC].expiry_ms or 0) * MS)

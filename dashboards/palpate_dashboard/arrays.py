@@ -6,28 +6,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from palpate_bus.messages import Transform
 from palpate_bus.messages.codec import Message
+from palpate_models.frames import Array
 
 
-def points(items: Any) -> NDArray[np.float64]:
+def points(items: Any) -> Array:
     """Points or Vector3s, shape (n, 3)."""
     return np.array([(p.x, p.y, p.z) for p in items], dtype=np.float64).reshape(-1, 3)
 
 
-def transform(message: Message) -> NDArray[np.float64]:
+def transform(message: Transform) -> Array:
     """A Transform as x y z [m] qx qy qz qw, shape (7,)."""
     p, q = message.translation, message.rotation
     return np.array((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-
-
-def matrix(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """X y z qx qy qz qw, shape (7,), as a homogeneous matrix, shape (4, 4)."""
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_quat(pose[3:]).as_matrix()
-    X[:3, 3] = pose[:3]
-    return X
 
 
 def triples(flat: NDArray[Any]) -> NDArray[Any]:

@@ -9,6 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from palpate_models.frames import Array
+
 TIMELINE = "sim_time"
 """The recording's only timeline: simulated time."""
 
@@ -17,12 +19,12 @@ Kind = Callable[[Sequence[Row]], Any]
 """Makes the columns of an entity from its rows."""
 
 
-def scalars(rows: Sequence[NDArray[np.float64]]) -> Any:
+def scalars(rows: Sequence[Array]) -> Any:
     """Plots: a row holds the values of an entity's series, shape (k,)."""
     return rr.Scalars.columns(scalars=np.concatenate(rows)).partition([len(row) for row in rows])
 
 
-def transforms(rows: Sequence[NDArray[np.float64]]) -> Any:
+def transforms(rows: Sequence[Array]) -> Any:
     """Poses: a row is x y z qx qy qz qw, shape (7,)."""
     table = np.stack(rows)
     return rr.Transform3D.columns(translation=table[:, :3], quaternion=table[:, 3:])
@@ -37,7 +39,7 @@ def deformations(rows: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]
     return columns.partition([len(positions) for positions, _ in rows])
 
 
-def arrows(rows: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Any:
+def arrows(rows: Sequence[tuple[Array, Array]]) -> Any:
     """Arrows: a row is origin and vector, shapes (3,)."""
     origins, vectors = zip(*rows, strict=True)
     return rr.Arrows3D.columns(origins=np.stack(origins), vectors=np.stack(vectors))

@@ -16,7 +16,7 @@ from palpate_dashboard.geometry import Array, Indices
 LAYERS: Final = ("mean", "band")
 
 
-class StiffnessMap:
+class MapView:
     """Draws the map into a recording. Positions are in A, metres; the third coordinate is dropped: it is seen from above."""
 
     def __init__(self, recording: rr.RecordingStream, region_m: tuple[float, float], centre_m: tuple[float, float]) -> None:
@@ -74,7 +74,7 @@ class StiffnessMap:
             mesh = rr.Mesh3D.from_fields(vertex_colors=np.where(scanned, colors, unknown).astype(np.uint32))
             self._recording.log(f"map/{layer}/surface", mesh)
 
-    def lesions(self, segments: Iterable[NDArray[np.float64]]) -> None:
+    def lesions(self, segments: Iterable[Array]) -> None:
         """True outlines of the lesions, one (k, 2, 3) array of segments each."""
         strips = [segment * (1, 1, 0) + (0, 0, 0.003) for outline in segments for segment in outline]
         shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])

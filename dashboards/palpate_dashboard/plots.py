@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_dashboard.columns import TIMELINE, Columns, scalars
 from palpate_dashboard.words import LEVELS, Health
+from palpate_models.frames import Array
 
 PHASES: Final = (
     ("home", (120, 130, 145)),
@@ -34,7 +34,7 @@ MODES: Final = (("idle", (120, 130, 145)), ("active", (70, 190, 90)), ("safe hol
 """Driver modes by number (RobotStatus.MODE_*)."""
 
 LEVEL_COLORS: Final = ((70, 190, 90), (240, 200, 60), (220, 40, 40), (120, 130, 145))
-"""Of `words.LEVELS`."""
+"""In the order of `words.LEVELS`."""
 _LOG_LEVELS: Final = {"warning": "WARN", "ERROR": "ERROR"}
 
 JOINT_COLORS: Final = (
@@ -105,7 +105,7 @@ class Plots:
         self._add("plots/depth/measured", t, 1e3 * measured_m if measured_m > DEPTH_FLOOR_M else np.nan)
         self._add("plots/depth/setpoint", t, 1e3 * setpoint_m if setpoint_m > DEPTH_FLOOR_M else np.nan)
 
-    def torques(self, t: int, share: NDArray[np.float64]) -> None:
+    def torques(self, t: int, share: Array) -> None:
         """Applied torques over their limits [1], shape (7,)."""
         self._columns.add("plots/torque/joints", scalars, t, 100.0 * share)
 
@@ -117,8 +117,8 @@ class Plots:
         """Simulated over wall time, over the last simulated second."""
         self._add("plots/pace/real_time_factor", t, real_time_factor)
 
-    def blame(self, t: int, share: NDArray[np.float64]) -> None:
-        """Of the waits that were seen, the part [1] that each of `BLAMED` was waited for, shape (k,)."""
+    def blame(self, t: int, share: Array) -> None:
+        """The part [1] of the observed waits that each of `BLAMED` was waited for, shape (k,)."""
         self._columns.add("plots/blame/roles", scalars, t, 100.0 * share)
 
     def state(self, t: int, path: str, name: str) -> bool:

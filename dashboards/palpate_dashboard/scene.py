@@ -37,20 +37,20 @@ class Shaded(NamedTuple):
     color: palette.Rgba
 
 
-class Scene:
+class SceneView:
     """Draws the scene into a recording. Poses are X_WB; positions are in world, metres."""
 
     def __init__(self, recording: rr.RecordingStream, columns: Columns) -> None:
         self._recording = recording
         self._columns = columns
-        self._poses: dict[str, NDArray[np.float64]] = {}
+        self._poses: dict[str, Array] = {}
         self._normals: VertexNormals | None = None
         self._rest: NDArray[np.float32] | None = None
         self._drawn: NDArray[np.float32] | None = None
         self._map_vertices: NDArray[np.float32] | None = None
         self._carry: Carry | None = None
         self._force_shown = False
-        self._trail: list[NDArray[np.float64]] = []
+        self._trail: list[Array] = []
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         red = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004])
         recording.log("world/tool/force", red, static=True)
@@ -90,7 +90,7 @@ class Scene:
             )
             self._recording.log(f"world/robot/{link}/shape_{i}", shape, static=True)
 
-    def link_poses(self, t: int, poses: Mapping[str, NDArray[np.float64]]) -> None:
+    def link_poses(self, t: int, poses: Mapping[str, Array]) -> None:
         """Poses of links by name: x y z [m] qx qy qz qw, shape (7,). A link that stands still is not written again."""
         for link, pose in poses.items():
             before = self._poses.get(link)
@@ -130,7 +130,7 @@ class Scene:
         self.at(t)
         self._recording.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)))
 
-    def lesions(self, segments: Iterable[NDArray[np.float64]]) -> None:
+    def lesions(self, segments: Iterable[Array]) -> None:
         """True outlines of the lesions, one (k, 2, 3) array of segments each. They stand still."""
         strips = [segment for outline in segments for segment in outline]
         shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
@@ -206,7 +206,7 @@ class Scene:
         shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(0.5)])
         self._recording.log("world/plan/path", shape)
 
-    def tool(self, t: int, position: NDArray[np.float64], in_contact: bool) -> None:
+    def tool(self, t: int, position: Array, in_contact: bool) -> None:
         """The tool's position, shape (3,): extends the travelled path."""
         if self._trail and np.abs(position - self._trail[-1]).max() < TRAIL_STEP_M:
             return
@@ -224,7 +224,7 @@ class Scene:
         self._recording.log("world/tool/travelled", shape)
         del self._trail[:-1]
 
-    def force(self, t: int, position: NDArray[np.float64], force: NDArray[np.float64]) -> None:
+    def force(self, t: int, position: Array, force: Array) -> None:
         """The contact force [N], shape (3,), that presses on the indenter at `position`; drawn beside the tool."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:

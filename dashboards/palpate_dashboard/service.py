@@ -13,9 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import MS, contract
 from palpate_bus.messages import RobotStatus
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import pose_matrix, transform_matrix
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, patient, plots, words
@@ -23,9 +24,9 @@ from palpate_dashboard.columns import Columns
 from palpate_dashboard.force_depth import ForceDepth, ForceDepthPlane
 from palpate_dashboard.geometry import VertexNormals, creased, level_lines
 from palpate_dashboard.layout import blueprint
-from palpate_dashboard.map import StiffnessMap
+from palpate_dashboard.map import MapView
 from palpate_dashboard.plots import Plots
-from palpate_dashboard.scene import Scene, Shaded
+from palpate_dashboard.scene import SceneView, Shaded
 from palpate_dashboard.sinks import Live, open_recording
 from palpate_models import lbr, table
 from palpate_models.band import half_width
@@ -35,7 +36,7 @@ from palpate_models.load import exam_input
 from palpate_models.scenario import Robot, Scenario
 
 FILE: Final = "recording.rrd"
-MS: Final = 1_000_000
+CAMERA_FRAME: Final = contract().topics["camera/depth/image_raw"].frame
 MESH_PERIOD: Final = 100 * MS
 PLOT_PERIOD: Final = 50 * MS
 TEXT_PERIOD: Final = 500 * MS
@@ -88,8 +89,8 @@ class DashboardService(Service):
         self._region = (exam.region_m, exam.centre_m)
         self._send_period = SEND_PERIOD_LIVE if paced and live != Live() else SEND_PERIOD
         self._columns = Columns(self._recording)
-        self._scene = Scene(self._recording, self._columns)
-        self._map = StiffnessMap(self._recording, exam.region_m, exam.centre_m)
+        self._scene = SceneView(self._recording, self._columns)
+        self._map = MapView(self._recording, exam.region_m, exam.centre_m)
         self._plots = Plots(self._recording, self._columns, limit, words.LEGEND)
         self._shapes = dict(_shapes(given.robot))
         for box in table.boxes(given.robot):
@@ -179,12 +180,14 @@ class DashboardService(Service):
             self._plots.pace(t, self._pace)
 
     def _link_poses(self, t: int, message: Message) -> None:
-        poses = {item.child_frame_id: arrays.transform(item.transform) for item in message.transforms}
+        transforms = {item.child_frame_id: item.transform for item in message.transforms}
+        poses = {frame: arrays.transform(transform) for frame, transform in transforms.items()}
         for link in poses.keys() & self._shapes.keys():
             self._scene.link_shape(link, self._shapes.pop(link))
         self._scene.link_poses(t, poses)
-        if lbr.LINK_NAMES[-1] in poses:
-            X_WI = arrays.matrix(poses[lbr.LINK_NAMES[-1]])
+        tool = transforms.get(lbr.LINK_NAMES[-1])
+        if tool is not None:
+            X_WI = transform_matrix(tool)
             self._scene.tool(t, X_WI[:3, 3], self._in_contact)
             self._scene.force(t, X_WI[:3, 3], -self._pressed_n * X_WI[:3, 2])
 
@@ -209,15 +212,14 @@ class DashboardService(Service):
             if inside.any():  # half contrast, on the part of the field that is not another lesion's
                 own = np.where(inside | (lesion < 0), ratio, 1.0)
                 outlines.append(level_lines(raised, triangles, own, (1.0 + float(own[inside].max())) / 2.0))
-        q, p = message.pose.orientation, message.pose.position
-        X_WA = arrays.matrix(np.array((p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
+        X_WA = pose_matrix(message.pose)
         self._map.lesions(outlines)
         self._scene.lesions([apply(X_WA, outline.reshape(-1, 3)).reshape(-1, 2, 3) for outline in outlines])
 
     def _tf_static(self, _t: int, message: Message) -> None:
         for item in message.transforms:
-            if item.child_frame_id == "camera_depth_optical_frame":
-                self._scene.camera(arrays.matrix(arrays.transform(item.transform)))
+            if item.child_frame_id == CAMERA_FRAME:
+                self._scene.camera(transform_matrix(item.transform))
 
     def _camera_info(self, _t: int, message: Message) -> None:
         self._scene.lens(np.asarray(message.k).reshape(3, 3), message.width, message.height)
@@ -254,14 +256,7 @@ class DashboardService(Service):
         if not self._is_due("text", t, TEXT_PERIOD):
             return
         self._due["text"] = t + TEXT_PERIOD
-        names = ("in_contact", "steady", "force_limited", "view_blocked")
-        flags = [name.replace("_", " ") for name in names if getattr(message, name)]
-        counts = (message.target_index, message.target_count, message.targets_skipped)
-        depth_mm = 1e3 * message.depth
-        page = words.status(
-            self._name, phase, message.message, counts, depth_mm, message.normal_force, flags, self._robot, self._pace
-        )
-        self._plots.document(t, "text/status", page)
+        self._plots.document(t, "text/status", words.status(self._name, phase, message, self._robot, self._pace))
 
     def _indentation(self, t: int, message: Message) -> None:
         self._pressed_n = message.normal_force

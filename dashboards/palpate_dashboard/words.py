@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from palpate_bus.messages import ExamState
 from palpate_bus.messages.codec import Message
 
 LEVELS = ("ok", "warning", "ERROR", "stale")
 """diagnostic_msgs/DiagnosticStatus levels."""
 SEVERITY = {"ok": 0, "stale": 1, "warning": 2, "ERROR": 3}
-"""Of each of them: the worst is shown first."""
+"""The order of these levels: the worst is shown first."""
+CONTACT_FLAGS = ("in_contact", "steady", "force_limited", "view_blocked")
+"""Fields of ExamState that are listed where they hold."""
 
 LEGEND = """
 | in the scene | |
@@ -36,21 +39,19 @@ LEGEND = """
 """
 
 
-def status(
-    scenario: str, phase: str, message: str, counts: tuple[int, int, int], depth_mm: float, force_n: float,
-    flags: Sequence[str], robot: str, real_time_factor: float | None,
-) -> str:  # fmt: skip
-    """The state of the exam. `counts`: targets visited, in all, and skipped."""
-    visited, total, skipped = counts
+def status(scenario: str, phase: str, exam: ExamState, robot: str, real_time_factor: float | None) -> str:
+    """The page on the state of the examination; `robot` is the driver's mode in words."""
+    flags = [name.replace("_", " ") for name in CONTACT_FLAGS if getattr(exam, name)]
+    depth_mm = 1e3 * exam.depth
     pace = [] if real_time_factor is None else [f"| pace | {real_time_factor:.1f} x real time |"]
     depth = f"{depth_mm:.1f} mm" if depth_mm > -20 else "not in contact"
     return "\n".join((
-        f"**{scenario}: {phase}.** {message}",
+        f"**{scenario}: {phase}.** {exam.message}",
         "",
-        f"| targets | {visited} of {total}, {skipped} skipped |",
+        f"| targets | {exam.target_index} of {exam.target_count}, {exam.targets_skipped} skipped |",
         "|---|---|",
         f"| depth | {depth} |",
-        f"| normal force | {force_n:.1f} N |",
+        f"| normal force | {exam.normal_force:.1f} N |",
         f"| contact | {', '.join(flags) or 'none'} |",
         f"| driver | {robot} |",
         *pace,

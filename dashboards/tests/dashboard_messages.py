@@ -9,21 +9,46 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from palpate_bus import messages as m
 from palpate_bus.contract import contract
-from palpate_bus.messages.codec import message_type
+from palpate_bus.messages import (
+    CameraInfo,
+    Clock,
+    DiagnosticArray,
+    DiagnosticStatus,
+    ExamState,
+    Finding,
+    Findings,
+    Image,
+    IndentationTruth,
+    KeyValue,
+    PalpationTargets,
+    Path,
+    PhantomTruth,
+    Point,
+    PointCloud2,
+    PointField,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    RegionOfInterest,
+    RobotStatus,
+    StiffnessMap,
+    SurfaceMesh,
+    TFMessage,
+    Transform,
+    TransformStamped,
+    Vector3,
+    Wrench,
+)
 from palpate_bus.messages.stamps import header, time_message
 from palpate_models import lbr
+from palpate_models.frames import Array
 from palpate_models.scenario import Robot
 
 MS = 1_000_000
 OBSERVED = frozenset(topic.name for topic, _ in contract().inputs("dashboard"))
 Messages = dict[str, Any]
 X_WA = np.array((0.56, 0.0, 0.93))
-_Point = message_type("geometry_msgs/msg/Point")
-_Vector = message_type("geometry_msgs/msg/Vector3")
-_Quaternion = message_type("geometry_msgs/msg/Quaternion")
-_Pose = message_type("geometry_msgs/msg/Pose")
 
 
 class FakeInbox:
@@ -52,7 +77,7 @@ class FakeInbox:
         return False
 
 
-def forward(joints: NDArray[np.float64], robot: Robot) -> dict[str, tuple[NDArray[np.float64], Rotation]]:
+def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:
     """Link positions and rotations in world."""
     position = np.array((*robot.base_xy_m, robot.base_height_m))
     rotation = Rotation.from_euler("z", robot.base_yaw_rad)
@@ -83,24 +108,23 @@ def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 def surface(t: int, vertices: NDArray[np.float32], triangles: NDArray[np.uint32], frame: str) -> Any:
-    return m.SurfaceMesh(header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
+    return SurfaceMesh(header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
 
 
-def pose(position: NDArray[np.float64], rotation: Rotation | None = None) -> Any:
+def pose(position: Array, rotation: Rotation | None = None) -> Any:
     q = (0.0, 0.0, 0.0, 1.0) if rotation is None else rotation.as_quat()
-    return _Pose(_Point(*map(float, position)), _Quaternion(*map(float, q)))
+    return Pose(Point(*map(float, position)), Quaternion(*map(float, q)))
 
 
-def transforms(t: int, poses: dict[str, tuple[NDArray[np.float64], Rotation]]) -> Any:
-    stamped, transform = m.TransformStamped, message_type("geometry_msgs/msg/Transform")
+def transforms(t: int, poses: dict[str, tuple[Array, Rotation]]) -> Any:
     items = [
-        stamped(header(t, "world"), link, transform(_Vector(*map(float, p)), _Quaternion(*map(float, r.as_quat()))))
+        TransformStamped(header(t, "world"), link, Transform(Vector3(*map(float, p)), Quaternion(*map(float, r.as_quat()))))
         for link, (p, r) in poses.items()
     ]
-    return message_type("tf2_msgs/msg/TFMessage")(items)
+    return TFMessage(items)
 
 
-def ratio_field(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
+def ratio_field(vertices: NDArray[np.float32]) -> Array:
     d = np.hypot(vertices[:, 0] + 0.05, vertices[:, 1] + 0.05)
     return np.asarray(1.0 + 3.0 / (1.0 + np.exp(np.minimum((d - 0.03) / 0.003, 50.0))))
 
@@ -111,7 +135,7 @@ def latched(scenario_robot: Robot) -> Messages:
     ratio = ratio_field(vertices)
     lesion = np.where(ratio > 2.5, 0, -1).astype(np.int32)
     background = np.full(len(vertices), 1.7e5)
-    truth = m.PhantomTruth(surface(0, vertices, triangles, "abdomen"), ratio * background, background, lesion, pose(X_WA))
+    truth = PhantomTruth(surface(0, vertices, triangles, "abdomen"), ratio * background, background, lesion, pose(X_WA))
     camera = np.array((0.95, -0.45, 1.85))
     z = (np.array((0.56, 0.0, 0.9)) - camera) / np.linalg.norm(np.array((0.56, 0.0, 0.9)) - camera)
     x = np.cross(z, (0, 0, 1.0))
@@ -125,41 +149,35 @@ def look(t: int) -> Messages:
     image += 0.1 * np.hypot(*np.meshgrid(np.linspace(-1, 1, 640), np.linspace(-1, 1, 480))).astype(np.float32)
     image[:20] = np.nan
     k = np.array((585.0, 0, 319.5, 0, 585.0, 239.5, 0, 0, 1))
-    info = message_type("sensor_msgs/msg/CameraInfo")
-    roi = message_type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+    roi = RegionOfInterest(0, 0, 0, 0, False)
     frame = "camera_depth_optical_frame"
     vertices, triangles = dome()
     world = (vertices + X_WA).astype(np.float32)
-    field = message_type("sensor_msgs/msg/PointField")
-    fields = [field(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
+    fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
     cloud = world.repeat(5, axis=0)
     cloud[0] = np.nan
     packed = np.ascontiguousarray(cloud).view(np.uint8).ravel()
     targets = world[(np.abs(vertices[:, :2]) < 0.1).all(axis=1)][::3]
     return {
-        "camera/depth/camera_info": info(
+        "camera/depth/camera_info": CameraInfo(
             header(t, frame), 480, 640, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), np.zeros(12), 0, 0, roi
         ),
-        "camera/depth/image_raw": message_type("sensor_msgs/msg/Image")(
-            header(t, frame), 480, 640, "32FC1", 0, 2560, image.view(np.uint8).ravel()
-        ),
-        "perception/points": message_type("sensor_msgs/msg/PointCloud2")(
-            header(t, "world"), 1, len(cloud), fields, False, 12, 12 * len(cloud), packed, False
-        ),
+        "camera/depth/image_raw": Image(header(t, frame), 480, 640, "32FC1", 0, 2560, image.view(np.uint8).ravel()),
+        "perception/points": PointCloud2(header(t, "world"), 1, len(cloud), fields, False, 12, 12 * len(cloud), packed, False),
         "perception/surface": surface(t, world, triangles, "world"),
-        "perception/targets": m.PalpationTargets(
+        "perception/targets": PalpationTargets(
             header(t, "world"),
-            [_Point(*map(float, p)) for p in targets],
-            [_Vector(0.0, 0.0, 1.0)] * len(targets),
+            [Point(*map(float, p)) for p in targets],
+            [Vector3(0.0, 0.0, 1.0)] * len(targets),
             np.zeros(len(targets), np.uint32),
             0.001,
             20,
             1.0,
             "",
         ),
-        "planning/path": message_type("nav_msgs/msg/Path")(
+        "planning/path": Path(
             header(t, "world"),
-            [m.PoseStamped(header(t, "world"), pose(p + np.array((0, 0, 0.02)))) for p in targets],
+            [PoseStamped(header(t, "world"), pose(p + np.array((0, 0, 0.02)))) for p in targets],
         ),
     }
 
@@ -169,7 +187,7 @@ def stiffness_map(t: int, share: float) -> Any:
     scanned = (np.abs(vertices[:, :2]) < 0.1).all(axis=1) & (vertices[:, 1] < -0.1 + 0.2 * share)
     mean = (1.7e5 * ratio_field(vertices)).astype(np.float32)
     none = np.full(len(vertices), -1, np.int32)
-    return m.StiffnessMap(
+    return StiffnessMap(
         header(t, "abdomen"),
         vertices.ravel(),
         triangles.ravel(),
@@ -186,28 +204,28 @@ def stiffness_map(t: int, share: float) -> Any:
 
 
 def findings(t: int) -> Any:
-    item = m.Finding(_Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99)
-    return m.Findings(header(t, "abdomen"), [item], True)
+    item = Finding(Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99)
+    return Findings(header(t, "abdomen"), [item], True)
 
 
-def robot_status(t: int, torque: NDArray[np.float64]) -> Any:
+def robot_status(t: int, torque: Array) -> Any:
     """The rest of the message is not drawn."""
     zero = np.zeros(7)
     rest = {
         "position": zero,
         "velocity": zero,
-        "wrench": message_type("geometry_msgs/msg/Wrench")(_Vector(0.0, 0.0, 0.0), _Vector(0.0, 0.0, 0.0)),
+        "wrench": Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)),
         "applied_torque": torque,
         "commands_rejected": 0,
     }
-    return m.RobotStatus(header=header(t), mode=1, cause=0, reason="", **rest)
+    return RobotStatus(header=header(t), mode=1, cause=0, reason="", **rest)
 
 
 def exam(t: int, phase: int, message: str, depth: float, force: float, visited: int) -> Any:
     pressed = force > 0.1
-    return m.ExamState(
+    return ExamState(
         header(t, "world"), phase, message, visited, 200, 1, pressed, pressed, False, False, 0.01 if pressed else 0.0,
-        depth, force, _Point(0.0, 0.0, 0.0), _Vector(0.0, 0.0, 1.0), -1,
+        depth, force, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1,
     )  # fmt: skip
 
 
@@ -234,11 +252,9 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
             "sim/link_poses": transforms(t, poses),
             "sim/surface": surface(t, moved.astype(np.float32), triangles, "world"),
             "exam/state": exam(t, phase, "scanning line 3" if pressing else "", depth, force, int(200 * s)),
-            "truth/indentation": m.IndentationTruth(
-                header(t, "world"), depth, force, 0.3, force, 9, _Point(0.0, 0.0, 0.0), 1.7e5
-            ),
+            "truth/indentation": IndentationTruth(header(t, "world"), depth, force, 0.3, force, 9, Point(0.0, 0.0, 0.0), 1.7e5),
             "robot/status": robot_status(t, 20.0 * np.sin(6 * s + np.arange(7.0))),
-            "clock": message_type("rosgraph_msgs/msg/Clock")(time_message(t)),
+            "clock": Clock(time_message(t)),
         }
         if 0.1 < s < 0.3:
             new |= look(t)
@@ -247,7 +263,8 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
         if s > 0.95:
             new["assessment/findings"] = findings(t)
         if t % (1000 * MS) == 0:
-            status, pair = m.DiagnosticStatus, message_type("diagnostic_msgs/msg/KeyValue")
-            rows = [status(0, role, "running", "", [pair("step", "0.1 ms")]) for role in ("robot", "tissue", "control")]
-            new["diagnostics"] = message_type("diagnostic_msgs/msg/DiagnosticArray")(header(t), rows)
+            rows = [
+                DiagnosticStatus(0, role, "running", "", [KeyValue("step", "0.1 ms")]) for role in ("robot", "tissue", "control")
+            ]
+            new["diagnostics"] = DiagnosticArray(header(t), rows)
         yield t, new

@@ -15,8 +15,7 @@ from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.codec import message_type
+from palpate_bus.messages import KeyValue, codec
 from palpate_dashboard import replay
 from palpate_dashboard.columns import TIMELINE
 from palpate_dashboard.plots import BLAMED
@@ -300,10 +299,9 @@ def test_force_over_depth_holds_every_reading_in_contact_once(whole: tuple[Recor
 
 def test_blame_is_of_those_who_were_waited_for(tmp_path: Path) -> None:
     messages = list(run(3.0, Scenario().robot))
-    pair = message_type("diagnostic_msgs/msg/KeyValue")
     for _, new in messages:
         for status, what in zip(new["diagnostics"].status if "diagnostics" in new else (), WAITS, strict=False):
-            status.values = [pair("waiting_for", what)]
+            status.values = [KeyValue("waiting_for", what)]
     draw(tmp_path / FILE, messages, without=("sim/surface", "camera/depth/image_raw", "perception/points"))
     rows = Recording(tmp_path / FILE).cells("/plots/blame/roles", "Scalars:scalars")
     share = dict(zip(BLAMED, rows[-1][1].as_py(), strict=True))

@@ -2,16 +2,13 @@
 
 import numpy as np
 
-from palpate_bus.messages import ExamState, Finding, Findings
-from palpate_bus.messages.codec import message_type
+from palpate_bus.messages import ExamState, Finding, Findings, Point
 from palpate_bus.messages.stamps import header
 from palpate_bus.run import main
 from palpate_bus.service import Service
 from palpate_models.frames import apply, inverse
 from palpate_models.load import exam_input, load_scenario
 from palpate_models.phantom import quadrant
-
-Point = message_type("geometry_msgs/msg/Point")
 
 
 class Threshold(Service):

@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, sin, sqrt
-
-_SMALL_RAD = 1e-3
-"""Below this angle the series to its fourth power is exact in double precision."""
+from math import sqrt
 
 Rows = Sequence[Sequence[float]]
 """A matrix, row by row, as numpy's `tolist` gives it."""
-
-
-def quaternion_of(r: Sequence[float]) -> tuple[float, float, float, float]:
-    """Unit quaternion (x, y, z, w) of a rotation vector [rad] no longer than pi, length 3; w >= 0."""
-    square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-    angle = sqrt(square)
-    scale = sin(angle / 2.0) / angle if angle > _SMALL_RAD else 0.5 - square / 48.0 + square * square / 3840.0
-    return scale * r[0], scale * r[1], scale * r[2], cos(angle / 2.0)
 
 
 def quaternion(R: Rows) -> tuple[float, float, float, float]:

@@ -18,6 +18,7 @@ from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
+from palpate_bus.messages.arrays import array_dtype
 from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import parse_token
@@ -94,7 +95,7 @@ def _field(description: Any, rng: random.Random) -> Any:
     size = detail[1] if kind == Nodetype.ARRAY else rng.randrange(4)
     item_kind, item = detail[0]
     if item_kind == Nodetype.BASE and item[0] != "string":
-        dtype = np.dtype({"bool": "?", "byte": "i1", "char": "u1"}.get(item[0], item[0]))
+        dtype = array_dtype(item[0])
         if item[0] == "bool":
             return np.array([rng.random() < 0.5 for _ in range(size)], dtype)
         return np.frombuffer(rng.randbytes(size * dtype.itemsize), dtype)

@@ -10,7 +10,7 @@ import numpy as np
 from palpate.replay.fields import Value, flat
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages import codec
-from palpate_bus.recordings import Recorded
+from palpate_bus.recordings import RecordedMessage
 
 RELATIVE = 1e-6
 """Default tolerance, as a part of a field's range in the contract; without a range, of the value or of one, whichever is more.
@@ -93,15 +93,15 @@ class TopicResult:
 
 
 def compare(
-    expected: Iterable[Recorded],
-    sent: Iterable[Recorded],
+    expected: Iterable[RecordedMessage],
+    sent: Iterable[RecordedMessage],
     rules: Contract,
     tolerance: Tolerance,
     topics: Iterable[str],
 ) -> dict[str, TopicResult]:
     """Pairs messages by topic and sequence number; both streams are in order of their stamps. `topics` are those compared."""
     results = {name: TopicResult(name) for name in topics}
-    waiting: dict[tuple[str, int], Recorded] = {}
+    waiting: dict[tuple[str, int], RecordedMessage] = {}
     recorded = iter(expected)
     following = next(recorded, None)
     for now in sent:
@@ -129,7 +129,7 @@ def compare(
     return results
 
 
-def _differ(result: TopicResult, topic: Topic, then: Recorded, now: Recorded, tolerance: Tolerance) -> None:
+def _differ(result: TopicResult, topic: Topic, then: RecordedMessage, now: RecordedMessage, tolerance: Tolerance) -> None:
     decode = codec.decoder(topic.type)
     was, is_now = list(flat(decode(then.payload))), list(flat(decode(now.payload)))
     if [name for name, _ in was] != [name for name, _ in is_now]:

@@ -14,7 +14,7 @@ from palpate.replay.reference import cut, rounded, write_reference
 from palpate.replay.rerun import rerun
 from palpate.replay.services import factory
 from palpate_bus.contract import MS, Contract, contract
-from palpate_bus.recordings import Recorded, Recording, RecordingError, open_recording
+from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Service
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
@@ -111,6 +111,6 @@ def make_reference(case: Case, path: Path, begin: int, end: int) -> None:
     write_reference(path, case.rules, chain(given, _rounded(answered, case.rules)), case.scenario)
 
 
-def _rounded(messages: Iterator[Recorded], rules: Contract) -> Iterator[Recorded]:
+def _rounded(messages: Iterator[RecordedMessage], rules: Contract) -> Iterator[RecordedMessage]:
     for message in messages:
         yield message._replace(payload=rounded(rules.topics[message.topic], message.payload))

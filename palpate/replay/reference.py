@@ -18,20 +18,20 @@ from mcap.writer import CompressionType, Writer
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds, time_message
-from palpate_bus.recordings import SCENARIO, Recorded, Recording
+from palpate_bus.recordings import SCENARIO, RecordedMessage, Recording
 
 DROPPED_BITS = np.int64(~((1 << 29) - 1))
 """Keeps 23 of the 52 fraction bits of a double, and so 24 significant ones."""
 
 
-def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int, end: int) -> Iterator[Recorded]:
+def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int, end: int) -> Iterator[RecordedMessage]:
     """The messages of `topics` from `begin` to `end` [ns], rounded, shifted to zero and numbered anew.
 
     What each topic carried last before `begin` comes first, as a late joiner would find it.
     """
     names = tuple(topics)
     numbers = dict.fromkeys(names, 0)
-    before: dict[str, Recorded] = {}
+    before: dict[str, RecordedMessage] = {}
     if begin > 0:
         for message in recording.messages(names, None, begin - 1):
             before[message.topic] = message
@@ -41,10 +41,10 @@ def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int
         numbers[topic.name] += 1
         stamp = message.stamp - begin
         sequence = stamp // topic.period + 1 if topic.periodic else numbers[topic.name]
-        yield Recorded(stamp, topic.name, rounded(topic, message.payload, begin), sequence)
+        yield RecordedMessage(stamp, topic.name, rounded(topic, message.payload, begin), sequence)
 
 
-def replace_stamp(message: Recorded, stamp: int) -> Recorded:
+def replace_stamp(message: RecordedMessage, stamp: int) -> RecordedMessage:
     """The message as if it had been sent at `stamp` [ns]."""
     return message._replace(stamp=stamp)
 
@@ -73,7 +73,7 @@ def _round(values: Any) -> Any:
     return (np.ascontiguousarray(values).view(np.int64) & DROPPED_BITS).view(np.float64)
 
 
-def write_reference(path: Path, rules: Contract, messages: Iterable[Recorded], scenario: str) -> None:
+def write_reference(path: Path, rules: Contract, messages: Iterable[RecordedMessage], scenario: str) -> None:
     """Writes a reference file; an old one is replaced only when the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")

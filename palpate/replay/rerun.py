@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from palpate_bus.contract import Contract, Edge
-from palpate_bus.recordings import Recorded
+from palpate_bus.recordings import RecordedMessage
 from palpate_bus.runtime.lockstep import Received, Stepper
 from palpate_bus.service import Service
 
 
-def rerun(service: Service, rules: Contract, inputs: Iterable[Recorded], end: int) -> Iterator[Recorded]:
+def rerun(service: Service, rules: Contract, inputs: Iterable[RecordedMessage], end: int) -> Iterator[RecordedMessage]:
     """What `service` sends when it gets `inputs` (in order of their stamps), from its start to the tick `end` [ns].
 
     At tick T it sees what it saw in the run: `same_tick` messages up to T, `previous` ones up to T less their topic's period. An
@@ -20,10 +20,10 @@ def rerun(service: Service, rules: Contract, inputs: Iterable[Recorded], end: in
     stepper = Stepper(service, rules)
     late = {name for name, buffer in stepper.buffers.items() if buffer.edge is Edge.OBSERVE}
     for port, payload, sequence in stepper.start():
-        yield Recorded(0, port.topic.name, payload, sequence)
+        yield RecordedMessage(0, port.topic.name, payload, sequence)
     source = iter(inputs)
     following = next(source, None)
-    held: list[Recorded] = []
+    held: list[RecordedMessage] = []
     for t in range(0, end + 1, stepper.role.period):
         for message in held:
             stepper.buffers[message.topic].deliver(Received(message.payload, message.stamp, message.sequence))
@@ -36,4 +36,4 @@ def rerun(service: Service, rules: Contract, inputs: Iterable[Recorded], end: in
                 stepper.buffers[following.topic].deliver(received)
             following = next(source, None)
         for port, payload, sequence in stepper.step(t):
-            yield Recorded(t, port.topic.name, payload, sequence)
+            yield RecordedMessage(t, port.topic.name, payload, sequence)

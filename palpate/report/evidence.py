@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from palpate.report.scoring import Map, Truth
+from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.frames import apply, inverse
 
@@ -60,15 +60,6 @@ class Contact:
 def points(message: Any, field: str = "vertices") -> Array:
     """A flat array of a message as points, shape (n, 3)."""
     return np.asarray(getattr(message, field), dtype=np.float64).reshape(-1, 3)
-
-
-def pose_matrix(pose: Any) -> Array:
-    """Homogeneous matrix, shape (4, 4), of a geometry_msgs/Pose."""
-    X = np.eye(4)
-    q, p = pose.orientation, pose.position
-    X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-    X[:3, 3] = p.x, p.y, p.z
-    return X
 
 
 def truth_of(message: Any) -> Truth:

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.checker import Kind
+from palpate_bus.contract.conformance import ViolationKind
 from palpate_bus.wire.liveliness import NodeTokens, parse_token
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.zenoh_config import BusOptions, session
@@ -152,7 +152,7 @@ def test_tf_is_where_the_described_arm_is_at_its_measured_joints(bag: AnyReader)
         assert np.linalg.norm(X[:3, 3] - data.oMf[model.getFrameId("indenter")].translation) < 0.01
 
 
-PACE = {str(kind) for kind in (Kind.AGE, Kind.RATE, Kind.SILENT)}
+PACE = {str(kind) for kind in (ViolationKind.AGE, ViolationKind.RATE, ViolationKind.SILENT)}
 """Violations that an overloaded machine makes by itself."""
 
 
@@ -169,6 +169,6 @@ def test_diagnostics_name_every_service_and_topic_and_a_sound_run_violates_nothi
             assert status.level in (0, 1, 2, 3)
             assert status.message
             assert status.hardware_id
-            found = {item.key for item in status.values} & {str(kind) for kind in Kind}
+            found = {item.key for item in status.values} & {str(kind) for kind in ViolationKind}
             assert found <= PACE, f"{status.name}: {status.message}"
             assert status.level < 2 or found or "expected" in status.message

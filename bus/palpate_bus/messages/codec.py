@@ -1,22 +1,21 @@
-"""ROS 2 messages in CDR, by `rosbags`, with the interfaces of ROS 2 Jazzy and of `palpation_msgs`.
+"""ROS 2 messages to and from little-endian CDR with its four-byte encapsulation header.
 
-A message type is named as in ROS (`sensor_msgs/msg/JointState`). `message_type(name)` is its dataclass; `encode` and `decode`
-convert to and from little-endian CDR with its four-byte encapsulation header; `type_hash` is the RIHS01 hash that rmw_zenoh
-puts into the key.
+The types of the control loop have codecs of their own (`struct_codecs`); rosbags does the rest. The bytes are the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
-from pathlib import Path
+from dataclasses import replace
+from functools import cache
 from typing import Any
 
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+import numpy as np
+from rosbags.interfaces import Nodetype
 
-from palpate_bus.messages import cdr
-from palpate_bus.messages.cdr_parts import CodecError
-from palpate_bus.messages.cdr_writer import Codec
+from palpate_bus.messages.arrays import array_dtype, fitted
+from palpate_bus.messages.struct_codecs import ENCAPSULATION, STRUCT_CODECS
+from palpate_bus.messages.typestore import CodecError, message_type, palpation_definitions, store, type_hash
 
 __all__ = [
     "CodecError",
@@ -32,60 +31,7 @@ __all__ = [
 ]
 
 Message = Any
-"""A message instance. Message classes are generated at run time from .msg files, so they have no static type."""
-
-
-def _interface_package() -> Path:
-    """The folder of the ROS 2 interface package `palpation_msgs`, in a wheel or in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    packaged = package / "palpation_msgs"
-    return packaged if packaged.is_dir() else package.parent / "palpation_msgs"
-
-
-def palpation_definitions() -> dict[str, str]:
-    """The .msg text of every message of `palpation_msgs`, by type name."""
-    return {
-        f"palpation_msgs/msg/{path.stem}": path.read_text(encoding="utf-8")
-        for path in sorted((_interface_package() / "msg").glob("*.msg"))
-    }
-
-
-def _load_store() -> Any:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types: dict[str, Any] = {}
-    for name, text in palpation_definitions().items():
-        types.update(get_types_from_msg(text, name))
-    store.register(types)
-    return store
-
-
-store: Any = _load_store()
-"""The rosbags typestore: ROS 2 Jazzy's interfaces and ours."""
-
-
-@cache
-def message_type(name: str) -> Any:
-    """The dataclass of a message type, e.g. `message_type("std_msgs/msg/Header")`.
-
-    Raises CodecError if neither ROS 2 Jazzy nor `palpation_msgs` has it.
-    """
-    try:
-        return store.types[name]
-    except KeyError:
-        raise CodecError(f"no such message type: {name!r} (ROS 2 Jazzy and palpation_msgs are known)") from None
-
-
-@cache
-def type_hash(name: str) -> str:
-    """The RIHS01 hash of a message type, `RIHS01_<64 hex digits>`."""
-    message_type(name)
-    return str(store.hash_rihs01(name))
-
-
-@cache
-def _fast(name: str) -> Codec:
-    """The generated codec of a type inside others. Raises KeyError if it has a field that only rosbags knows how to encode."""
-    return cdr.nested(store, name, _fast)
+"""A message of any class. Where the class is known, `palpate_bus.messages` has it with its fields."""
 
 
 def encode(message: Message, name: str) -> bytes:
@@ -102,32 +48,85 @@ def decode(payload: bytes | memoryview, name: str) -> Message:
 def encoder(name: str) -> Callable[[Message], bytes]:
     """`encode` for one type, for hot paths."""
     message_type(name)
-    try:
-        return cdr.encoder(store, name, _fast)
-    except KeyError:
-        return partial(_rosbags_encode, name)
+    own = STRUCT_CODECS.get(name)
+    encode_message = own.encode if own else _rosbags_encoder(name)
+
+    def encode(message: Message) -> bytes:
+        try:
+            return encode_message(message)
+        except Exception as error:
+            raise CodecError(f"{name}: cannot encode: {error}") from error
+
+    return encode
 
 
 @cache
 def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
     """`decode` for one type, for hot paths."""
     message_type(name)
-    other = partial(_rosbags_decode, name)
-    try:
-        return cdr.decoder(store, name, _fast, other)
-    except KeyError:
-        return other
+    own = STRUCT_CODECS.get(name)
+
+    def decode(payload: bytes | memoryview) -> Message:
+        try:
+            if own is None or payload[:2] != ENCAPSULATION[:2]:  # rosbags reads big-endian messages too
+                return store.deserialize_cdr(memoryview(payload), name)
+            message, end = own.decode(bytes(payload))
+            if not 0 <= len(payload) - end < 4:  # some encoders pad the end to a multiple of four
+                raise ValueError(f"the message ends at {end}")
+        except Exception as error:
+            raise CodecError(f"{name}: cannot decode {len(payload)} bytes: {error}") from error
+        return message
+
+    return decode
 
 
-def _rosbags_encode(name: str, message: Message) -> bytes:
-    try:
-        return bytes(store.serialize_cdr(message, name))
-    except Exception as error:
-        raise CodecError(f"{name}: cannot encode: {error}") from error
+def _rosbags_encoder(name: str) -> Callable[[Message], bytes]:
+    has_arrays = bool(_array_fields(name) or _fields_with_arrays(name))
+
+    def encode(message: Message) -> bytes:
+        return bytes(store.serialize_cdr(_with_fitted_arrays(message, name) if has_arrays else message, name))
+
+    return encode
 
 
-def _rosbags_decode(name: str, payload: bytes | memoryview) -> Message:
-    try:
-        return store.deserialize_cdr(payload, name)
-    except Exception as error:
-        raise CodecError(f"{name}: cannot decode {len(payload)} bytes: {error!r}") from error
+def _with_fitted_arrays(message: Message, name: str, path: str = "") -> Message:
+    """The message with arrays of the types and layouts that its fields have: rosbags takes an array's bytes as they are."""
+    changed: dict[str, Any] = {}
+    for field, dtype, length in _array_fields(name):
+        value = getattr(message, field)
+        array = fitted(value, dtype, length, path + field)
+        if array is not value:
+            changed[field] = array
+    for field, nested, repeated in _fields_with_arrays(name):
+        value = getattr(message, field)
+        if repeated:
+            changed[field] = [_with_fitted_arrays(item, nested, f"{path}{field}.") for item in value]
+        else:
+            inner = _with_fitted_arrays(value, nested, f"{path}{field}.")
+            if inner is not value:
+                changed[field] = inner
+    return replace(message, **changed) if changed else message
+
+
+@cache
+def _array_fields(name: str) -> tuple[tuple[str, np.dtype[Any], int | None], ...]:
+    """Name, type and length (None: any) of each array of numbers in a message type, nested messages left out."""
+    found = []
+    for field, (kind, detail) in store.get_msgdef(name).fields:
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            item_kind, item = detail[0]
+            if item_kind == Nodetype.BASE and item[0] != "string":
+                found.append((field, array_dtype(item[0]), detail[1] if kind == Nodetype.ARRAY else None))
+    return tuple(found)
+
+
+@cache
+def _fields_with_arrays(name: str) -> tuple[tuple[str, str, bool], ...]:
+    """Name, message type and whether it is a sequence of each field of a message type whose messages hold arrays of numbers."""
+    found = []
+    for field, (kind, detail) in store.get_msgdef(name).fields:
+        repeated = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        item_kind, item = detail[0] if repeated else (kind, detail)
+        if item_kind == Nodetype.NAME and (_array_fields(item) or _fields_with_arrays(item)):
+            found.append((field, item, repeated))
+    return tuple(found)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ def quaternion(R: Array) -> tuple[float, float, float, float]:
     return x / norm, y / norm, z / norm, w / norm
 
 
-def rotation(orientation: Any) -> Array:
+def rotation(orientation: Quaternion) -> Array:
     """Rotation matrix, shape (3, 3), of a `geometry_msgs/Quaternion`. Raises ValueError if its norm is off by 1 % or more."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     norm = sqrt(x * x + y * y + z * z + w * w)
@@ -48,38 +47,55 @@ def rotation(orientation: Any) -> Array:
     )
 
 
-def pose_message(R: Array, p: Array) -> Any:
+def pose_matrix(message: Pose) -> Array:
+    """Homogeneous matrix, shape (4, 4), of a `geometry_msgs/Pose`. Raises ValueError as `rotation` does."""
+    return _homogeneous(rotation(message.orientation), vector(message.position))
+
+
+def transform_matrix(message: Transform) -> Array:
+    """Homogeneous matrix, shape (4, 4), of a `geometry_msgs/Transform`. Raises ValueError as `rotation` does."""
+    return _homogeneous(rotation(message.rotation), vector(message.translation))
+
+
+def _homogeneous(R: Array, p: Array) -> Array:
+    X = np.eye(4)
+    X[:3, :3] = R
+    X[:3, 3] = p
+    return X
+
+
+def pose_message(R: Array, p: Array) -> Pose:
     """`geometry_msgs/Pose` of a rotation matrix, shape (3, 3), and an origin [m], shape (3,)."""
     return Pose(Point(*p.tolist()), Quaternion(*quaternion(R)))
 
 
-def transform_message(X: Array) -> Any:
+def transform_message(X: Array) -> Transform:
     """`geometry_msgs/Transform` of a homogeneous matrix, shape (4, 4)."""
     return Transform(Vector3(*X[:3, 3].tolist()), Quaternion(*quaternion(X[:3, :3])))
 
 
-def twist_message(V: Array) -> Any:
+def twist_message(V: Array) -> Twist:
     """`geometry_msgs/Twist` of a twist, linear [m/s] then angular [rad/s], shape (6,)."""
     return Twist(Vector3(*V[:3].tolist()), Vector3(*V[3:].tolist()))
 
 
-def wrench_message(F: Array) -> Any:
+def wrench_message(F: Array) -> Wrench:
     """`geometry_msgs/Wrench` of a wrench, force [N] then torque [N m], shape (6,)."""
     return Wrench(Vector3(*F[:3].tolist()), Vector3(*F[3:].tolist()))
 
 
-def vector(message: Any) -> Array:
-    """Shape (3,): of anything with x, y and z."""
+def vector(message: Point | Vector3) -> Array:
+    """The x, y and z of a `geometry_msgs/Point` or `geometry_msgs/Vector3`, shape (3,)."""
     return np.array((message.x, message.y, message.z))
 
 
-def twist(message: Any) -> Array:
+def twist(message: Twist) -> Array:
     """Linear [m/s] then angular [rad/s], shape (6,), of a `geometry_msgs/Twist`."""
     v, w = message.linear, message.angular
     return np.array((v.x, v.y, v.z, w.x, w.y, w.z))
 
 
-def wrench(message: Any) -> Array:
+def wrench(message: Wrench) -> Array:
     """Force [N] then torque [N m], shape (6,), of a `geometry_msgs/Wrench`."""
     f, m = message.force, message.torque
     return np.array((f.x, f.y, f.z, m.x, m.y, m.z))

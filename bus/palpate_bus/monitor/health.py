@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from palpate_bus.contract import Topic
-from palpate_bus.contract.checker import Kind
+from palpate_bus.contract.conformance import ViolationKind as Kind
 
 
 @dataclass(frozen=True)

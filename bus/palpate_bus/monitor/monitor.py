@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from palpate_bus.contract import MS, Contract, Topic
-from palpate_bus.contract.checker import Checker, Kind
+from palpate_bus.contract.conformance import Checker
+from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.messages import codec
 from palpate_bus.monitor import pace
 from palpate_bus.monitor.health import SeenViolation, TopicHealth, Violation

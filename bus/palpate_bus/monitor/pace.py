@@ -12,7 +12,7 @@ from statistics import median
 from typing import NamedTuple
 
 from palpate_bus.contract import MS, Topic
-from palpate_bus.contract.checker import Kind
+from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.monitor.streams import Stream
 
 RATE_TOLERANCE = 0.2

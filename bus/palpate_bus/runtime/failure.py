@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 
-from palpate_bus.contract.checker import Checker
+from palpate_bus.contract.conformance import Checker
 from palpate_bus.messages.codec import CodecError, Message
 from palpate_bus.runtime.lockstep import InputBuffer, Received
 

@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 
+from palpate_bus.messages.arrays import array_dtype
 from palpate_bus.messages.codec import message_type, store
 
 LONGEST = 4
@@ -55,7 +56,7 @@ def _scalar(base: str) -> st.SearchStrategy[Any]:
 
 
 def _array(base: str, least: int, most: int) -> st.SearchStrategy[Any]:
-    dtype = np.dtype({"bool": "?", "byte": "i1", "char": "u1"}.get(base, base))
+    dtype = array_dtype(base)
     if base == "bool":
         return st.lists(st.booleans(), min_size=least, max_size=most).map(lambda values: np.array(values, dtype))
     return (

@@ -6,12 +6,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from palpate.check.report import Report
 from palpate.check.rig import Heard, Rig, Source
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, SurfaceMesh
+from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.frames import Array
 
@@ -27,11 +27,7 @@ def pose_of(message: Any) -> Array | None:
     """X_WC of the optical frame in a tf_static, shape (4, 4)."""
     for item in message.transforms:
         if item.child_frame_id == FRAME and item.header.frame_id == "world":
-            p, q = item.transform.translation, item.transform.rotation
-            X = np.eye(4)
-            X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-            X[:3, 3] = p.x, p.y, p.z
-            return X
+            return transform_matrix(item.transform)
     return None
 
 

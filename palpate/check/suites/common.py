@@ -9,7 +9,7 @@ import numpy as np
 from palpate.check.report import Report
 from palpate.check.rig import Heard, Rig
 from palpate_bus.contract import MS, Topic
-from palpate_bus.contract.checker import Checker
+from palpate_bus.contract.conformance import Checker
 
 RATE_TOLERANCE = 0.2
 """Of a live implementation, over the whole check."""

@@ -5,19 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from palpate.check.report import Report
 from palpate.check.rig import Feed, Heard, Rig, Source
-from palpate_bus.contract import MS
+from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
+from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
 
 TORQUE = "control/joint_torque"
-VALID = 250 * MS
+VALID = (contract().topics["planning/setpoint"].expiry_ms or 0) * MS
 
 
 def joints(q: Any = lbr.HOME, names: tuple[str, ...] = lbr.JOINT_NAMES) -> Source:
@@ -43,8 +43,7 @@ def joint_target(q: Any, stiffness: float) -> Source:
 
 def pose_target(X_WI: Array, stiffness: float) -> Source:
     """A set-point of mode CARTESIAN; the null-space posture is where the arm stands."""
-    x, y, z, w = _quaternion(X_WI)
-    pose = Pose(Point(*map(float, X_WI[:3, 3])), Quaternion(x, y, z, w))
+    pose = pose_message(X_WI[:3, :3], X_WI[:3, 3])
     zero = Vector3(0.0, 0.0, 0.0)
 
     def source(t: int) -> Any:
@@ -55,11 +54,6 @@ def pose_target(X_WI: Array, stiffness: float) -> Source:
         )  # fmt: skip
 
     return source
-
-
-def _quaternion(X: Array) -> tuple[float, float, float, float]:
-    x, y, z, w = map(float, Rotation.from_matrix(X[:3, :3]).as_quat())
-    return x, y, z, w
 
 
 def feed(setpoint: Source | None = None, arm: Source | None = None) -> Feed:

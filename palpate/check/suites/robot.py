@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from palpate.check.report import Report
 from palpate.check.rig import Feed, Heard, Rig, Source
@@ -19,6 +18,7 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
 )
+from palpate_bus.messages.geometry import rotation
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_models import lbr
 
@@ -269,8 +269,8 @@ def _force(rig: Rig, report: Report) -> None:
     before = _mean_force(rig.run(0.1, quiet(rig))["ft/wrench"])
     force_W = np.array([0.0, 0.0, PRESS_N])
     pressed = _mean_force(rig.run(0.1, _pressing(rig, force_W))["ft/wrench"])
-    o = rig.last("sim/tool_state").pose.orientation
-    expected = Rotation.from_quat((o.x, o.y, o.z, o.w)).inv().apply(force_W)
+    R_WI = rotation(rig.last("sim/tool_state").pose.orientation)
+    expected = R_WI.T @ force_W
     got = pressed - before
     rig.run(0.3, quiet(rig))
     ok = bool(np.linalg.norm(got - expected) < 0.3 * PRESS_N)

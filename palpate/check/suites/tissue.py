@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from palpate.check.report import Report
 from palpate.check.rig import Feed, Heard, Rig
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
+from palpate_bus.messages.geometry import rotation, vector
 from palpate_bus.messages.stamps import header
 from palpate_models.frames import Array
 
@@ -107,10 +107,9 @@ def _spot(truth: Any, report: Report) -> tuple[Array, Array]:
         "length 1, z up in the abdomen's frame",
         f"{unit:.2g} off",
     )
-    o, p = truth.pose.orientation, truth.pose.position
-    R_WA, p_WA = Rotation.from_quat((o.x, o.y, o.z, o.w)), np.array((p.x, p.y, p.z))
+    R_WA, p_WA = rotation(truth.pose.orientation), vector(truth.pose.position)
     top = np.argmin(np.hypot(vertices[:, 0], vertices[:, 1]) - 1e-3 * vertices[:, 2])
-    return R_WA.apply(vertices[top]) + p_WA, R_WA.apply(normals[top])
+    return R_WA @ vertices[top] + p_WA, R_WA @ normals[top]
 
 
 def _check_free(heard: list[Heard], report: Report, name: str) -> None:

@@ -16,9 +16,9 @@ from palpate_assessment.findings import CANDIDATE_RATIO, StiffArea, candidates, 
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.inversion import POWER, Z90, Noise, Observations, estimate_noise, invert, observe, spread_under
 from palpate_assessment.prior import HEALTHY, LESION, Field
-from palpate_assessment.sampling import Sample
+from palpate_assessment.sampling import ForceSample
+from palpate_models.frames import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _QUIET = 0.15
@@ -37,7 +37,7 @@ class Assessment:
     stiffness: Array
     """Median of k_w [N/m^3], shape (n,)."""
     lower: Array
-    """Of the 90 % band."""
+    """Lower end of the 90 % band."""
     upper: Array
     scanned: Mask
     """Within reach of a sample, shape (n,)."""
@@ -50,7 +50,7 @@ class Assessment:
 
 
 def assess(
-    samples: Sequence[Sample],
+    samples: Sequence[ForceSample],
     grid: MapGrid,
     contact: ReferenceContact,
     reach: float,

@@ -12,14 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 from scipy.special import k0, k0e, k1, k1e
 
+from palpate_models.frames import Array
 from palpate_models.scenario import Stiffness
-
-Array = NDArray[np.float64]
 
 _PIXEL = 0.0005
 """Raster on which footprints and overlaps are integrated [m]; halving it changes them by less than 0.5 %."""

@@ -19,8 +19,8 @@ from scipy.stats import norm
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.inversion import Z90, Observations, Posterior
 from palpate_assessment.prior import Field
+from palpate_models.frames import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CANDIDATE_RATIO = 1.5
@@ -49,13 +49,13 @@ class StiffArea:
     nodes: Mask
     """Which of the grid's nodes belong to it, shape (n,)."""
     centroid: Array
-    """Of its area [m], shape (3,)."""
+    """Centroid of the area [m], shape (3,)."""
     area: float
     """On the surface [m^2]."""
     ratio: float
     """Stiffness against the rest [1]."""
     ratio_lower: float
-    """Of the 90 % band."""
+    """Lower end of the 90 % band."""
     ratio_upper: float
     confidence: float
     """Posterior probability that the area is stiffer than healthy variation explains."""

@@ -9,7 +9,7 @@ from numpy.polynomial.polynomial import polyvander
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 _DEGREE = 4
 """Degree of the polynomial that stands for the abdomen's shape: its curvature is that of the trunk, not of the noise."""

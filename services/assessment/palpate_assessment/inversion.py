@@ -15,16 +15,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 
 from palpate_assessment.contact import REACH, ReferenceContact
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.prior import Field
-from palpate_assessment.sampling import Sample
-
-Array = NDArray[np.float64]
+from palpate_assessment.sampling import ForceSample
+from palpate_models.frames import Array
 
 POWER = 0.8
 """Exponent p of the mean over the footprint: 1 to first order; a wall that gives way beside a stiff area makes it a little less
@@ -89,7 +87,7 @@ class Observations:
     steep: Array
     """d log F / d depth [1/m], shape (m,)."""
     squared_distance: Array
-    """Of the samples from each other [m^2], shape (m, m)."""
+    """Squared distances between the samples [m^2], shape (m, m)."""
     relative: Array
     """Noise of the force over the force [1], shape (m,)."""
     footprint: Array
@@ -99,7 +97,7 @@ class Observations:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of the noise, shape (m, m)."""
+        """Covariance of the noise, shape (m, m)."""
         return self.noise.covariance(self.steep, self.squared_distance, self.relative, self.spread)
 
 
@@ -129,7 +127,7 @@ class Posterior:
         return np.asarray(np.sqrt(np.maximum(self.prior.variance - np.einsum("ij,ij->j", half, half), 1e-8)))
 
 
-def reference_force(samples: Sequence[Sample], contact: ReferenceContact, curvature: Array) -> Array:
+def reference_force(samples: Sequence[ForceSample], contact: ReferenceContact, curvature: Array) -> Array:
     """Force over k_w [m^3] that a homogeneous wall would show at each sample, shape (m,).
 
     Depth is led by the dashpot (u + tau du/dt); the path's memory is taken off.
@@ -141,7 +139,7 @@ def reference_force(samples: Sequence[Sample], contact: ReferenceContact, curvat
     return np.asarray(np.maximum(instantaneous * (1.0 - lost / contact.force(depth)), 1e-12))
 
 
-def observe(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact, noise: Noise) -> Observations:
+def observe(samples: Sequence[ForceSample], grid: MapGrid, contact: ReferenceContact, noise: Noise) -> Observations:
     """The samples as observations on a grid. Samples need positive depth and force."""
     position = np.array([s.position for s in samples])
     depth = np.array([s.depth for s in samples])
@@ -164,7 +162,7 @@ def spread_under(footprint: Array, z: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(footprint @ z**2 - mean**2, 0.0)))
 
 
-def footprints(samples: Sequence[Sample], grid: MapGrid, contact: ReferenceContact) -> Array:
+def footprints(samples: Sequence[ForceSample], grid: MapGrid, contact: ReferenceContact) -> Array:
     """Weight of each node in each sample, shape (m, n), rows sum to 1: distances along the surface are taken in space."""
     centre = np.array([s.position for s in samples]) + contact.advance(np.array([s.velocity for s in samples]))
     levels = np.round(np.clip([s.depth for s in samples], 0.002, 0.02) * 1000)

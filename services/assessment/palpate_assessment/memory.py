@@ -11,11 +11,9 @@ It holds for sliding at any speed, for holding still (there it is the usual rela
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_assessment.contact import ReferenceContact
-
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 _SLICE = 4
 """States gathered into one slice of the path: 40 ms at 100 Hz, over which the wall hardly relaxes."""

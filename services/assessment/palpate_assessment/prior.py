@@ -13,12 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_assessment.grid import MapGrid
-
-Array = NDArray[np.float64]
-
+from palpate_models.frames import Array
 
 _NEGLIGIBLE = 1e-5
 """Modes of a component below this part of its greatest are left out: they hold less than 1e-3 of its variance."""
@@ -129,7 +126,7 @@ class _Part:
         return block if self._envelope is None else block * self._envelope
 
     def _components(self, within: Array, modes: Array) -> Iterator[tuple[Array, Array, Array]]:
-        """Of each component: Bx, and its share of `within` as (m, ky, nx) and of `modes` as (m, ky, kx)."""
+        """Yields for each component Bx, and its share of `within` as (m, ky, nx) and of `modes` as (m, ky, kx)."""
         row = begin = 0
         for ky, along_x in zip(self._ky, self._along_x, strict=True):
             end = begin + ky * along_x.shape[1]

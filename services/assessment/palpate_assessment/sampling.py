@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.memory import PathMemory
-
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 TRAVEL = 0.005
 """Travel that one sample averages [m]: a third of the footprint's radius, so it blurs nothing."""
@@ -42,7 +40,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Sample:
+class ForceSample:
     """One measurement of force at depth, averaged over a few millimetres of travel, in A."""
 
     time: float
@@ -78,7 +76,7 @@ class Sampler:
         self._last: State | None = None
         self._onset: float | None = None
 
-    def add(self, state: State) -> Sample | None:
+    def add(self, state: State) -> ForceSample | None:
         """Takes the next state; returns the sample that it completes, if any."""
         sample = None
         if state.in_contact:
@@ -99,7 +97,7 @@ class Sampler:
             sample = self._average()
         return sample
 
-    def _average(self) -> Sample | None:
+    def _average(self) -> ForceSample | None:
         block, self._block = self._block, []
         if len(block) < _FEWEST:
             return None
@@ -114,7 +112,7 @@ class Sampler:
         velocity = slope @ position
         rest = force - force.mean() - centred * float(slope @ force)
         middle = position.mean(axis=0)
-        return Sample(
+        return ForceSample(
             time=float(time.mean()),
             position=middle,
             normal=normal,

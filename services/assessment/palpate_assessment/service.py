@@ -6,30 +6,25 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_assessment.assess import Assessment, assess
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.findings import StiffArea
 from palpate_assessment.grid import MapGrid, map_grid
-from palpate_assessment.sampling import Sample, Sampler, State
-from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, StiffnessMap
-from palpate_bus.messages.codec import Message, message_type
+from palpate_assessment.sampling import ForceSample, Sampler, State
+from palpate_bus.contract import contract
+from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
+from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import ExamInput, Scenario
 
-Array = NDArray[np.float64]
-
-_Point: Any = message_type("geometry_msgs/msg/Point")
-_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
-
-FRAME = "abdomen"
+FRAME = contract().topics["assessment/map"].frame or ""
 PITCH = 0.005
-"""Of the final map's grid [m]: a third of the footprint's radius."""
+"""Pitch of the final map's grid [m]: a third of the footprint's radius."""
 MARGIN = 0.020
 """The map's grid goes this far beyond the examined region [m]: what the footprint reaches."""
 GROWING_PITCH = 0.008
@@ -54,7 +49,7 @@ class AssessmentService(Service):
         self._contact = ReferenceContact(exam.robot.indenter_radius_m, exam.exam.depth_m)
         self._reach = float(np.clip(0.8 * exam.exam.spacing_m, 0.006, 0.020))
         self._sampler = Sampler(self._contact)
-        self._samples: list[Sample] = []
+        self._samples: list[ForceSample] = []
         self._surface: Array | None = None
         self._coarse: MapGrid | None = None
         self._last_map = 0
@@ -66,7 +61,7 @@ class AssessmentService(Service):
         """Samples as they come, a map every few seconds, and once the scan is over the final map and the findings."""
         for surface in inbox.new("perception/surface"):
             self._perceive(surface)
-        new: list[Sample] = []
+        new: list[ForceSample] = []
         phase = None
         for state in inbox.new("exam/state"):
             phase = int(state.phase)
@@ -94,8 +89,9 @@ class AssessmentService(Service):
         }
 
     def _perceive(self, message: Message) -> None:
-        if message.header.frame_id != "world":
-            raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want 'world'")
+        wanted = contract().topics["perception/surface"].frame
+        if message.header.frame_id != wanted:
+            raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
         p_W = np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3)
         self._surface = apply(self._X_AW, p_W)
         self._coarse = self._grid(GROWING_PITCH)
@@ -145,12 +141,12 @@ def create(scenario: Scenario) -> Service:
     return AssessmentService(exam_input(scenario))
 
 
-def sample_message(sample: Sample) -> Message:
+def sample_message(sample: ForceSample) -> Message:
     """`palpation_msgs/PalpationSample`, stamped with the middle of the measurement."""
     return PalpationSample(
         header=header(round(sample.time * NS), FRAME),
-        position=_Point(*map(float, sample.position)),
-        normal=_Vector3(*map(float, sample.normal)),
+        position=Point(*map(float, sample.position)),
+        normal=Vector3(*map(float, sample.normal)),
         depth=sample.depth,
         normal_force=sample.force,
         tangential_speed=float(np.linalg.norm(sample.velocity)),
@@ -189,7 +185,7 @@ def finding_message(area: StiffArea) -> Message:
     """`palpation_msgs/Finding`."""
     x, y, z = map(float, area.centroid)
     return Finding(
-        centroid=_Point(x, y, z),
+        centroid=Point(x, y, z),
         quadrant=quadrant(x, y),
         area=area.area,
         stiffness_ratio=area.ratio,

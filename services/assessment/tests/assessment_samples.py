@@ -7,7 +7,7 @@ import numpy as np
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.inversion import POWER, footprints, reference_force
-from palpate_assessment.sampling import Sample
+from palpate_assessment.sampling import ForceSample
 
 CONTACT = ReferenceContact(0.015, 0.010)
 REGION = 0.12
@@ -21,10 +21,12 @@ def flat_grid(pitch: float = 0.006, region: float = REGION) -> MapGrid:
     return map_grid(surface, (0.0, 0.0), (region, region), 0.02, pitch)
 
 
-def samples_of(grid: MapGrid, z: np.ndarray, depth: float = 0.010, speed: float = 0.0, region: float = REGION) -> list[Sample]:
+def samples_of(
+    grid: MapGrid, z: np.ndarray, depth: float = 0.010, speed: float = 0.0, region: float = REGION
+) -> list[ForceSample]:
     """A snake of samples over a wall of log k_w `z` on the grid's nodes, without noise."""
     bare = [
-        Sample(
+        ForceSample(
             time=0.0,
             position=np.array((x, y, 0.0)),
             normal=np.array((0.0, 0.0, 1.0)),
@@ -42,4 +44,4 @@ def samples_of(grid: MapGrid, z: np.ndarray, depth: float = 0.010, speed: float 
     ]
     felt = (footprints(bare, grid, CONTACT) @ np.exp(POWER * z)) ** (1 / POWER)
     force = felt * reference_force(bare, CONTACT, np.zeros(len(bare)))
-    return [Sample(**{**vars(s), "force": float(f)}) for s, f in zip(bare, force, strict=True)]
+    return [ForceSample(**{**vars(s), "force": float(f)}) for s, f in zip(bare, force, strict=True)]

@@ -12,27 +12,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from palpate.report.evidence import centroids_of, map_of
 from palpate.report.scoring import Scores, Truth, score
 from palpate_assessment.service import AssessmentService
-from palpate_bus.messages import ExamState, SurfaceMesh
-from palpate_bus.messages.codec import message_type
+from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.stamps import header
-from palpate_models.frames import apply, matrix
+from palpate_models.frames import Array, apply, matrix
 from palpate_models.load import exam_input
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.field import gaussian_field
 from palpate_models.scenario import Lesion, Mode, Phantom, Scenario
 from palpate_tissue.tissue import Tissue
-
-Array = NDArray[np.float64]
-
-_Point: Any = message_type("geometry_msgs/msg/Point")
-_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
 
 SURFACE_SD, SURFACE_LENGTH = 0.0001, 0.012
 """Error of the perceived surface [m] and its correlation length: perception's own figures."""
@@ -174,8 +167,8 @@ def _state(
         depth_setpoint=0.01,
         depth=depth,
         normal_force=force,
-        surface_point=_Point(*map(float, p_W)),
-        surface_normal=_Vector3(*map(float, n_W)),
+        surface_point=Point(*map(float, p_W)),
+        surface_normal=Vector3(*map(float, n_W)),
         end_tick=-1,
     )
 

@@ -7,7 +7,7 @@ import pytest
 
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.grid import map_grid
-from palpate_assessment.sampling import LONGEST, TRAVEL, Sample, Sampler, State
+from palpate_assessment.sampling import LONGEST, TRAVEL, ForceSample, Sampler, State
 
 CONTACT = ReferenceContact(0.015, 0.010)
 UP = np.array((0.0, 0.0, 1.0))
@@ -17,7 +17,7 @@ def state(k: int, x: float = 0.0, depth: float = 0.01, force: float = 2.0, count
     return State(0.01 * k, np.array((x, 0.0, 0.0)), UP, depth, force, touching, counts)
 
 
-def run(states: list[State]) -> list[Sample]:
+def run(states: list[State]) -> list[ForceSample]:
     sampler = Sampler(CONTACT)
     return [s for s in map(sampler.add, states) if s is not None]
 

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
+from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped
+from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import header
 from palpate_models import lbr
-from palpate_models.frames import Array
 from palpate_models.lbr_kinematics import link_transforms
-from palpate_models.rotations import quaternion, quaternion_of
 from palpate_models.scenario import ExamInput
 
 _AXES = np.array(lbr.JOINT_AXIS)
 _FIRST_JOINT = 1
-"""Where the joints stand among the frames: behind the base, whose frame stands still as those behind them do."""
+"""Index of the first joint's frame: the base stands before it. All frames but the joints' are constant."""
 
 
 class FrameTree:
@@ -26,21 +25,17 @@ class FrameTree:
     def __init__(self, exam: ExamInput) -> None:
         frames = [*link_transforms(np.zeros(7), exam.robot), ("world", "abdomen", np.array(exam.X_WA))]
         self._names = [(parent, child) for parent, child, _ in frames]
-        self._transforms = [_transform(X) for _, _, X in frames]
+        self._transforms = [transform_message(X) for _, _, X in frames]
 
-    def message(self, t: int, q: Iterable[float]) -> Any:
+    def message(self, t: int, q: Iterable[float]) -> TFMessage:
         """The tree at joint positions `q` [rad], shape (7,), stamped `t` [ns]."""
-        turns = np.array(q, np.float64)[:, None] * _AXES
+        turns = Rotation.from_rotvec(np.array(q, np.float64)[:, None] * _AXES)
         transforms = self._transforms.copy()
-        for i, turn in enumerate(turns.tolist(), _FIRST_JOINT):
-            transforms[i] = Transform(transforms[i].translation, Quaternion(*quaternion_of(turn)))
+        for i, turn in enumerate(turns.as_quat(canonical=True).tolist(), _FIRST_JOINT):
+            transforms[i] = Transform(transforms[i].translation, Quaternion(*turn))
         return TFMessage(
             [
                 TransformStamped(header(t, parent), child, transform)
                 for (parent, child), transform in zip(self._names, transforms, strict=True)
             ]
         )
-
-
-def _transform(X: Array) -> Any:
-    return Transform(Vector3(*X[:3, 3].tolist()), Quaternion(*quaternion(X[:3, :3].tolist())))

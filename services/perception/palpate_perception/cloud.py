@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.scenario import Exam
-
-Array = NDArray[np.float64]
 
 JUMP: Final = 0.015
 """Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth: 16 mm at 1.1 m,
@@ -40,14 +38,14 @@ class Cloud:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class RegionBox:
     """The region of interest with its margin: an axis-aligned box in A [m]."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
     @classmethod
-    def of(cls, exam: Exam, margin: float, z: tuple[float, float]) -> Box:
+    def of(cls, exam: Exam, margin: float, z: tuple[float, float]) -> RegionBox:
         """The exam's region, wider by `margin` [m] on each side, between the heights `z` [m]."""
         (cx, cy), (width, height) = exam.centre_m, exam.region_m
         half_x, half_y = width / 2 + margin, height / 2 + margin
@@ -80,7 +78,7 @@ def project(p_C: Array, K: Array) -> tuple[Array, Array]:
     return K[0, 0] * p_C[:, 0] / p_C[:, 2] + K[0, 2], K[1, 1] * p_C[:, 1] / p_C[:, 2] + K[1, 2]
 
 
-def window(box: Box, X_CA: Array, K: Array, shape: tuple[int, int]) -> tuple[slice, slice]:
+def window(box: RegionBox, X_CA: Array, K: Array, shape: tuple[int, int]) -> tuple[slice, slice]:
     """Rows and columns of the image that can see the box; empty slices when none can.
 
     The whole image when a corner is behind the camera.
@@ -107,7 +105,7 @@ def remove_invalid(cloud: Cloud) -> Cloud:
     return cloud.where(np.asarray(np.isfinite(cloud.p_W).all(axis=1), np.bool_))
 
 
-def crop(cloud: Cloud, X_WA: Array, box: Box, floor_m: float) -> Cloud:
+def crop(cloud: Cloud, X_WA: Array, box: RegionBox, floor_m: float) -> Cloud:
     """Step 3: the points in the box and above the height `floor_m` in world (the table's top, with its noise)."""
     inside = box.holds(apply(inverse(X_WA), cloud.p_W))
     return cloud.where(np.asarray(inside & (cloud.p_W[:, 2] > floor_m)))

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Pattern
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 

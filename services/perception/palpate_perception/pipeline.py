@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.scenario import Exam
 from palpate_models.table import TABLE_TOP_M
 from palpate_perception import cloud, pattern, surface, visibility
-from palpate_perception.cloud import Array, Box, Cloud
+from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
 
 MARGIN_M: Final = 0.03
@@ -60,7 +60,7 @@ class Targets:
 
 
 @dataclass(frozen=True, slots=True)
-class Mesh:
+class PerceivedMesh:
     """The perceived surface, in world."""
 
     p_W: Array
@@ -76,7 +76,7 @@ class Perceived:
     """All that a burst of frames tells."""
 
     cloud: Cloud
-    mesh: Mesh | None
+    mesh: PerceivedMesh | None
     """None when too little was seen."""
     targets: Targets
     sigma: float
@@ -95,8 +95,8 @@ class Pipeline:
         """`X_WA`: registered pose of the abdomen in world, shape (4, 4)."""
         self._exam = exam
         self._X_WA, self._X_AW = X_WA, inverse(X_WA)
-        self._box = Box.of(exam, MARGIN_M, HEIGHT_M)
-        self._region = Box.of(exam, 0.0, HEIGHT_M)
+        self._box = RegionBox.of(exam, MARGIN_M, HEIGHT_M)
+        self._region = RegionBox.of(exam, 0.0, HEIGHT_M)
 
     def fusion(self, camera: Intrinsics) -> DepthFusion:
         """An empty fusion of the part of the image that sees the region."""
@@ -155,7 +155,7 @@ class Pipeline:
         p_A = np.column_stack((xy, field.height(xy[:, 0], xy[:, 1])))
         return apply(self._X_WA, p_A), field.normal(xy[:, 0], xy[:, 1]) @ self._X_WA[:3, :3].T
 
-    def _mesh(self, field: surface.HeightField, p_A: Array) -> Mesh:
+    def _mesh(self, field: surface.HeightField, p_A: Array) -> PerceivedMesh:
         """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         x = pattern.stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
@@ -168,7 +168,7 @@ class Pipeline:
         triangles = triangles[keep[triangles].all(axis=1)]
         new = np.cumsum(keep) - 1
         p_W, n_W = self._on(field, nodes[keep])
-        return Mesh(p_W, n_W, new[triangles].astype(np.uint32))
+        return PerceivedMesh(p_W, n_W, new[triangles].astype(np.uint32))
 
 
 def _remarks(guessed: int, nodes: int, motion: float) -> str:

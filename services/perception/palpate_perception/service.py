@@ -6,25 +6,22 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
-from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages import PalpationTargets, Point, PointCloud2, PointField, SurfaceMesh, Vector3
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
-from palpate_perception.cloud import Array, Cloud
+from palpate_perception.cloud import Cloud
 from palpate_perception.fusion import DepthFusion, Image
-from palpate_perception.pipeline import Intrinsics, Mesh, Perceived, Pipeline, Targets
+from palpate_perception.pipeline import Intrinsics, Perceived, PerceivedMesh, Pipeline, Targets
 
-_Point: Any = message_type("geometry_msgs/msg/Point")
-_PointCloud: Any = message_type("sensor_msgs/msg/PointCloud2")
-_PointField: Any = message_type("sensor_msgs/msg/PointField")
-_Surface: Any = message_type("palpation_msgs/msg/SurfaceMesh")
-_Targets: Any = message_type("palpation_msgs/msg/PalpationTargets")
-_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
-
+FRAME: Final = contract().topics["perception/targets"].frame or ""
+"""Frame of all that perception sends."""
 PATIENCE_NS: Final = 1 * NS
 """How long after the expected end of a burst perception waits for missing frames."""
 
@@ -162,35 +159,31 @@ def depth_in_metres(message: Message) -> Image:
 def camera_pose(message: Message, frame: str) -> Array | None:
     """X_WC, shape (4, 4), of an optical frame from tf_static; None when it is not in there."""
     for item in message.transforms:
-        if item.child_frame_id == frame and item.header.frame_id == "world":
-            p, q = item.transform.translation, item.transform.rotation
-            X = np.eye(4)
-            X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-            X[:3, 3] = p.x, p.y, p.z
-            return X
+        if item.child_frame_id == frame and item.header.frame_id == FRAME:
+            return transform_matrix(item.transform)
     return None
 
 
 def points(t: int, p_W: Array) -> Message:
     """`sensor_msgs/PointCloud2` in world: x y z float32 [m]."""
-    fields = [_PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
+    fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
     data = np.ascontiguousarray(p_W, "<f4").view(np.uint8).reshape(-1)
-    return _PointCloud(header(t, "world"), 1, len(p_W), fields, False, 12, 12 * len(p_W), data, True)
+    return PointCloud2(header(t, FRAME), 1, len(p_W), fields, False, 12, 12 * len(p_W), data, True)
 
 
-def surface(t: int, mesh: Mesh) -> Message:
+def surface(t: int, mesh: PerceivedMesh) -> Message:
     """`palpation_msgs/SurfaceMesh` in world."""
     vertices, normals = (np.ascontiguousarray(x, np.float32).reshape(-1) for x in (mesh.p_W, mesh.n_W))
-    return _Surface(header(t, "world"), vertices, normals, np.ascontiguousarray(mesh.triangles).reshape(-1))
+    return SurfaceMesh(header(t, FRAME), vertices, normals, np.ascontiguousarray(mesh.triangles).reshape(-1))
 
 
 def targets(t: int, perceived: Perceived) -> Message:
     """`palpation_msgs/PalpationTargets` in world."""
     found = perceived.targets
-    return _Targets(
-        header(t, "world"),
-        [_Point(*map(float, p)) for p in found.p_W],
-        [_Vector3(*map(float, n)) for n in found.n_W],
+    return PalpationTargets(
+        header(t, FRAME),
+        [Point(*map(float, p)) for p in found.p_W],
+        [Vector3(*map(float, n)) for n in found.n_W],
         found.line,
         perceived.sigma,
         perceived.frames,

@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import coo_array, csr_array, kron
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 CUTOFF_M: Final = 0.03
 """Wave length that passes with half its amplitude: wider waves are shape, narrower ones noise."""
@@ -30,7 +30,7 @@ TUKEY: Final = 4.685
 ROUNDS: Final = 3
 
 
-class Axis:
+class KnotAxis:
     """Cubic B-splines on one axis, with knots evenly spread over [low, high] [m]."""
 
     def __init__(self, low: float, high: float, spacing: float) -> None:
@@ -64,8 +64,8 @@ class Axis:
 class HeightField:
     """A fitted surface z = s(x, y) in A, with its covariance."""
 
-    x: Axis
-    y: Axis
+    x: KnotAxis
+    y: KnotAxis
     coefficients: Array
     """Shape (x.size, y.size)."""
     factor: Array
@@ -100,7 +100,7 @@ def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, flo
     """
     if len(p) < 10:
         raise ValueError(f"surface fit: {len(p)} points, want at least 10")
-    x, y = (Axis(a, b, CUTOFF_M / KNOTS_PER_CUTOFF) for a, b in zip(low, high, strict=True))
+    x, y = (KnotAxis(a, b, CUTOFF_M / KNOTS_PER_CUTOFF) for a, b in zip(low, high, strict=True))
     rows = _rows(x, y, p)
     width = DEGREE * (y.size + 1)  # half band width of the normal matrix: neighbours in x are y.size apart
     weight = 1 / sigma**2
@@ -122,7 +122,7 @@ def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, flo
     return HeightField(x, y, c.reshape(x.size, y.size) + level, factor, scale)  # B-splines sum to one
 
 
-def _rows(x: Axis, y: Axis, p: Array) -> csr_array[Any]:
+def _rows(x: KnotAxis, y: KnotAxis, p: Array) -> csr_array[Any]:
     """Tensor-product basis at the points, sparse, shape (n, x.size * y.size)."""
     (bx, ix), (by, iy) = x.local(p[:, 0]), y.local(p[:, 1])
     data = np.einsum("ni,nj->nij", bx, by).ravel()
@@ -131,7 +131,7 @@ def _rows(x: Axis, y: Axis, p: Array) -> csr_array[Any]:
     return csr_array((data, column, start), shape=(len(p), x.size * y.size))
 
 
-def _energy(x: Axis, y: Axis) -> Any:
+def _energy(x: KnotAxis, y: KnotAxis) -> Any:
     """Matrix of E, sparse, shape (x.size * y.size, the same)."""
     gx, gy = ([csr_array(axis.gram(d)) for d in range(4)] for axis in (x, y))
     return sum(k * kron(gx[3 - d], gy[d]) for d, k in enumerate((1.0, 3.0, 3.0, 1.0)))

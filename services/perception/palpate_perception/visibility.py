@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.scenario import Exam
-from palpate_perception.cloud import Array, project
+from palpate_perception.cloud import project
 
 CELL_M: Final = 0.01
 """Edge of the cells in which coverage is counted: five pixels of a Kinect at 1.1 m."""

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from palpate_models.frames import apply, inverse, look_at
 from palpate_models.scenario import Exam
 from palpate_perception import cloud
-from palpate_perception.cloud import Box, Cloud
+from palpate_perception.cloud import Cloud, RegionBox
 
 K = np.array([[585.0, 0.0, 319.5], [0.0, 580.0, 239.5], [0.0, 0.0, 1.0]])
 X_WA = np.eye(4)
 X_WA[:3, 3] = 0.56, 0.0, 0.93
 X_WC = look_at(np.array([0.95, -0.45, 1.85]), np.array([0.56, 0.0, 0.9]))
-BOX = Box.of(Exam(), 0.03, (-0.16, 0.06))
+BOX = RegionBox.of(Exam(), 0.03, (-0.16, 0.06))
 
 coordinate = st.floats(-0.3, 0.3)
 

@@ -112,7 +112,7 @@ def test_too_few_points_are_an_error() -> None:
 
 
 def test_gram_matrices_are_exact() -> None:
-    axis = surface.Axis(0.0, 1.0, 0.25)
+    axis = surface.KnotAxis(0.0, 1.0, 0.25)
     total = axis.values(np.array([0.3]), 0).sum()
     assert total == pytest.approx(1)
     assert axis.gram(0).sum() == pytest.approx(1)  # the sum of all splines is 1

@@ -15,20 +15,26 @@ import numpy as np
 from mcap.writer import CompressionType
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointState, SurfaceMesh, ToolState, WrenchStamped, codec
+from palpate_bus.messages import (
+    Duration,
+    JointState,
+    JointTorqueCommand,
+    Point,
+    Pose,
+    Quaternion,
+    SurfaceMesh,
+    ToolState,
+    Twist,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+    codec,
+)
 from palpate_bus.messages.stamps import header
 from palpate_recorder.bag import BagWriter
 from palpate_recorder.service import channels
 
 MS = 1_000_000
-_Vector: Any = codec.message_type("geometry_msgs/msg/Vector3")
-_Point: Any = codec.message_type("geometry_msgs/msg/Point")
-_Pose: Any = codec.message_type("geometry_msgs/msg/Pose")
-_Twist: Any = codec.message_type("geometry_msgs/msg/Twist")
-_Wrench: Any = codec.message_type("geometry_msgs/msg/Wrench")
-_Quaternion: Any = codec.message_type("geometry_msgs/msg/Quaternion")
-_Torque: Any = codec.message_type("palpation_msgs/msg/JointTorqueCommand")
-_Duration: Any = codec.message_type("builtin_interfaces/msg/Duration")
 
 
 def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:
@@ -43,18 +49,18 @@ def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:
         found.append((f"/{topic}", codec.encode(message, contract().topics[topic].type), t, sequence))
 
     def vector() -> Any:
-        return _Vector(*random.normal(size=3))
+        return Vector3(*random.normal(size=3))
 
     for i in range(int(seconds * 1000)):
         t = i * MS
         joints = np.sin(t / 1e9 + np.arange(7)) + 1e-6 * random.normal(size=7)
-        wrench = _Wrench(vector(), vector())
-        pose = _Pose(_Point(*random.normal(size=3)), _Quaternion(0.0, 0.0, 0.0, 1.0))
+        wrench = Wrench(vector(), vector())
+        pose = Pose(Point(*random.normal(size=3)), Quaternion(0.0, 0.0, 0.0, 1.0))
         add("joint_states", JointState(header(t), names, joints, 1e-4 * random.normal(size=7), 10 * joints), t, i)
         add("ft/wrench", WrenchStamped(header(t, "ft_sensor"), wrench), t, i)
         add("sim/contact_wrench", WrenchStamped(header(t, "world"), wrench), t, i)
-        add("sim/tool_state", ToolState(header(t, "world"), pose, _Twist(vector(), vector()), 0.015), t, i)
-        add("control/joint_torque", _Torque(header(t), random.normal(size=7), _Duration(0, 50 * MS), ""), t, i)
+        add("sim/tool_state", ToolState(header(t, "world"), pose, Twist(vector(), vector()), 0.015), t, i)
+        add("control/joint_torque", JointTorqueCommand(header(t), random.normal(size=7), Duration(0, 50 * MS), ""), t, i)
         if i % 50 == 0:
             dent = 0.01 * np.exp(-((grid - (0.1 * np.sin(t / 1e9), 0)) ** 2).sum(axis=1) / 8e-4)
             vertices = np.column_stack((grid, -dent)).astype(np.float32).ravel()

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message, decode
 from palpate_bus.messages.stamps import time_message
-from palpate_bus.recordings import Recorded, Recording, RecordingError, open_recording
+from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.scenario import Scenario
 
@@ -29,7 +29,7 @@ class ReplayedCamera(Service):
         """Reads the frames, about 1 MB each. Raises RecordingError when the recording has no frame or no pose."""
         rules = contract()
         recording.check(rules, (IMAGE, INFO, POSE))
-        by_topic: dict[str, dict[int, Recorded]] = {IMAGE: {}, INFO: {}, POSE: {}}
+        by_topic: dict[str, dict[int, RecordedMessage]] = {IMAGE: {}, INFO: {}, POSE: {}}
         for message in recording.messages(by_topic):
             by_topic[message.topic][message.stamp] = message
         for topic, messages in by_topic.items():
@@ -65,7 +65,7 @@ class ReplayedCamera(Service):
         """How many frames were shown, and how many different ones there are."""
         return {"recording": str(self._path), "frames": self._shown, "frames_recorded": len(self._frames)}
 
-    def _message(self, recorded: Recorded) -> Message:
+    def _message(self, recorded: RecordedMessage) -> Message:
         return decode(recorded.payload, self._types[recorded.topic])
 
 

@@ -1,0 +1,25 @@
+"""Which message classes `palpate_bus.messages` has, by their packages in ROS. No two of them share a short name."""
+
+from __future__ import annotations
+
+PACKAGES: dict[str, tuple[str, ...]] = {
+    "builtin_interfaces": ("Duration", "Time"),
+    "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
+    "geometry_msgs": (
+        "Point", "Pose", "PoseStamped", "Quaternion", "Transform", "TransformStamped", "Twist", "Vector3", "Wrench",
+        "WrenchStamped",
+    ),
+    "nav_msgs": ("Path",),
+    "palpation_msgs": (
+        "Advance", "CameraTrigger", "ExamState", "Finding", "Findings", "ImpedanceSetpoint", "IndentationTruth",
+        "JointTorqueCommand", "OperatorRequest", "PalpationSample", "PalpationTargets", "PhantomTruth", "RecordChunk",
+        "RobotStatus", "RunControl", "ServiceReport", "StiffnessMap", "SupervisorState", "SurfaceMesh", "ToolState",
+    ),
+    "rosgraph_msgs": ("Clock",),
+    "sensor_msgs": ("CameraInfo", "Image", "JointState", "PointCloud2", "PointField", "RegionOfInterest"),
+    "std_msgs": ("Header", "String"),
+    "tf2_msgs": ("TFMessage",),
+}  # fmt: skip
+
+TYPE_NAMES: dict[str, str] = {name: f"{package}/msg/{name}" for package, names in PACKAGES.items() for name in names}
+"""The full type name of each class: `TYPE_NAMES["JointState"]` is `sensor_msgs/msg/JointState`."""

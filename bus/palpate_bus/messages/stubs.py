@@ -1,0 +1,80 @@
+"""Writes `__init__.pyi`, which tells type checkers the fields of the message classes.
+
+python -m palpate_bus.messages.stubs --write     after a change of a .msg file or of names.py
+python -m palpate_bus.messages.stubs --check     exits with 1 if the file is not what --write would write; a test runs it
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+
+from palpate_bus.messages.arrays import array_dtype
+from palpate_bus.messages.names import TYPE_NAMES
+from palpate_bus.messages.typestore import store
+
+STUB = Path(__file__).with_name("__init__.pyi")
+
+_HEAD = '''\
+"""Written by `python -m palpate_bus.messages.stubs --write`; change the .msg files or names.py instead."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+'''
+_SHORT_NAMES = {name: short for short, name in TYPE_NAMES.items()}
+
+
+def stub() -> str:
+    """The text of `__init__.pyi`: a dataclass for each message class. Raises KeyError if one contains a type without a class."""
+    return "\n\n".join([_HEAD.rstrip(), *(_class_lines(short, name) for short, name in TYPE_NAMES.items())]) + "\n"
+
+
+def _class_lines(short: str, name: str) -> str:
+    definition = store.get_msgdef(name)
+    fields = [f"    {field}: {_type_of(description)}" for field, description in definition.fields]
+    constants = [
+        f"    {constant}: ClassVar[{type(getattr(definition.cls, constant)).__name__}]"
+        for constant, annotation in definition.cls.__annotations__.items()
+        if "ClassVar" in str(annotation) and constant != "__msgtype__"
+    ]
+    return "\n".join(["@dataclass", f"class {short}:", "    __msgtype__: ClassVar[str]", *constants, *fields])
+
+
+def _type_of(description: Any) -> str:
+    """The Python type of a field that rosbags describes so."""
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return _SHORT_NAMES[detail]
+    if kind == Nodetype.BASE:
+        base = detail[0]
+        return {"string": "str", "bool": "bool", "float32": "float", "float64": "float"}.get(base, "int")
+    item_kind, item = detail[0]
+    if item_kind == Nodetype.NAME or item[0] == "string":
+        return f"list[{_type_of(detail[0])}]"
+    return f"NDArray[np.{array_dtype(item[0]).name}]"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m palpate_bus.messages.stubs")
+    choice = parser.add_mutually_exclusive_group(required=True)
+    choice.add_argument("--write", action="store_true")
+    choice.add_argument("--check", action="store_true")
+    if parser.parse_args(arguments).write:
+        STUB.write_text(stub(), encoding="utf-8")
+        return 0
+    if STUB.read_text(encoding="utf-8") == stub():
+        return 0
+    print(f"{STUB} is out of date: run python -m palpate_bus.messages.stubs --write", file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
