@@ -11,10 +11,11 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.setpoint import Setpoint
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_control.impedance import ImpedanceController
 from palpate_control.reference import Extrapolator
-from palpate_control.service import create, setpoint_from
+from palpate_control.service import create
 from palpate_models.lbr import HOME, JOINT_NAMES
 from palpate_models.scenario import Scenario
 
@@ -70,11 +71,11 @@ def measure(steps: int = 4000) -> dict[str, float]:
     x, y, z = (float(value) for value in arm.p_WI)
     pose = Pose(Point(x, y, z), Quaternion(1.0, 0.0, 0.0, 0.0))
 
-    controller, guide = ImpedanceController(arm), Extrapolator()
+    controller, guide = ImpedanceController(arm), Extrapolator(10 * MS)
     law, extrapolation, step, decode, encode = (_Clock() for _ in range(5))
     for k in range(steps):
         if k % 10 == 0:
-            guide.accept(setpoint_from(_setpoint(k * MS, pose)), k * MS)
+            guide.accept(Setpoint.from_message(_setpoint(k * MS, pose)), k * MS)
         with extrapolation:
             reference = guide.at(k * MS)
         with law:

@@ -22,9 +22,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_bus.contract import contract
+from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
-from palpate_control.reference import Extrapolator, Mode, Reference, Setpoint
+from palpate_control.reference import Extrapolator, Reference
 from palpate_models.lbr import urdf
 from palpate_models.phantom import build_phantom
 from palpate_planning.setpoint import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
@@ -105,10 +107,10 @@ def linearise(contrast: float, stiffness: float, across: float = 1.0) -> Loop:
     asked[:2] *= across
     asked[2] = stiffness
     setpoint = Setpoint(
-        mode=Mode.CARTESIAN, stamp=0, R_WD=model.R_WI.copy(), p_WD=model.p_WI.copy(), V_WD=np.zeros(6), F_W=np.zeros(6),
+        mode=ControlMode.CARTESIAN, stamp=0, R_WD=model.R_WI.copy(), p_WD=model.p_WI.copy(), V_WD=np.zeros(6), F_W=np.zeros(6),
         stiffness=asked, damping_ratio=DAMPING_RATIO, q=q, qd=np.zeros(7), joint_stiffness=POSTURE_STIFFNESS,
     )  # fmt: skip
-    extrapolator = Extrapolator()
+    extrapolator = Extrapolator(contract().topics["planning/setpoint"].period)
     extrapolator.accept(setpoint, 0)
     reference = extrapolator.at(0)
     zero, eye = np.zeros(7), np.eye(7)
@@ -118,7 +120,7 @@ def linearise(contrast: float, stiffness: float, across: float = 1.0) -> Loop:
     model.update(q, zero)
     lever = np.array(((0, -radius, 0), (radius, 0, 0), (0, 0, 0)))  # velocity of the point below the centre by rotation
     return Loop(
-        inertia=np.asarray(np.linalg.inv(model.mobility), dtype=np.float64),
+        inertia=model.inertia(q),
         friction=np.diag(model.viscous_friction),
         stiffness=np.array(springs).T,
         damping=np.array(damping).T,

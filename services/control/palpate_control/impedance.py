@@ -23,24 +23,63 @@ against each other, and then a few milliseconds from measuring to acting shake t
 
 from __future__ import annotations
 
+from math import isfinite
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
+import pinocchio as pin
 
-from palpate_control import kernel
-from palpate_control.kernel import JOINT_DAMPING_RATIO, LEAST_DAMPING
-from palpate_control.layout import QDD
-from palpate_control.model import DOF, SLOW_S, ArmModel
-from palpate_control.reference import Mode, Reference, Setpoint
+from palpate_bus.setpoint import ControlMode, Setpoint
+from palpate_control.model import DOF, ArmModel
+from palpate_control.reference import Reference
 from palpate_control.safety import SafetyNet
+from palpate_models.compiled import compiled
+from palpate_models.frames import Array
 
-Array = NDArray[np.float64]
+Arrays = tuple[Array, ...]
 
+POSITION_CLIP_M = 0.1
+"""Largest position error that stretches the spring, each axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use the like)."""
+ROTATION_CLIP_RAD = 0.5
+"""The same for rotation."""
+JOINT_CLIP_RAD = 0.25
+"""The same for a joint in mode JOINT."""
+NULL_TORQUE_NM = 5.0
+"""Cap of the null-space torque, each joint."""
+JOINT_DAMPING_RATIO = 0.7
+"""Damping ratio of the joint springs in mode JOINT and of the null-space posture [1]."""
+STICTION_SPEED = 0.02
+"""Joint speed at which half of the Coulomb friction is compensated [rad/s]; keeps the compensation smooth."""
+LEAST_DAMPING = 0.1
+"""Part of the designed damping that is commanded even where friction alone would do: friction is known badly."""
+REGULARISATION = 1e-7
+"""Added to the diagonal of a task mobility [1/kg, 1/(kg m^2)], which loses rank where the arm is singular."""
+SLOW_S = 0.1
+"""T: time scale on which motion is as much friction's as inertia's [s]. Postures and scans move this slowly or slower."""
 DEAD_TICKS = 2
 """From measuring to acting: a tick of transport, one of holding the torque, half of velocity's age, rounded up."""
 SPRING_ANGLE = 0.3
 """Fastest undamped frequency of a spring, times the dead time [rad]: past it sampled damping adds energy."""
 DESIGN_TICKS = 10
 """Gains are designed for each set-point, and again after so many ticks: meanwhile the arm moves by milliradians."""
+
+
+class CartesianGains(NamedTuple):
+    """Gains of mode CARTESIAN: of the six axes of D, shape (6,), and of the posture in the null space, shape (7,)."""
+
+    K: Array
+    B: Array
+    K_0: Array
+    B_0: Array
+    J_bar: Array
+    """Inverse of the Jacobian in world axes, consistent with W = (M + T D)^-1: W J^T (J W J^T)^-1, shape (7, 6)."""
+
+
+class JointGains(NamedTuple):
+    """Gains of mode JOINT, shape (7, 7) each."""
+
+    K: Array
+    B: Array
 
 
 class ImpedanceController:
@@ -51,15 +90,11 @@ class ImpedanceController:
         self.model = model
         self._net = SafetyNet(model.position_lower, model.position_upper, model.torque_limit, limit_zone, period_s)
         self._dead_time = DEAD_TICKS * period_s
-        self._spring_rate = SPRING_ANGLE / self._dead_time
-        self._joints = np.stack((model.velocity_limit, model.viscous_friction, model.coulomb_friction))
-        self._q, self._qd, self._raw = np.zeros(DOF), np.zeros(DOF), np.zeros(DOF)
-        self._J, self._JW, self._slow_inertia = np.zeros((6, DOF)), np.zeros((6, DOF)), np.zeros((6, 6))  # in D's axes
+        self._friction = (model.viscous_friction, model.coulomb_friction, model.velocity_limit)
         self._designed_for: Setpoint | None = None
         self._design_age = 0
-        self._gains = np.zeros(6 + 6 + DOF)
-        self._joint_stiffness = self._joint_damping = np.zeros((DOF, DOF))
-        self._position_error, self._velocity_error = np.zeros(DOF), np.zeros(DOF)
+        self._cartesian_gains = CartesianGains(*np.zeros((2, 6)), *np.zeros((2, DOF)), np.zeros((DOF, 6)))
+        self._joint_gains = JointGains(*np.zeros((2, DOF, DOF)))
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
@@ -71,37 +106,38 @@ class ImpedanceController:
 
         Raises ValueError if `q` or `qd` is not finite or not of shape (7,).
         """
-        if not self._take(q, qd):
+        q, qd = np.array(q, dtype=float), np.array(qd, dtype=float)
+        if not (q.shape == qd.shape == (DOF,) and isfinite(q.dot(q) + qd.dot(qd))):
             raise ValueError(f"joint_states: position = {q}, velocity = {qd}: must be {DOF} finite values each")
-        if reference.setpoint.mode is Mode.CARTESIAN:
-            self._cartesian(reference)
-        else:
-            self._joint(reference)
-        return self._net.torque(self._raw, self._q, self.model.gravity)
+        law = self._cartesian if reference.setpoint.mode is ControlMode.CARTESIAN else self._joint
+        return self._net.torque(law(q, qd, reference), q, self.model.gravity)
 
-    def _take(self, q: Array, qd: Array) -> bool:
-        """Copies a joint state; False where it is none."""
-        if q.shape != (DOF,) or qd.shape != (DOF,):
-            return False
-        self._q[:] = q
-        self._qd[:] = qd
-        return kernel.finite(self._q, self._qd)
+    def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
+        """The torque that the law asks for in mode CARTESIAN [N m], shape (7,)."""
+        model, motion = self.model, reference.motion
+        model.update(q, qd)
+        if self._outdated(reference.setpoint):
+            setpoint = reference.setpoint  # copied: arrays of messages are read-only, which is another type to numba
+            asked = (setpoint.stiffness.copy(), setpoint.damping_ratio.copy(), setpoint.joint_stiffness.copy())
+            inertia, friction = model.inertia(q), model.viscous_friction
+            self._cartesian_gains = cartesian_gains(asked, motion.R_WD, model.J_W, inertia, friction, self._dead_time)
+        arm = (q, qd, model.p_WI, model.J_W, model.coriolis)
+        R_DI = motion.R_WD.T.dot(model.R_WI)
+        gains = tuple(self._cartesian_gains)
+        return cartesian_torque(arm, tuple(motion), pin.log3(R_DI), pin.Jlog3(R_DI), gains, self._friction)
 
-    def _joint(self, reference: Reference) -> None:
-        model, q, qd = self.model, self._q, self._qd
+    def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
+        """The torque that the law asks for in mode JOINT [N m], shape (7,)."""
+        model, motion = self.model, reference.motion
         model.update_gravity(q)
         if self._outdated(reference.setpoint):
-            self._design_joint(q, reference["joint_stiffness"])
-        kernel.joint_errors(q, qd, reference.values, self._position_error, self._velocity_error)
-        kernel.joint_torque(
-            self._joint_stiffness.dot(self._position_error),
-            self._joint_damping.dot(self._velocity_error),
-            model.inverse_dynamics(q, qd, reference.values[QDD:]),
-            model.gravity,
-            reference.values,
-            self._joints,
-            self._raw,
-        )
+            self._joint_gains = joint_gains(
+                reference.setpoint.joint_stiffness, model.inertia(q), model.viscous_friction, self._dead_time
+            )
+        error = np.minimum(np.maximum(motion.q - q, -JOINT_CLIP_RAD), JOINT_CLIP_RAD)
+        impedance = self._joint_gains.K @ error + self._joint_gains.B @ (motion.qd - qd)
+        inertial = model.inverse_dynamics(q, qd, motion.qdd) - model.gravity
+        return impedance + inertial + friction_torque(motion.qd, model.viscous_friction, model.coulomb_friction)
 
     def _outdated(self, setpoint: Setpoint) -> bool:
         """Whether gains are to be designed now for the set-point."""
@@ -111,46 +147,92 @@ class ImpedanceController:
         self._designed_for, self._design_age = setpoint, 1
         return True
 
-    def _design_joint(self, q: Array, stiffness: Array) -> None:
-        """Gains of mode JOINT at a posture, mode by mode bounded as in `_design`."""
-        L = np.linalg.cholesky(self.model.inertia(q))
-        L_inverse = np.linalg.inv(L)
-        squared, V = np.linalg.eigh((L_inverse * stiffness).dot(L_inverse.T))
-        P, P_inverse = L.dot(V), V.T.dot(L_inverse)
-        friction = (P_inverse**2).dot(self.model.viscous_friction)
-        squared = np.minimum(np.maximum(squared, 0.0), np.maximum(self._spring_rate**2, friction / (4 * self._dead_time)))
-        damping = (2 * JOINT_DAMPING_RATIO) * np.sqrt(squared)
-        self._joint_stiffness = (P * squared).dot(P.T)
-        self._joint_damping = (P * np.maximum(damping - friction, LEAST_DAMPING * damping)).dot(P.T)
 
-    def _cartesian(self, reference: Reference) -> None:
-        model, q, qd, values = self.model, self._q, self._qd, reference.values
-        J, JW, slow_inertia = self._J, self._JW, self._slow_inertia
-        model.update(q, qd)
-        kernel.task_space(values, model.J_W, model.slow_mobility, J, JW, slow_inertia)
-        if self._outdated(reference.setpoint):
-            self._design(reference)
-        kernel.cartesian_torque(
-            q,
-            qd,
-            values,
-            model.R_WI,
-            model.p_WI,
-            J,
-            JW,
-            slow_inertia,
-            model.bias,
-            model.gravity,
-            self._gains,
-            self._joints,
-            self._raw,
-        )
+# The law is compiled, because it is most of a tick at 1 kHz; pinocchio's log3 and Jlog3 are called before it. What it takes comes
+# in plain tuples: numba reads them in half the time that it needs for named ones.
 
-    def _design(self, reference: Reference) -> None:
-        """Gains for this set-point and posture: stiffness that sampling can bear and the damping that goes with it."""
-        joint_mobility = self.model.mobility
-        mobility = self._J.dot(joint_mobility).dot(self._J.T)
-        square_rate = self._spring_rate**2
-        kernel.design(
-            reference.values, mobility, joint_mobility, self._slow_inertia, SLOW_S, square_rate, self._dead_time, self._gains
-        )
+
+@compiled
+def cartesian_torque(arm: Arrays, desired: Arrays, phi: Array, Jlog: Array, gains: Arrays, friction: Arrays) -> Array:
+    """Torque of mode CARTESIAN [N m], shape (7,), before limits.
+
+    Args:
+        arm: q, qd, p_WI, J_W and C(q, qd) qd, as `ArmModel` evaluates them.
+        desired: the fields of `Motion`.
+        phi: rotation vector of R_DI [rad], shape (3,).
+        Jlog: derivative of `phi` by a rotation in axes of I, shape (3, 3).
+        gains: the fields of `CartesianGains`.
+        friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shapes (7,).
+    """
+    q, qd, p_WI, J, coriolis = arm
+    R_WD, p_WD, V_WD, F_W, q_0, qd_0, _ = desired
+    K, B, K_0, B_0, J_bar = gains
+    viscous, coulomb, velocity_limit = friction
+
+    p_error = np.clip(R_WD.T @ (p_WD - p_WI), -POSITION_CLIP_M, POSITION_CLIP_M)
+    R_error = np.clip(-phi, -ROTATION_CLIP_RAD, ROTATION_CLIP_RAD)
+    V_error = to_axes(R_WD.T, V_WD - J @ qd)
+    spring = np.concatenate((K[:3] * p_error, Jlog @ (K[3:] * R_error)))  # the gradient of 1/2 phi' K phi
+    F = to_axes(R_WD, spring + B * V_error) + F_W
+
+    tau_0 = K_0 * (q_0 - q) + B_0 * (qd_0 - qd)
+    null = tau_0 - J.T @ (J_bar.T @ tau_0)
+    null *= NULL_TORQUE_NM / max(NULL_TORQUE_NM, np.abs(null).max())  # as a whole: so it stays in the null space
+
+    qd_d = qd_0 + J_bar @ (V_WD - J @ qd_0)
+    qd_d = np.minimum(np.maximum(qd_d, -velocity_limit), velocity_limit)
+    torque: Array = J.T @ F + null + coriolis + friction_torque(qd_d, viscous, coulomb)
+    return torque
+
+
+@compiled
+def friction_torque(qd: Array, viscous: Array, coulomb: Array) -> Array:
+    """Torque that overcomes the joints' friction at desired velocities `qd` [rad/s], [N m], shape (7,)."""
+    return (viscous + coulomb / (np.abs(qd) + STICTION_SPEED)) * qd
+
+
+@compiled
+def to_axes(R_AB: Array, x_B: Array) -> Array:
+    """A twist or wrench at the same point, linear and angular part, shape (6,), from axes of B to those of A."""
+    return np.concatenate((R_AB @ x_B[:3], R_AB @ x_B[3:]))
+
+
+@compiled
+def cartesian_gains(asked: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, dead_time: float) -> CartesianGains:
+    """Stiffness that sampling can bear, the damping that goes with it, and the null space, at a posture.
+
+    Args:
+        asked: stiffness, damping ratio and joint stiffness of a `Setpoint`.
+        R_WD: desired rotation of the indenter, shape (3, 3).
+        J_W: Jacobian in world axes, shape (6, 7).
+        M: inertia of the joints [kg m^2], shape (7, 7).
+        D: their viscous friction [N m s/rad], shape (7,).
+        dead_time: from measuring to acting [s].
+    """
+    stiffness, damping_ratio, K_0 = asked
+    turn = np.kron(np.eye(2), R_WD.T)  # a twist or wrench from world axes to D's
+    J = turn @ J_W
+    M_inverse, W = np.linalg.inv(M), np.linalg.inv(M + SLOW_S * np.diag(D))
+    mobility = J @ M_inverse @ J.T
+    inertia = np.diag(np.linalg.inv(mobility + REGULARISATION * np.eye(6)))
+    slow_inertia = np.linalg.inv(J @ W @ J.T + REGULARISATION * np.eye(6))
+    friction = (np.diag(slow_inertia) - inertia) / SLOW_S
+    # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
+    mass = np.minimum(inertia, 4 / np.diag(mobility))
+    K = np.minimum(stiffness, np.maximum((SPRING_ANGLE / dead_time) ** 2 * mass, friction / (4 * dead_time)))
+    B = 2 * damping_ratio * np.sqrt(K * mass)
+    B_0 = 2 * JOINT_DAMPING_RATIO * np.sqrt(K_0 / np.diag(M_inverse))
+    J_bar = W @ J.T @ slow_inertia @ turn
+    return CartesianGains(K, np.maximum(B - friction, LEAST_DAMPING * B), K_0, B_0, J_bar)
+
+
+def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:
+    """Gains of mode JOINT at a posture of inertia `M`, shape (7, 7): bounded as in `cartesian_gains`, mode by mode."""
+    L = np.linalg.cholesky(M)
+    L_inverse = np.linalg.inv(L)
+    squared, V = np.linalg.eigh((L_inverse * stiffness) @ L_inverse.T)
+    P, P_inverse = L @ V, V.T @ L_inverse
+    friction = P_inverse**2 @ viscous_friction
+    squared = np.clip(squared, 0.0, np.maximum((SPRING_ANGLE / dead_time) ** 2, friction / (4 * dead_time)))
+    damping = 2 * JOINT_DAMPING_RATIO * np.sqrt(squared)
+    return JointGains((P * squared) @ P.T, (P * np.maximum(damping - friction, LEAST_DAMPING * damping)) @ P.T)

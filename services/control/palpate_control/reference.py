@@ -1,219 +1,115 @@
-"""Set-points and what the controller follows between them: extrapolated by their twist, joined without a step."""
+"""What the law follows between set-points: each is carried on by its velocity and joined to the one before without a step."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from enum import IntEnum
-from math import exp, sqrt
-from operator import attrgetter
-from typing import Final
+from math import exp
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from palpate_control import layout
-from palpate_control.extrapolation import carry, change_over, follow, joint_acceleration
+from palpate_bus.setpoint import ControlMode, Setpoint
+from palpate_models.frames import Array
 
-Array = NDArray[np.float64]
-
-MAX_EXTRAPOLATION_NS = 30_000_000
-"""Past this age a set-point stands still. One is 10 to 19 ms old in use; one missing message is bridged."""
+BRIDGED_PERIODS = 3
+"""A set-point older than this many periods stands still. One is one to two periods old in use, and one may be missing."""
 SMOOTHING_S = 0.005
-"""Time constant in which the step between two set-points fades."""
+"""Time constant with which the step between two set-points fades [s]."""
 MAX_ACCELERATION = 15.0
 """Bound on the acceleration read off consecutive joint set-points [rad/s^2]."""
 
 
-class Mode(IntEnum):
-    """What a set-point asks for; values of `palpation_msgs/ImpedanceSetpoint`."""
+class Motion(NamedTuple):
+    """The moving part of a set-point at one moment: fields as in `Setpoint`, and the joints' acceleration."""
 
-    CARTESIAN = 0
-    JOINT = 1
-
-
-@dataclass(frozen=True, slots=True)
-class Setpoint:
-    """One set-point of the impedance controller. Constructing one checks it; ValueError names the field."""
-
-    mode: Mode
-    stamp: int
-    """Time at which pose and joint position hold [ns]."""
     R_WD: Array
-    """Desired rotation of the indenter frame in world, shape (3, 3)."""
     p_WD: Array
-    """Desired origin of the indenter frame in world [m], shape (3,)."""
     V_WD: Array
-    """Desired twist in world axes, linear [m/s] then angular [rad/s], shape (6,)."""
     F_W: Array
-    """Feed-forward wrench exerted on the environment, force [N] then torque [N m], world axes, at I, shape (6,)."""
-    stiffness: Array
-    """In axes of the desired frame: translation [N/m], rotation [N m/rad], shape (6,)."""
-    damping_ratio: Array
-    """[1], shape (6,)."""
     q: Array
-    """JOINT: target; CARTESIAN: null-space posture [rad], shape (7,)."""
     qd: Array
-    """Velocity of `q` [rad/s], shape (7,)."""
-    joint_stiffness: Array
-    """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
-    values: Array = field(init=False, repr=False, compare=False)
-    """All of them as in `layout`, shape (64,)."""
-
-    def __post_init__(self) -> None:
-        values: Array = np.concatenate((*_PARTS(self), _STILL), axis=None)
-        if values.size != layout.COUNT:
-            raise ValueError(f"set-point: has {values.size - _STILL.size} numbers: must be {layout.COUNT - _STILL.size}")
-        if not ((values >= _LOW) & (values <= _HIGH)).all():  # so it is, too, where one is NaN
-            raise ValueError(self._wrong())
-        object.__setattr__(self, "values", values)
-        a, b, c, d, e, f, g, h, i = values[layout.R_WD : layout.QDD].tolist()
-        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-        if abs(determinant - 1) > 1e-6:
-            raise ValueError(f"set-point: R_WD has determinant {determinant}: must be a rotation")
-
-    def _wrong(self) -> str:
-        """The first field that is out of its range."""
-        for name, part, said, low, high in RANGES:
-            values = getattr(self, name)[part]
-            if not np.isfinite(values).all():
-                return f"set-point: {said} = {values}: must be finite"
-            if not ((values >= low) & (values <= high)).all():
-                return f"set-point: {said} = {values}: must be within {low:g} and {high:g}"
-        return f"set-point: R_WD = {self.R_WD}: must be a rotation"
+    qdd: Array
+    """[rad/s^2], shape (7,); zero in mode CARTESIAN."""
 
 
-_ALL, _FIRST, _LAST = slice(None), slice(0, 3), slice(3, 6)
-RANGES: Final = (
-    ("stiffness", _ALL, "stiffness", 0.0, 20000.0),
-    ("damping_ratio", _ALL, "damping_ratio", 0.0, 10.0),
-    ("joint_stiffness", _ALL, "joint_stiffness", 0.0, 5000.0),
-    ("p_WD", _ALL, "pose.position", -3.0, 3.0),
-    ("V_WD", _FIRST, "twist.linear", -2.0, 2.0),
-    ("V_WD", _LAST, "twist.angular", -20.0, 20.0),
-    ("F_W", _FIRST, "wrench.force", -100.0, 100.0),
-    ("F_W", _LAST, "wrench.torque", -50.0, 50.0),
-    ("q", _ALL, "joint_position", -3.2, 3.2),
-    ("qd", _ALL, "joint_velocity", -4.0, 4.0),
-)
-"""What a set-point may ask for: attribute, part of it, the message's field, least and largest value; as in the contract, where it
-says."""
-_PARTS: Final = attrgetter(*(name for name in layout.NUMBERS.names or () if name != "qdd"))  # which is the last
-_STILL: Final = np.zeros(layout.COUNT - layout.QDD)
-
-
-def _bounds(column: int, of_rotation: float) -> Array:
-    """Least or greatest values (`column` of `RANGES`) of all numbers, shape (64,)."""
-    numbers = np.zeros(1, layout.NUMBERS)
-    numbers["R_WD"] = of_rotation
-    for row in RANGES:
-        numbers[row[0]][:, row[1]] = row[column]
-    return numbers.view(np.float64)
-
-
-_LOW: Final = _bounds(3, -2.0)
-_HIGH: Final = _bounds(4, 2.0)
-
-
-def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
-    """Rotation matrix, shape (3, 3), of a unit quaternion. Raises ValueError if its norm is off by 1 % or more."""
-    norm = sqrt(x * x + y * y + z * z + w * w)
-    if not abs(norm - 1) < 0.01:
-        raise ValueError(f"set-point: pose.orientation = ({x}, {y}, {z}, {w}) has norm {norm}: must be 1")
-    rotation: Array = pin.Quaternion(w / norm, x / norm, y / norm, z / norm).toRotationMatrix()
-    return rotation
-
-
-@dataclass(slots=True)
-class Reference:
+class Reference(NamedTuple):
     """What the law follows at one tick."""
 
     setpoint: Setpoint
-    """The set-point that it comes from."""
-    values: Array
-    """That set-point's numbers carried on to the tick, and the joints' acceleration, as in `layout`, shape (64,)."""
+    """The set-point in use: its mode, stiffness and damping hold as they are."""
+    motion: Motion
+    """Its motion, carried on to the tick."""
 
-    def __getitem__(self, name: str) -> Array:
-        """The part of `values` that `layout.NUMBERS` has under this name, as a view of its shape."""
-        part: Array = self.values.view(layout.NUMBERS)[name][0]
-        return part
+
+# The coordinates of a motion are one vector, shape (32,), so that carrying on, joining and fading are one expression: position,
+# rotation vector away from the set-point's own R_WD in world axes, joint positions; the velocities of these; wrench.
+_P, _PHI, _Q, _V, _QD, _F = slice(0, 3), slice(3, 6), slice(6, 13), slice(13, 19), slice(19, 26), slice(26, 32)
+_POSITIONS, _VELOCITIES = slice(0, 13), slice(13, 26)
 
 
 class Extrapolator:
-    """Carries set-points on to the present: pose (+) twist * age, joint position + velocity * age.
+    """Carries set-points on to the present: pose by the twist, joint positions by their velocity and acceleration.
 
-    Consecutive set-points rarely meet exactly: their path accelerates. The gap at the change-over (in pose, twist,
-    wrench, joint position and velocity) is added to the new one and fades in `SMOOTHING_S`: neither step nor lag.
+    Consecutive set-points rarely meet exactly, because their path accelerates. The gap between them at the change-over is added
+    to the new one and fades within `SMOOTHING_S`: there is neither a step nor a lag.
     """
 
-    def __init__(self) -> None:
-        self._current: Setpoint | None = None
-        self._acceleration = np.zeros(7)
-        self._gap = np.zeros(32)  # as `extrapolation.bridge` has it
-        self._time = 0
-        self._standing = False
-
-    @property
-    def current(self) -> Setpoint | None:
+    def __init__(self, period: int) -> None:
+        """Set-points come every `period` [ns]."""
+        self._max_age = BRIDGED_PERIODS * period
+        self._terms = np.zeros((4, 32))
+        """Coordinates at the set-point's stamp, what they gain with its age [s] and the square of that, and the gap."""
+        self._since = 0
+        """The last tick of the set-point before [ns]: the gap fades from then on."""
+        self._tick = 0
+        """The newest tick [ns]."""
+        self.current: Setpoint | None = None
         """The set-point in use."""
-        return self._current
 
     def clear(self) -> None:
         """Forgets the set-point, so that the next one starts afresh."""
-        self._current = None
-        self._acceleration = np.zeros(7)
-        self._gap[:] = 0.0
-        self._standing = False
+        self.current = None
 
     def accept(self, setpoint: Setpoint, t: int) -> None:
         """Takes a new set-point at time `t` [ns]."""
-        old = self._current
-        if old is None or old.mode != setpoint.mode:
-            self.clear()
-            self._current = setpoint
+        before = self.current
+        if before is None or before.mode is not setpoint.mode:
+            self.current, self._tick, self._terms = setpoint, t, _terms(setpoint, np.zeros(7))
             return
-        before = self._raw(old, t)
-        spacing = setpoint.stamp - old.stamp
-        acceleration = np.zeros(7)
-        if setpoint.mode is Mode.JOINT and 0 < spacing <= MAX_EXTRAPOLATION_NS:
-            joint_acceleration(old.values, setpoint.values, spacing * 1e-9, MAX_ACCELERATION, acceleration)
-        self._acceleration = acceleration
-        self._current = setpoint
-        after = self._raw(setpoint, t)
-        self._standing = False
-        change_over(before.values, after.values, pin.log3(before["R_WD"] @ after["R_WD"].T), self._gap)
-        if setpoint.mode is Mode.JOINT:
-            self._gap[:18] = 0.0  # a joint reference has no pose of its own
-
-    def _raw(self, setpoint: Setpoint, t: int) -> Reference:
-        """The set-point extrapolated to `t` alone."""
-        values = np.empty(layout.COUNT)
-        age = t - setpoint.stamp
-        carry(setpoint.values, self._acceleration, _bounded(age) * 1e-9, age > MAX_EXTRAPOLATION_NS, values)
-        return Reference(setpoint, values)
+        now, acceleration = self._coordinates(before, t, self._tick), np.zeros(7)
+        now[_PHI] = pin.log3(pin.exp3(now[_PHI]) @ before.R_WD @ setpoint.R_WD.T)  # away from the new R_WD
+        spacing = setpoint.stamp - before.stamp
+        if setpoint.mode is ControlMode.JOINT and 0 < spacing <= self._max_age:
+            acceleration = np.clip((setpoint.qd - before.qd) / (spacing * 1e-9), -MAX_ACCELERATION, MAX_ACCELERATION)
+        self.current, self._since, self._terms = setpoint, self._tick, _terms(setpoint, acceleration)
+        self._terms[3] = now - self._coordinates(setpoint, t, t)
 
     def at(self, t: int) -> Reference:
-        """The reference at time `t` [ns], which does not go back. Raises ValueError before the first set-point."""
-        setpoint = self._current
+        """The reference at time `t` [ns]. Raises ValueError before the first set-point."""
+        setpoint = self.current
         if setpoint is None:
             raise ValueError("no set-point yet")
-        age = t - setpoint.stamp
-        standing = age > MAX_EXTRAPOLATION_NS
-        if standing and not self._standing:
-            self._standing = True  # the sender has fallen silent: brake smoothly
-            if setpoint.mode is Mode.CARTESIAN:
-                self._gap[6:12] += setpoint.V_WD
-            self._gap[25:] += setpoint.qd
-        elapsed = t - self._time
-        fade = exp(-elapsed * 1e-9 / SMOOTHING_S) if self._time and elapsed > 0 else 1.0
-        self._time = t
-        values = np.empty(layout.COUNT)
-        follow(setpoint.values, self._acceleration, _bounded(age) * 1e-9, standing, fade, self._gap, values)
-        return Reference(setpoint, values)
+        self._tick = t
+        x = self._coordinates(setpoint, t, t)
+        R_WD = pin.exp3(x[_PHI]).dot(setpoint.R_WD)
+        qdd = self._terms[1, _QD] if t - setpoint.stamp <= self._max_age else np.zeros(7)
+        return Reference(setpoint, Motion(R_WD, x[_P], x[_V], x[_F], x[_Q], x[_QD], qdd))
+
+    def _coordinates(self, setpoint: Setpoint, t: int, faded: int) -> Array:
+        """Coordinates of the reference at `t`, shape (32,), with the gap as it has faded until `faded` [ns]."""
+        age = min(max(t - setpoint.stamp, -self._max_age), self._max_age) * 1e-9
+        x: Array = np.array((1.0, age, age * age, exp((self._since - faded) * 1e-9 / SMOOTHING_S))).dot(self._terms)
+        excess = t - setpoint.stamp - self._max_age
+        if excess > 0:  # the sender has fallen silent: brake smoothly
+            x[_VELOCITIES] *= exp(-excess * 1e-9 / SMOOTHING_S)
+        return x
 
 
-def _bounded(age: int) -> int:
-    """An age [ns] within what is extrapolated."""
-    if age > MAX_EXTRAPOLATION_NS:
-        return MAX_EXTRAPOLATION_NS
-    return age if age > -MAX_EXTRAPOLATION_NS else -MAX_EXTRAPOLATION_NS
+def _terms(setpoint: Setpoint, acceleration: Array) -> Array:
+    """The terms of a set-point's coordinates without a gap, shape (4, 32); `acceleration` of the joints [rad/s^2]."""
+    terms = np.zeros((4, 32))
+    terms[0, _P], terms[0, _Q], terms[0, _F] = setpoint.p_WD, setpoint.q, setpoint.F_W
+    terms[0, _V], terms[0, _QD] = setpoint.V_WD, setpoint.qd
+    terms[1, _POSITIONS], terms[1, _QD] = terms[0, _VELOCITIES], acceleration
+    terms[2, _Q] = acceleration / 2
+    return terms

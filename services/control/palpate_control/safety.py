@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_control import kernel
-
-Array = NDArray[np.float64]
+from palpate_models.compiled import compiled
+from palpate_models.frames import Array
 
 TORQUE_RATE_NM = 1.0
 """Largest change of a joint's torque in one millisecond [N m] (libfranka and CRISP bound it to 0.5 to 1.0)."""
@@ -18,31 +16,46 @@ REPULSION_FRACTION = 0.3
 class SafetyNet:
     """Between any law and the arm: torques away from joint limits, within the joints' limits, and without jumps.
 
-    The repulsion is a progressive spring in the last `zone` before each joint limit: conservative, smooth at the zone's edge.
+    The repulsion is a progressive spring in the last `zone` before each joint limit: conservative, and smooth at the zone's edge.
     Torques saturate with gravity counted in. Their change from tick to tick is bounded.
     """
 
-    def __init__(self, lower: Array, upper: Array, torque_limit: Array, zone: float, period_s: float = 1e-3) -> None:
+    def __init__(self, lower: Array, upper: Array, torque_limit: Array, zone: float, period_s: float) -> None:
         """Limits [rad] and torque limits [N m], shapes (7,); `zone` [rad], 0 switches the repulsion off.
 
         One torque comes every `period_s`.
         """
-        cap = REPULSION_FRACTION * torque_limit
-        gain = cap / zone**2 if zone > 0 else np.zeros_like(lower)
-        self._zone = np.stack(((lower + upper) / 2, (upper - lower) / 2 - zone, gain, cap))
-        self._limit = torque_limit
+        gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)
+        self._joints = ((lower + upper) / 2, (upper - lower) / 2 - zone, gain, torque_limit)
         self._rate = TORQUE_RATE_NM * period_s / 1e-3
         self._last = np.zeros_like(torque_limit)
 
     def reset(self) -> None:
         """Starts again from zero torque, as after a pause in which nothing was commanded."""
-        self._last[:] = 0.0
+        self._last = np.zeros_like(self._last)
 
     def torque(self, wanted: Array, q: Array, gravity: Array) -> Array:
         """The torque that may be commanded [N m], shape (7,), at joint positions `q` [rad], in place of the `wanted` one.
 
-        It and it plus `gravity` are within limits. `wanted` is used up.
+        It and it plus `gravity` are within limits.
         """
-        allowed = np.empty(len(wanted))
-        kernel.safe(wanted, q, gravity, self._zone, self._limit, self._rate, self._last, allowed)
-        return allowed
+        safe = safe_torque(wanted, q, gravity, self._last, self._rate, self._joints)
+        self._last = np.array(safe, dtype=float)  # numba's array has a dtype that equals numpy's but is another: slow to encode
+        return self._last
+
+
+@compiled
+def safe_torque(wanted: Array, q: Array, gravity: Array, last: Array, rate: float, joints: tuple[Array, ...]) -> Array:
+    """The torque [N m], shape (7,), that pushes away from the joint limits, else is as `wanted`, within all limits.
+
+    It is within the torque limits, also with `gravity` added, and within `rate` of `last` [N m]. `joints` are the middle of the
+    joints' ranges [rad], the angle from it at which the repulsion begins [rad], its gain [N m/rad^2] and the torque limits [N m].
+    """
+    middle, free, gain, limit = joints
+    off = q - middle
+    depth = np.maximum(np.abs(off) - free, 0.0)
+    repulsion = np.minimum(gain * depth**2, REPULSION_FRACTION * limit)
+    low = np.maximum(np.maximum(-limit, -limit - gravity), last - rate)
+    high = np.minimum(np.minimum(limit, limit - gravity), last + rate)
+    safe: Array = np.minimum(np.maximum(wanted - np.sign(off) * repulsion, low), high)
+    return safe

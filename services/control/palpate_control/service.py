@@ -13,17 +13,16 @@ from palpate_bus.messages import ImpedanceSetpoint, JointTorqueCommand, Point, P
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_control import kernel
+from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import DOF, ArmModel
-from palpate_control.reference import Extrapolator, Mode, Setpoint, rotation_from_quaternion
+from palpate_control.reference import Extrapolator
+from palpate_models.frames import Array
 from palpate_models.lbr import HOME, JOINT_NAMES, urdf
 from palpate_models.load import exam_input
 from palpate_models.scenario import Limits, Robot, Scenario
 
 _NAMES = list(JOINT_NAMES)
-AHEAD = 500 * MS
-"""A set-point whose stamp is further in the future is refused: it would keep all later ones waiting."""
 
 
 class ControlService(Service):
@@ -43,8 +42,8 @@ class ControlService(Service):
         self.model = ArmModel(urdf(robot))
         topics = contract().topics
         self._controller = ImpedanceController(self.model, limits.joint_margin_rad, contract().roles[self.role].period / NS)
-        self._reference = Extrapolator()
-        self._setpoint_expiry = (topics["planning/setpoint"].expiry_ms or 0) * MS
+        self._reference = Extrapolator(topics[TOPIC].period)
+        self._setpoint_expiry = (topics[TOPIC].expiry_ms or 0) * MS
         self._joint_states_age = (topics["joint_states"].max_age_ms or 0) * MS
         self._validity = (topics["control/joint_torque"].expiry_ms or 0) * MS
         self._valid = duration_message(self._validity)
@@ -69,8 +68,8 @@ class ControlService(Service):
         """Compiles the law in both modes now, on set-points as they come from the bus: at 1 kHz there is no time for it."""
         kind, rest, still = "palpation_msgs/msg/ImpedanceSetpoint", np.zeros(DOF), Vector3(0.0, 0.0, 0.0)
         pose = Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
-        for mode in Mode:
-            guide = Extrapolator()
+        for mode in ControlMode:
+            guide = Extrapolator(contract().topics[TOPIC].period)
             for stamp in (0, MS):
                 message = ImpedanceSetpoint(
                     header(stamp, "world"),
@@ -85,9 +84,8 @@ class ControlService(Service):
                     np.ones(DOF),
                     self._valid,
                 )
-                guide.accept(setpoint_from(codec.decode(codec.encode(message, kind), kind)), stamp)
+                guide.accept(Setpoint.from_message(codec.decode(codec.encode(message, kind), kind)), stamp)
                 self._controller.torque(np.array(HOME), rest, guide.at(stamp))
-        kernel.widen(self._peak, rest)
         self._controller.reset()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -100,14 +98,14 @@ class ControlService(Service):
         # The law compares the reference with a measurement, so it takes that of the same moment. With the present one a late
         # state would look like an error that grows with the speed, and wind the spring up: 17 mrad after 20 ms at 0.86 rad/s.
         followed = max(measured, t - self._setpoint_expiry)
-        for message in inbox.new("planning/setpoint"):
+        for message in inbox.new(TOPIC):
             self._take(message, t)
         while self._coming and self._coming[0].stamp <= followed:
             self._reference.accept(self._coming.popleft(), followed)
         if self._expires is None or joints is None:
             return self._command(t, np.zeros(DOF), self._valid)
         if self._ceased or t > self._expires:
-            expired = f"the last planning/setpoint expired {(t - self._expires) / MS:.0f} ms ago"
+            expired = f"the last {TOPIC} expired {(t - self._expires) / MS:.0f} ms ago"
             return self._cease(t, self._ceased or self._refused or expired)
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
@@ -119,7 +117,7 @@ class ControlService(Service):
             torque = self._controller.torque(joints.position, joints.velocity, reference)
         except ValueError as error:
             return self._reject_joints(t, str(error))
-        kernel.widen(self._peak, torque)
+        self._peak = np.maximum(self._peak, np.abs(torque))
         self._torque, self._until = torque, t + self._validity
         return self._command(t, torque, self._valid)
 
@@ -130,12 +128,13 @@ class ControlService(Service):
     def _take(self, message: Message, t: int) -> None:
         """Checks a set-point; it is followed once the arm was measured at its time, the very first one at once."""
         try:
-            setpoint = setpoint_from(message)
+            setpoint = Setpoint.from_message(message)
         except ValueError as error:
-            self._refuse(t, str(error))
+            self._refuse(t, str(error).removeprefix(f"{TOPIC}: "))
             return
-        if setpoint.stamp > t + AHEAD:
-            self._refuse(t, f"stamped {(setpoint.stamp - t) / MS:.0f} ms ahead, limit {AHEAD / MS:.0f} ms")
+        if setpoint.stamp > t + self._setpoint_expiry:  # it would expire before it is due, and keep all later ones waiting
+            limit = self._setpoint_expiry / MS
+            self._refuse(t, f"stamped {(setpoint.stamp - t) / MS:.0f} ms ahead, limit {limit:.0f} ms")
             return
         while self._coming and self._coming[-1].stamp >= setpoint.stamp:
             self._coming.pop()  # planning's clock was set back: its newest word counts
@@ -149,7 +148,7 @@ class ControlService(Service):
 
     def _refuse(self, t: int, why: str) -> None:
         self._facts["setpoints_rejected"] += 1
-        self._refused = f"planning/setpoint refused: {why}"
+        self._refused = f"{TOPIC} refused: {why}"
         self._problem = f"at {t} ns: {self._refused}"
 
     def _stand(self, t: int, problem: str) -> Outbox:
@@ -176,30 +175,8 @@ class ControlService(Service):
         return self._cease(t, problem)
 
     @staticmethod
-    def _command(t: int, torque: np.ndarray[Any, np.dtype[np.float64]], valid_for: Message, problem: str = "") -> Outbox:
+    def _command(t: int, torque: Array, valid_for: Message, problem: str = "") -> Outbox:
         return {"control/joint_torque": JointTorqueCommand(header(t), torque, valid_for, problem)}
-
-
-def setpoint_from(message: Message) -> Setpoint:
-    """The arrays of a `palpation_msgs/ImpedanceSetpoint`. Raises ValueError naming the field that is not usable."""
-    p, o = message.pose.position, message.pose.orientation
-    v, w = message.twist.linear, message.twist.angular
-    f, m = message.wrench.force, message.wrench.torque
-    if message.mode not in (Mode.CARTESIAN, Mode.JOINT):
-        raise ValueError(f"set-point: mode = {message.mode}: must be {list(map(int, Mode))}")
-    return Setpoint(
-        mode=Mode(message.mode),
-        stamp=nanoseconds(message.header.stamp),
-        R_WD=rotation_from_quaternion(o.x, o.y, o.z, o.w),
-        p_WD=np.array([p.x, p.y, p.z]),
-        V_WD=np.array([v.x, v.y, v.z, w.x, w.y, w.z]),
-        F_W=np.array([f.x, f.y, f.z, m.x, m.y, m.z]),
-        stiffness=message.stiffness,
-        damping_ratio=message.damping_ratio,
-        q=message.joint_position,
-        qd=message.joint_velocity,
-        joint_stiffness=message.joint_stiffness,
-    )
 
 
 def create(scenario: Scenario) -> ControlService:

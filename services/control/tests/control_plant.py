@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 
+from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.model import ArmModel
-from palpate_control.reference import Mode, Reference, Setpoint
+from palpate_control.reference import Motion, Reference
 from palpate_models.lbr import urdf
 from palpate_models.scenario import Robot
 
@@ -68,7 +69,9 @@ class Plant:
         return 0.5 * float(self.qd @ pin.crba(self.model, self.data, self.q) @ self.qd)
 
 
-def setpoint(arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: Mode = Mode.CARTESIAN, **changes: object) -> Setpoint:
+def setpoint(
+    arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: ControlMode = ControlMode.CARTESIAN, **changes: object
+) -> Setpoint:
     """A set-point that holds posture `at`, with `changes`."""
     arm.update(np.asarray(at, dtype=float), np.zeros(7))
     fields: dict[str, object] = {
@@ -82,11 +85,12 @@ def setpoint(arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: Mode = Mode.CA
         "damping_ratio": np.full(6, 0.8),
         "q": np.array(at, dtype=float),
         "qd": np.zeros(7),
-        "joint_stiffness": np.full(7, 20.0) if mode is Mode.CARTESIAN else np.full(7, 500.0),
+        "joint_stiffness": np.full(7, 20.0) if mode is ControlMode.CARTESIAN else np.full(7, 500.0),
     }
     return Setpoint(**(fields | changes))  # type: ignore[arg-type]
 
 
 def reference(setpoint_: Setpoint) -> Reference:
     """A set-point as the law follows it, without extrapolation."""
-    return Reference(setpoint_, setpoint_.values.copy())
+    s = setpoint_
+    return Reference(s, Motion(s.R_WD, s.p_WD, s.V_WD, s.F_W, s.q, s.qd, np.zeros(7)))

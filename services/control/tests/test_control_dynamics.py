@@ -10,9 +10,10 @@ import pinocchio as pin
 import pytest
 from control_plant import ROBOT, WORKING, External, Plant, no_force, reference, setpoint
 
+from palpate_bus.setpoint import ControlMode
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
-from palpate_control.reference import Extrapolator, Mode, Reference
+from palpate_control.reference import Extrapolator, Reference
 from palpate_models.lbr import HOME, urdf
 from palpate_models.scenario import Robot
 
@@ -61,11 +62,11 @@ def test_stiffness_is_what_was_asked_for(axis: int) -> None:
     R_now, p_now, _ = plant.tip()
     if axis < 3:
         moved = R.T @ (p_now - p)
-        assert moved[axis] == pytest.approx(size / ref["stiffness"][axis], rel=0.02)
+        assert moved[axis] == pytest.approx(size / ref.setpoint.stiffness[axis], rel=0.02)
         assert np.abs(np.delete(moved, axis)).max() < 0.02 * moved[axis]
     else:
         turned = pin.log3(R.T @ R_now)
-        assert turned[axis - 3] == pytest.approx(size / ref["stiffness"][axis], rel=0.02)
+        assert turned[axis - 3] == pytest.approx(size / ref.setpoint.stiffness[axis], rel=0.02)
 
 
 @pytest.mark.parametrize("q", WORKING)
@@ -98,7 +99,7 @@ def test_stable_where_friction_is_not_what_it_is_thought_to_be(q: np.ndarray, as
     plant = Plant(q, real)
     simulate(plant, robot, lambda _: moved, 1500)
     assert plant.energy() < 1e-4
-    assert np.linalg.norm(plant.tip()[1] - moved["p_WD"]) < 3e-3  # of 12: twice the friction also takes twice the time
+    assert np.linalg.norm(plant.tip()[1] - moved.motion.p_WD) < 3e-3  # of 12: twice the friction also takes twice the time
 
 
 @pytest.mark.parametrize("q", WORKING)
@@ -108,7 +109,7 @@ def test_scan_keeps_up_with_its_setpoints(arm: ArmModel, q: np.ndarray, joint_st
     held = setpoint(arm, q)
     V = np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.0])
     stiffness = np.full(7, joint_stiffness)
-    guide = Extrapolator()
+    guide = Extrapolator(10 * MS)
 
     def at(t: int) -> Reference:
         if t % (10 * MS) == 0:
@@ -132,14 +133,14 @@ def test_joint_mode_follows_a_motion(arm: ArmModel) -> None:
         s, sd = 10 * x**3 - 15 * x**4 + 6 * x**5, (30 * x**2 - 60 * x**3 + 30 * x**4) / duration
         return start + s * (end - start), sd * (end - start)
 
-    guide = Extrapolator()
+    guide = Extrapolator(10 * MS)
     plant = Plant(start)
     errors = []
 
     def at(t: int) -> Reference:
         if t % (10 * MS) == 0:
             q, qd = planned(t - 10 * MS)
-            guide.accept(setpoint(arm, start, t - 10 * MS, Mode.JOINT, q=q, qd=qd), t)
+            guide.accept(setpoint(arm, start, t - 10 * MS, ControlMode.JOINT, q=q, qd=qd), t)
         errors.append(np.abs(plant.q - planned(t)[0]).max())
         return guide.at(t)
 
@@ -152,7 +153,7 @@ def test_joint_mode_is_calm_where_torques_act_late(arm: ArmModel) -> None:
     """Joints 1 and 3 of almost one axis, 8 ms from measuring to acting, as with an arm behind two more processes."""
     posture = np.array([-0.15, 0.35, 0.03, -1.8, 0.0, 0.92, 0.0])
     firm = np.array([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])
-    hold = reference(setpoint(arm, posture, mode=Mode.JOINT, joint_stiffness=firm))
+    hold = reference(setpoint(arm, posture, mode=ControlMode.JOINT, joint_stiffness=firm))
     plant = Plant(posture + np.array([0.01, 0.0, -0.01, 0.0, 0.0, 0.0, 0.0]))
     _, torques = simulate(plant, ROBOT, lambda t: hold, 1500, late=8)
     assert np.abs(np.diff(torques[-200:], axis=0)).max() < 0.01
@@ -164,7 +165,7 @@ def test_joint_mode_bears_a_wrong_friction(arm: ArmModel, viscous: float) -> Non
     """Late torques, too, where 10 Nms/rad are assumed."""
     posture = np.array(HOME)
     firm = np.array([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])
-    hold = reference(setpoint(arm, posture, mode=Mode.JOINT, joint_stiffness=firm))
+    hold = reference(setpoint(arm, posture, mode=ControlMode.JOINT, joint_stiffness=firm))
     plant = Plant(posture + 0.01, Robot(joint_damping_nms=viscous))
     _, torques = simulate(plant, ROBOT, lambda t: hold, 2000, late=6)
     assert np.abs(np.diff(torques[-200:], axis=0)).max() < 0.01
@@ -174,7 +175,7 @@ def test_joint_mode_needs_no_friction(arm: ArmModel) -> None:
     """The springs are bounded for every mode, the light wrist's too, where the driver compensates all friction."""
     smooth = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
     posture = WORKING[1]
-    hold = reference(setpoint(arm, posture, mode=Mode.JOINT))
+    hold = reference(setpoint(arm, posture, mode=ControlMode.JOINT))
     plant = Plant(posture + 0.01, smooth)
     simulate(plant, smooth, lambda t: hold, 1500)
     assert plant.energy() < 1e-6
@@ -184,11 +185,13 @@ def test_joint_mode_needs_no_friction(arm: ArmModel) -> None:
 def test_change_of_mode_is_bumpless(arm: ArmModel) -> None:
     """Joint hold, Cartesian hold, joint hold, in contact force: neither torque nor indenter jumps."""
     q = WORKING[1]
-    holds = {mode: reference(setpoint(arm, q, mode=mode)) for mode in Mode}
+    holds = {mode: reference(setpoint(arm, q, mode=mode)) for mode in ControlMode}
     n = np.array([0.0, 0.0, 1.0])
-    positions, torques = simulate(
-        Plant(q), ROBOT, lambda t: holds[Mode.CARTESIAN if 500 * MS <= t < 1000 * MS else Mode.JOINT], 1500, lambda p, v: 5 * n
-    )
+
+    def at(t: int) -> Reference:
+        return holds[ControlMode.CARTESIAN if 500 * MS <= t < 1000 * MS else ControlMode.JOINT]
+
+    positions, torques = simulate(Plant(q), ROBOT, at, 1500, lambda p, v: 5 * n)
     assert np.abs(np.diff(torques, axis=0)).max() <= 1.0 + 1e-9
     speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / 1e-3
     assert speed[490:].max() < 0.05

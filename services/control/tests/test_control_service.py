@@ -11,7 +11,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_control import extrapolation, kernel
+from palpate_control import impedance, safety
 from palpate_control.service import ControlService, create
 from palpate_models.lbr import HOME, JOINT_NAMES
 from palpate_models.scenario import Scenario
@@ -127,12 +127,12 @@ def test_commands_own_their_arrays(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"joint_position": np.full(7, np.nan)}, "joint_position = [nan"),
+        ({"joint_position": np.full(7, np.nan)}, "joint_position = nan: must be"),
         ({"stiffness": np.full(6, -1.0)}, "stiffness"),
         ({"mode": 7}, "mode = 7"),
         ({"pose": Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 0.0))}, "pose.orientation = ("),
-        ({"pose": Pose(Point(np.inf, 0.0, 0.0), Quaternion(1.0, 0.0, 0.0, 0.0))}, "pose.position = [inf"),
-        ({"joint_velocity": np.full(7, 9.0)}, "joint_velocity = [9. 9. 9. 9. 9. 9. 9.]: must be within -4 and 4"),
+        ({"pose": Pose(Point(np.inf, 0.0, 0.0), Quaternion(1.0, 0.0, 0.0, 0.0))}, "pose.position = inf"),
+        ({"joint_velocity": np.full(7, 9.0)}, "joint_velocity = 9"),
     ],
 )
 def test_bad_setpoint_is_refused_and_the_one_before_goes_on(rig: Rig, changes: dict[str, Any], named: str) -> None:
@@ -229,7 +229,7 @@ def test_an_arm_that_lags_by_more_than_a_setpoints_spacing_is_followed_in_its_ow
 
 def test_nothing_is_compiled_in_mid_run(rig: Rig) -> None:
     """Arrays as they come from the bus are of the types that the warm-up has compiled for."""
-    functions = [f for module in (kernel, extrapolation) for f in vars(module).values() if hasattr(f, "signatures")]
+    functions = [f for module in (impedance, safety) for f in vars(module).values() if hasattr(f, "signatures")]
     assert functions
     before = [len(f.signatures) for f in functions]
     for k in range(4):
@@ -245,7 +245,7 @@ def test_a_setpoint_of_the_far_future_is_refused_and_holds_up_no_other(rig: Rig)
     before = rig.tick(20).torque[0]
     rig.send(setpoint(rig.t + 3_600_000 * MS))
     rig.tick()
-    assert "ms ahead, limit 500 ms" in rig.service.finish()["problem"]
+    assert "ms ahead, limit 250 ms" in rig.service.finish()["problem"]
     rig.send(setpoint(rig.t, joint_position=np.array(HOME) - 0.1))
     command = rig.tick(40)
     assert valid_for(command) == EXPIRY
@@ -255,6 +255,6 @@ def test_a_setpoint_of_the_far_future_is_refused_and_holds_up_no_other(rig: Rig)
 def test_a_setpoint_after_planning_s_clock_was_set_back_counts(rig: Rig) -> None:
     rig.send(setpoint(0))
     before = rig.tick(20).torque[0]
-    rig.send(setpoint(rig.t + 400 * MS))
+    rig.send(setpoint(rig.t + 200 * MS))
     rig.send(setpoint(rig.t, joint_position=np.array(HOME) - 0.1))
     assert np.sign(rig.tick(40).torque[0]) == -np.sign(before)

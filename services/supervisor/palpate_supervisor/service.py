@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import isfinite
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_bus.contract import MS
+from palpate_bus.contract import MS, contract
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import inverse
@@ -20,23 +19,19 @@ from palpate_supervisor.latch import Latch
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import Breach, Cause, Level, Watch
 
-Array = NDArray[np.float64]
-
 NOWHERE = -1.0
 """Depth [m] while no surface is known."""
 MISSED = (("control", Level.EMERGENCY), ("planning", Level.EMERGENCY), ("assessment", Level.SOFT_STOP))
 """Roles and what their loss calls for: without the first two the arm must stand still, without assessment there is no reason to
 go on pressing."""
 WATCHED = ("robot/status", "exam/state")
-"""Topics whose age is watched: the arm's, and planning's, whose set-points expire as soon."""
-MAX_AGE = 250 * MS
-"""Set-points expire then [ns]; control and driver watch their own inputs, faster."""
+"""Topics whose age is watched: the arm's and planning's."""
 SETTLE = 1000 * MS
-"""Ages are not judged so long after the start [ns]: processes come up one by one."""
+"""Ages are not judged for so long after the start [ns]: processes come up one by one."""
 
 
 class SupervisorService(Service):
-    """Watches the examination and stops it. Of control and planning it knows no more than whether they live."""
+    """Watches the examination and stops it. It knows no more about control and planning than whether they are alive."""
 
     role: ClassVar[str] = "supervisor"
 
@@ -46,7 +41,8 @@ class SupervisorService(Service):
         self._watch = Watch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
         RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it ahead of any deadline
-        self._sense.sense(np.zeros(7), np.zeros(7), np.zeros(6))  # as well
+        self._max_age = (contract().topics["planning/setpoint"].expiry_ms or 0) * MS
+        """Age [ns] at which a topic counts as silent: when set-points expire. Control and driver watch their inputs, faster."""
         self._latch = Latch()
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
@@ -97,8 +93,8 @@ class SupervisorService(Service):
             return found
         for name in WATCHED:
             heard = inbox.stamp(name)
-            if heard is not None and t - heard > MAX_AGE:
-                words = f"nothing on {name} for {(t - heard) / 1e6:.0f} ms, limit {MAX_AGE / 1e6:.0f} ms"
+            if heard is not None and t - heard > self._max_age:
+                words = f"nothing on {name} for {(t - heard) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
                 found.append(Breach(Level.EMERGENCY, Cause.SILENT, words))
         return found
 
@@ -114,15 +110,11 @@ class SupervisorService(Service):
         return []
 
     def _measure(self, status: Any) -> list[Breach]:
-        force, moment = status.wrench.force, status.wrench.torque
-        felt = (force.x, force.y, force.z, moment.x, moment.y, moment.z)
-        wrench = np.array(felt)
-        q, qd = status.position.copy(), status.velocity.copy()
-        if not all(map(isfinite, (*q.tolist(), *qd.tolist(), *felt))):
-            values = {"position": q, "velocity": qd, "wrench": wrench}
-            name = next(name for name in values if not np.isfinite(values[name]).all())
-            return [Breach(Level.EMERGENCY, Cause.INVALID, f"robot/status: {name} = {values[name]}: must be finite")]
-        self._tool = tool = self._sense.sense(q, qd, wrench)
+        values = {"position": status.position, "velocity": status.velocity, "wrench": wrench(status.wrench)}
+        for name, value in values.items():
+            if not np.isfinite(value).all():
+                return [Breach(Level.EMERGENCY, Cause.INVALID, f"robot/status: {name} = {value}: must be finite")]
+        self._tool = tool = self._sense.sense(*values.values())
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)
         depth = None if self._surface is None else self._surface.depth(tool.p_W)

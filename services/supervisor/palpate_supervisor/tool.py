@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from palpate_models import lbr
-from palpate_models.compiled import compiled
+from palpate_models.frames import Array
+from palpate_models.gravity import GRAVITY
 from palpate_models.nearest import nearest_vertex
 from palpate_models.scenario import Robot
 
-Array = NDArray[np.float64]
-
-GRAVITY = 9.81
-"""[m/s^2]"""
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -51,15 +46,9 @@ class ToolSense:
         pin.forwardKinematics(model, data, q, qd)
         pin.updateFramePlacement(model, data, self._indenter)
         pin.updateFramePlacement(model, data, self._sensor)
-        velocity = pin.getFrameVelocity(model, data, self._indenter, _WORLD_AXES).linear
-        return Tool(self._p_WI.copy(), sqrt(velocity.dot(velocity)), _force(wrench_S, self._R_SW, self._weight_W))
-
-
-@compiled
-def _force(wrench_S: Array, R_SW: Array, weight_W: Array) -> float:
-    """Magnitude [N] of the force in an F/T reading, shape (6,), less a weight [N] in world axes, shape (3,)."""
-    external = wrench_S[:3] - R_SW @ weight_W
-    return sqrt(external @ external)
+        v_WI = pin.getFrameVelocity(model, data, self._indenter, _WORLD_AXES).linear
+        force_S = wrench_S[:3] - self._R_SW @ self._weight_W
+        return Tool(self._p_WI.copy(), float(np.linalg.norm(v_WI)), float(np.linalg.norm(force_S)))
 
 
 class RestSurface:

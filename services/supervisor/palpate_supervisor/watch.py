@@ -6,13 +6,9 @@ from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
+from palpate_models.frames import Array
 from palpate_models.scenario import Limits
 from palpate_supervisor.tool import Tool
-
-Array = NDArray[np.float64]
 
 LOOKAHEAD_S = 0.1
 """A force that will be over its limit so much later counts as over it: a retreat takes 30 to 50 ms to begin, a hold that follows

@@ -7,6 +7,7 @@ import pytest
 
 from palpate_bus.contract import MS
 from palpate_models import lbr
+from palpate_models.gravity import GRAVITY
 from palpate_models.load import exam_input, load_scenario
 from palpate_models.scenario import Limits
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
@@ -84,7 +85,7 @@ def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
 def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:
     sense = ToolSense(KNOWN.robot)
     q = np.array(lbr.HOME)
-    weight = KNOWN.robot.tool_mass_kg * 9.81
+    weight = KNOWN.robot.tool_mass_kg * GRAVITY
     hanging = np.array([0.0, 0.0, weight, 0.0, 0.0, 0.0])  # tool straight down: +z reads its weight
     tool = sense.sense(q, np.zeros(7), hanging)
     assert tool.force == pytest.approx(0.0, abs=0.01)
