@@ -23,7 +23,7 @@ from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, co
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.backends.winkler.mechanics import StabilityError
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_tissue.surface import RestSurface
+from palpate_tissue.surface import SkinSurface
 
 SPEED_MPS = 0.03
 RADIUS_M = 0.015
@@ -45,7 +45,7 @@ def measure(steps: int = 4000) -> dict[str, float]:
     begin = time.perf_counter()
     tissue = ElasticTissue(model, compliance(model, phantom.lesions), phantom.stiffness, phantom.breathing)
     load = time.perf_counter() - begin
-    surface = RestSurface(model)
+    surface = SkinSurface(model)
     path = []
     for k in range(steps):
         under = surface.nearest(np.array((-0.06 + SPEED_MPS * tissue.dt * k, 0.01, 0.0)))

@@ -23,7 +23,7 @@ from palpate_models.frames import Array, apply, matrix
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Pose
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.surface import RestSurface
+from palpate_tissue.surface import SkinSurface
 
 _log = logging.getLogger("palpate.tissue")
 
@@ -43,7 +43,7 @@ class TissueService(Service):
         self._truth_period = topics["truth/indentation"].period
         self._out_of_reach = topics["truth/indentation"].ranges["depth"][0]
         """Depth before the first tool state [m]."""
-        self._surface = RestSurface(truth)
+        self._surface = SkinSurface(truth)
         self._X_WA = matrix(pose)
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
         self._p_WA = self._X_WA[:3, 3].copy()

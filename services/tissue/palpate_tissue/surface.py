@@ -47,7 +47,7 @@ class Skin(NamedTuple):
     """Shape (m, 3)."""
 
 
-class RestSurface:
+class SkinSurface:
     """Queries on a phantom's surface."""
 
     def __init__(self, model: PhantomModel) -> None:

@@ -15,7 +15,7 @@ from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Breathing, Lesion, Phantom, Registration, Scenario
 from palpate_models.scenario import Pose as TruePose
 from palpate_tissue.backends.winkler.service import create
-from palpate_tissue.surface import RestSurface, nearest_on_triangle
+from palpate_tissue.surface import SkinSurface, nearest_on_triangle
 
 LESION = Lesion(centre_m=(-0.02, 0.0))
 
@@ -163,7 +163,7 @@ def test_report_counts_contact():
 
 def test_nearest_rest_point_against_brute_force():
     model = build_phantom(Phantom(), 0)
-    surface = RestSurface(model)
+    surface = SkinSurface(model)
     rng = np.random.default_rng(0)
     corners = model.vertices[model.triangles]
     for p in np.column_stack((rng.uniform(-0.1, 0.1, (40, 2)), rng.uniform(-0.03, 0.05, 40))):
@@ -190,7 +190,7 @@ def test_nearest_point_of_a_triangle_by_sampling():
 
 def test_nearest_rest_point_breathes():
     model = build_phantom(Phantom(), 0)
-    surface = RestSurface(model)
+    surface = SkinSurface(model)
     p = np.array((0.0, 0.02, 0.02))
     assert surface.nearest(p).height - surface.nearest(p, 0.006).height == pytest.approx(0.006, rel=0.05)
 
@@ -206,7 +206,7 @@ def test_normals_of_a_dent_are_those_of_the_mesh():
         np.add.at(mesh, model.triangles[:, k], cross)
     mesh /= np.linalg.norm(mesh, axis=1, keepdims=True)
     near = (np.abs(model.vertices[:, :2]) < 0.08).all(axis=1) & (model.normals[:, 2] > 0)
-    normals = RestSurface(model).normals(inward).T
+    normals = SkinSurface(model).normals(inward).T
     angle = np.degrees(np.arccos(np.clip((normals * mesh).sum(axis=1), -1, 1)))
     assert angle[near].max() < 2
 
