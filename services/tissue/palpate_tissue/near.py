@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from palpate_models.frames import Array
 
+RIM = 0.2
+"""Vertices are held by the sphere where its surface makes less than 78 degrees with the tangent plane (cos > 0.2)."""
 _REACH_M = 0.030
 """Least depth of the sphere's centre below the rest surface at which the vertices found are still all that it might touch."""
 

@@ -17,6 +17,7 @@ from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, StabilityError, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.friction import Push, Sphere, rub, skin
+from palpate_tissue.near import RIM
 
 ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
 STILL = np.zeros(3)
@@ -338,7 +339,7 @@ def reference_step(wall, patch, motion, radius, excursion):
     d = motion[0] - patch.origin - patch.X
     s = -(d * patch.n).sum(axis=1)
     half_chord = np.sqrt(np.maximum(radius**2 - (d**2).sum(axis=1) + s**2, 0.0))
-    w = np.where(half_chord > 0.2 * radius, s + half_chord + excursion * patch.beta, -np.inf)
+    w = np.where(half_chord > RIM * radius, s + half_chord + excursion * patch.beta, -np.inf)
     gap = np.maximum(w - u[patch.vertex], 0.0)
     u[patch.vertex] += gap
     f = patch.gain * gap

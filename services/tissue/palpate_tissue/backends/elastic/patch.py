@@ -7,10 +7,8 @@ import numpy as np
 from palpate_models.frames import Array
 from palpate_tissue.backends.elastic.contact import ContactSolver
 from palpate_tissue.friction import Push
-from palpate_tissue.near import Near
+from palpate_tissue.near import RIM, Near
 
-_RIM = 0.2
-"""Vertices are held by the sphere where its surface makes less than 78 degrees with the tangent plane (cos > 0.2)."""
 _NOWHERE_M = -1.0
 """Where a vertex is held that is not under the sphere."""
 
@@ -43,7 +41,7 @@ class ElasticPatch:
         self._q = q = np.subtract(p, self.near.origin)  # so that d = q - X
         self._s = s = self._height - n @ q
         square = R * R - (q @ q - 2 * (X @ q) + self._square) + s * s
-        rim = (_RIM * R) ** 2
+        rim = (RIM * R) ** 2
         self._c = c = np.sqrt(np.maximum(square, rim))
         w: Array = s + c + excursion * self._breathing
         w[square <= rim] = _NOWHERE_M

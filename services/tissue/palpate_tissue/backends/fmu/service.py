@@ -25,7 +25,7 @@ from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.wiring import Wiring
 
-_log = logging.getLogger("palpate.fmu_host")
+_log = logging.getLogger("palpate.tissue")
 
 MOST_STEPS = 1000
 """Steps an FMU of fixed step size may be behind in one call; more is a mistake."""

@@ -4,7 +4,7 @@
     u  = max(u*, w),  f = C (u - u*) / h      `hold`: w is where the sphere holds a vertex
     y_k = e_k y_k + (1 - e_k) g_k u           `relax`
 
-The FMU's C source adds the same terms in the same order.
+The FMU's C source has the same equations.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_tissue.friction import Bristle, Push, Sphere, rub
+from palpate_tissue.near import RIM
 from palpate_tissue.vectors import add, divide, dot, row, scale, subtract
 
 Index = NDArray[np.uint16] | NDArray[np.uint32]
 """Unsigned: a signed index may be negative to numba, and looking each time doubles the cost of the field's step."""
-RIM = 0.2
-"""Vertices are held by the sphere where its surface makes less than 78 degrees with the tangent plane (cos > 0.2)."""
 _USUAL = 7
 """Entries of most rows of the field's matrix: a vertex and its six neighbours."""
 
