@@ -72,8 +72,9 @@ def build(
                 out,
                 fmi,
                 names,
-                compiling=lambda name: bar.update(task, description=f"compiling for {name} (a minute, the first time)"),
-                compiled=lambda _: bar.advance(task),
+                compiling=lambda name: bar.update(
+                    task, advance=1, description=f"compiling for {name} (a minute, the first time)"
+                ),
             )
     except (ScenarioError, MeshError, ExportError, CompileError, ValueError, OSError) as error:
         _fail(console, str(error))

@@ -31,9 +31,9 @@ from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.service import create as create_fmu
-from palpate_tissue.service import create as create_native
-from palpate_tissue.surface import Surface
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.service import create as create_native
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_tissue.surface import SkinSurface
 
 BOUND = 1e-9
 """Relative difference allowed. Both add the same terms, in different orders: 1e-13 is what is measured."""
@@ -41,7 +41,7 @@ RADIUS_M = 0.015
 STEP_S = 1e-3
 
 
-def path(surface: Surface) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def path(surface: SkinSurface) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Press, hold (relaxation), slide over the lesion, turn on the spot, withdraw, and wait: position and velocities."""
     x = np.concatenate((np.full(800, -0.09), np.linspace(-0.09, -0.01, 1600), np.full(1000, -0.01)))
     depth = np.concatenate((np.linspace(-0.003, 0.010, 400), np.full(2400, 0.010), np.linspace(0.010, -0.05, 600)))
@@ -63,8 +63,8 @@ def path(surface: Surface) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:
     scenario = load_scenario("rlq_guarding", settings)
     model = build_phantom(scenario.phantom, scenario.seed)
-    tissue = Tissue(model, scenario.phantom.stiffness, scenario.phantom.breathing)
-    motions = path(Surface(model))
+    tissue = WinklerTissue(model, scenario.phantom.stiffness, scenario.phantom.breathing)
+    motions = path(SkinSurface(model))
     if "phantom.edge_m=0.0035" in settings:
         motions = motions[:1500]
     wrenches = np.empty((len(motions), 2, 6))

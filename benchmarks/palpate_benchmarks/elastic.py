@@ -13,25 +13,24 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_bus.contract import contract
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_models.scenario import Lesion, Phantom, Stiffness
+from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
-from palpate_tissue.mechanics import StabilityError
-from palpate_tissue.soft_body import SoftBody
-from palpate_tissue.surface import Surface
-from palpate_tissue.tissue import Tissue
-
-Array = NDArray[np.float64]
+from palpate_tissue.backends.winkler.mechanics import StabilityError
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_tissue.surface import SkinSurface
 
 SPEED_MPS = 0.03
 RADIUS_M = 0.015
 DEPTH_M = 0.010
 SIZES = (1_000, 3_000, 10_000, 50_000)
-SURFACE_EVERY = 50
-"""The deformed surface is asked for each so many steps, as the bus does."""
+SURFACE_EVERY = contract().topics["sim/surface"].period // contract().roles["tissue"].period
+"""Steps between two messages of the deformed surface."""
 _HALF_M = 0.13
 """Of the flat patch of the size sweep, as large as an abdomen's front."""
 
@@ -46,7 +45,7 @@ def measure(steps: int = 4000) -> dict[str, float]:
     begin = time.perf_counter()
     tissue = ElasticTissue(model, compliance(model, phantom.lesions), phantom.stiffness, phantom.breathing)
     load = time.perf_counter() - begin
-    surface = Surface(model)
+    surface = SkinSurface(model)
     path = []
     for k in range(steps):
         under = surface.nearest(np.array((-0.06 + SPEED_MPS * tissue.dt * k, 0.01, 0.0)))
@@ -54,7 +53,7 @@ def measure(steps: int = 4000) -> dict[str, float]:
     return {"vertices": len(model.vertices), "load_s": load, **_slide(tissue, np.array(path), tissue.dt)}
 
 
-def _slide(body: SoftBody, path: Array, dt: float) -> dict[str, float]:
+def _slide(body: TissueBackend, path: Array, dt: float) -> dict[str, float]:
     velocity, spin = np.array((SPEED_MPS, 0.0, 0.0)), np.zeros(3)
     costs, contacts = np.empty(len(path)), np.empty(len(path))
     before = time.thread_time_ns()
@@ -89,7 +88,7 @@ def measure_size(vertices: int, tier: str, steps: int = 1000) -> dict[str, Any]:
     begin = time.perf_counter()
     try:
         if tier == "surface":
-            body: SoftBody = Tissue(model, Stiffness())
+            body: TissueBackend = WinklerTissue(model, Stiffness())
         else:
             body = ElasticTissue(model, _uniform(model), Stiffness())
     except (SizeError, StabilityError) as error:

@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuInstance
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Lesion, Phantom
-
-Array = NDArray[np.float64]
 
 RADIUS_M = 0.015
 DEPTH_M = 0.010

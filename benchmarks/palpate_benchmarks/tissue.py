@@ -9,8 +9,8 @@ import numpy as np
 
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Lesion, Phantom
-from palpate_tissue.surface import Surface
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_tissue.surface import SkinSurface
 
 SPEED_MPS = 0.03
 RADIUS_M = 0.015
@@ -24,8 +24,8 @@ def measure(steps: int = 4000) -> dict[str, float]:
     """
     phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01)),))
     model = build_phantom(phantom, seed=0)
-    tissue = Tissue(model, phantom.stiffness, phantom.breathing)
-    surface = Surface(model)
+    tissue = WinklerTissue(model, phantom.stiffness, phantom.breathing)
+    surface = SkinSurface(model)
     velocity, spin = np.array((SPEED_MPS, 0.0, 0.0)), np.zeros(3)
     costs, contacts = np.empty(steps), np.empty(steps)
     for k in range(steps):

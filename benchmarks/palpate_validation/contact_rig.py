@@ -14,28 +14,24 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, duration_message
+from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
+from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_control.service import create as create_control
 from palpate_models import lbr
-from palpate_models.frames import matrix
+from palpate_models.frames import Array, matrix
 from palpate_models.load import exam_input
 from palpate_models.scenario import Background, Phantom, Scenario, Stiffness
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.messages import setpoint_message
+from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.poses import least_twist, pose
-from palpate_planning.setpoint import ControlMode, Setpoint
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.service import RobotService
+from palpate_tissue.backends.winkler.service import create as create_tissue
 from palpate_tissue.service import TissueService
-from palpate_tissue.service import create as create_tissue
 from palpate_validation.delays import BusDelay, Delayed
-
-Array = NDArray[np.float64]
 
 DEPTH_M = 0.010
 ABOVE_M = 0.005
@@ -128,29 +124,39 @@ class _Script:
 
     def __post_init__(self) -> None:
         chosen = scenario(self.contrast)
-        kinematics = Kinematics(chosen.robot, chosen.limits)
+        kinematics = ArmKinematics(chosen.robot, chosen.limits)
         self.R = least_twist(np.array((0.0, 0.0, -1.0)), kinematics.pose(lbr.HOME)[:3, :3])
         self.top = matrix(chosen.phantom.pose.true)[:3, 3] + (0.0, 0.0, chosen.robot.indenter_radius_m)
         self.ready = kinematics.solve(self._at(-ABOVE_M), lbr.HOME).q
-        self._valid = duration_message((contract().topics["planning/setpoint"].expiry_ms or 0) * MS)
 
     def _at(self, depth: float) -> Array:
         return pose(self.R, self.top - (0.0, 0.0, depth))
 
     def depth(self, t: float) -> float:
-        """Of the set-point below the skin at rest [m] at time `t` [s]."""
+        """Depth of the set-point below the skin at rest [m] at time `t` [s]."""
         if t < PRESS_S:
             return -ABOVE_M + (DEPTH_M + ABOVE_M) * _smooth((t - BEGIN_S) / (PRESS_S - BEGIN_S))
         return DEPTH_M + (NUDGE_M if NUDGE_S <= t < NUDGE_S + NUDGE_FOR_S else 0.0)
 
     def __call__(self, t: int) -> Mapping[str, Message]:
-        if t % (10 * MS):
+        if t % contract().topics[TOPIC].period:
             return {}
         now = t / NS
-        setpoint = Setpoint(ControlMode.CARTESIAN, self._at(self.depth(now)), self.ready)
-        message = setpoint_message(t, setpoint, self._valid)
-        message.stiffness = setpoint.stiffness * (1, 1, self.stiffness / setpoint.stiffness[2], 1, 1, 1)
-        return {"planning/setpoint": message}
+        X_WD = self._at(self.depth(now))
+        setpoint = Setpoint(
+            stamp=t,
+            mode=ControlMode.CARTESIAN,
+            R_WD=X_WD[:3, :3],
+            p_WD=X_WD[:3, 3],
+            V_WD=np.zeros(6),
+            F_W=np.zeros(6),
+            stiffness=np.array([3000.0, 3000.0, self.stiffness, 250.0, 250.0, 100.0]),
+            damping_ratio=np.full(6, 0.8),
+            q=self.ready,
+            qd=np.zeros(7),
+            joint_stiffness=np.full(7, 20.0),
+        )
+        return {TOPIC: setpoint.message()}
 
 
 def _smooth(t: float) -> float:

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_validation.check import Check, Section
-from palpate_validation.dart_scene import Box, DartScene, Ellipsoid, Flesh
+from palpate_validation.dart_scene import DartScene, Ellipsoid, Flesh, SoftBox
 from palpate_validation.plots import COLOURS
 from palpate_validation.probing import STILL
 from palpate_validation.twins import twin
-
-Array = NDArray[np.float64]
 
 RADIUS_M = 0.020
 DT = 1e-3
@@ -23,14 +21,14 @@ SPEED_MPS = 0.02
 SETTLE_S, MEAN_S = 0.5, 0.2
 """A depth is held for the first, then the force is averaged over the second."""
 DEPTHS_M = np.array((2, 4, 6, 8, 10)) * 1e-3
-BOX = Flesh(Box((0.1, 0.1, 0.05), (21, 21, 3)), k_v=4.25, k_e=0.0, damping=0.6, mass=0.02)
+BOX = Flesh(SoftBox((0.1, 0.1, 0.05), (21, 21, 3)), k_v=4.25, k_e=0.0, damping=0.6, mass=0.02)
 """Vertices 5 mm apart with the default wall's k_w: 962 point masses."""
 ELLIPSOID = Flesh(Ellipsoid((0.3, 0.3, 0.1), 16, 60), k_v=4.25, k_e=4.0, damping=0.6, mass=0.02)
 """946 point masses; the pole is nearly flat, radius of curvature 0.45 m."""
 
 
 @dataclass(frozen=True)
-class Curve:
+class ForceCurve:
     """Static force at each depth of `DEPTHS_M`, and the cost of a step in contact."""
 
     force: Array
@@ -39,7 +37,7 @@ class Curve:
     """Fastest tenth of the held steps at 10 mm [us]: what a busy machine disturbs least."""
 
 
-def press_dart(flesh: Flesh, friction: float, depths: Array = DEPTHS_M) -> Curve:
+def press_dart(flesh: Flesh, friction: float, depths: Array = DEPTHS_M) -> ForceCurve:
     """Presses DART's soft body. The force is freed of DART's time-step factor (see `Flesh.at_rest`)."""
     scene = DartScene(flesh, RADIUS_M, DT, friction=friction)
     forces: list[float] = []
@@ -55,10 +53,10 @@ def press_dart(flesh: Flesh, friction: float, depths: Array = DEPTHS_M) -> Curve
             if k * DT >= SETTLE_S:
                 held.append(scene.force())
         forces.append(float(np.mean(held)))
-    return Curve(np.array(forces) / flesh.at_rest(DT), 1e6 * float(np.percentile(costs, 10)))
+    return ForceCurve(np.array(forces) / flesh.at_rest(DT), 1e6 * float(np.percentile(costs, 10)))
 
 
-def press_ours(flesh: Flesh, depths: Array = DEPTHS_M) -> Curve:
+def press_ours(flesh: Flesh, depths: Array = DEPTHS_M) -> ForceCurve:
     """Presses our tissue with the same vertices and springs, in the same way."""
     tissue = twin(flesh)
     forces: list[float] = []
@@ -71,7 +69,7 @@ def press_ours(flesh: Flesh, depths: Array = DEPTHS_M) -> Curve:
             force, _ = tissue.step(0.0, p, STILL, RADIUS_M)
             costs.append(time.perf_counter() - begin)
         forces.append(float(force[2]))
-    return Curve(np.array(forces), 1e6 * float(np.percentile(costs, 10)))
+    return ForceCurve(np.array(forces), 1e6 * float(np.percentile(costs, 10)))
 
 
 def sliding_vertices(flesh: Flesh, depths: Array = DEPTHS_M) -> Array:
@@ -79,7 +77,7 @@ def sliding_vertices(flesh: Flesh, depths: Array = DEPTHS_M) -> Array:
 
     A vertex inside the sphere moves to its surface along the radius; k_v times the way is its force, whose upward part counts.
     """
-    if not isinstance(flesh.shape, Box):
+    if not isinstance(flesh.shape, SoftBox):
         raise TypeError("sliding_vertices: only for a box")
     size, count = flesh.shape.size_m[0], flesh.shape.counts[0]
     grid = np.linspace(-size / 2, size / 2, count)
@@ -93,11 +91,11 @@ def sliding_vertices(flesh: Flesh, depths: Array = DEPTHS_M) -> Array:
 class Bodies:
     """All curves of the comparison."""
 
-    box: Curve
-    box_ours: Curve
-    box_slippery: Curve
-    ellipsoid: Curve
-    ellipsoid_ours: Curve
+    box: ForceCurve
+    box_ours: ForceCurve
+    box_slippery: ForceCurve
+    ellipsoid: ForceCurve
+    ellipsoid_ours: ForceCurve
 
 
 def measure(depths: Array = DEPTHS_M) -> Bodies:

@@ -14,17 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import dartpy as dart
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 HEAVY_KG = 1e6
 """Mass of what the flesh hangs on: it moves by less than a nanometre."""
 
 
 @dataclass(frozen=True)
-class Box:
+class SoftBox:
     """A box with its top in z = 0, `counts` vertices along x, y and z. Its point masses have no edges."""
 
     size_m: tuple[float, float, float]
@@ -78,7 +74,7 @@ class Ellipsoid:
 class Flesh:
     """A DART soft body's parameters; each vertex has the same."""
 
-    shape: Box | Ellipsoid
+    shape: SoftBox | Ellipsoid
     k_v: float
     """Stiffness of the spring that ties a vertex to its rest place [N/m]."""
     k_e: float
@@ -147,7 +143,7 @@ class DartScene:
 
     @property
     def depth(self) -> float:
-        """Of the sphere's lowest point below z = 0 [m]."""
+        """Depth of the sphere's lowest point below z = 0 [m]."""
         return -(self._height + float(self._probe.getPositions()[0]))
 
     def force(self) -> float:

@@ -14,19 +14,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
+from palpate_models.frames import Array
+from palpate_models.gravity import GRAVITY
 from palpate_models.phantom import flat_phantom
 from palpate_models.scenario import Stiffness
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
-from palpate_validation.dart_scene import Box, DartScene, Flesh
+from palpate_validation.dart_scene import DartScene, Flesh, SoftBox
 from palpate_validation.plots import COLOURS, INK, QUIET
 
-Array = NDArray[np.float64]
-
-GRAVITY = 9.81
 MASS_KG = 0.35
 """Stand-off and indenter of the default tool."""
 RADIUS_M = 0.015
@@ -36,7 +34,7 @@ DT = 4e-4
 SURFACE = Stiffness(k_w_n_per_m3=3.3e7, length_m=0.004, dashpot_s=0.004, prony_g=(), prony_tau_s=(), friction=0.0)
 """Our surface for the figure."""
 SURFACE_EDGE_M = 0.0025
-FLESH = Flesh(Box((0.03, 0.03, 0.02), (13, 13, 3)), k_v=560.0, k_e=0.0, damping=0.7, mass=1e-3)
+FLESH = Flesh(SoftBox((0.03, 0.03, 0.02), (13, 13, 3)), k_v=560.0, k_e=0.0, damping=0.7, mass=1e-3)
 """DART's soft body for the figure, vertices 2.5 mm apart."""
 
 
@@ -78,7 +76,7 @@ def drop_on_tissue(
     surface: Stiffness = SURFACE, mass: float = MASS_KG, height: float = HEIGHT_M, seconds: float = SECONDS
 ) -> Drop:
     """Drops a sphere of `mass` [kg] from `height` [m] on our tissue; semi-implicit Euler at 0.4 ms."""
-    tissue = Tissue(flat_phantom(0.035, SURFACE_EDGE_M, surface.k_w_n_per_m3), surface, dt=DT)
+    tissue = WinklerTissue(flat_phantom(0.035, SURFACE_EDGE_M, surface.k_w_n_per_m3), surface, dt=DT)
     z, v, contact = height, 0.0, 0.0
     p = np.array((0.0, 0.0, RADIUS_M + height))
     velocity = np.zeros(3)

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_validation.check import Check, Section
 from palpate_validation.hertz import YOUNG_PA, hertz_force, sneddon_force
 from palpate_validation.plots import COLOURS, INK, QUIET
-
-Array = NDArray[np.float64]
 
 RADII_M = (0.010, 0.015, 0.020, 0.030)
 DEPTHS_M = np.array((2, 3, 5, 7, 10)) * 1e-3

@@ -7,15 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel, flat_phantom
 from palpate_models.scenario import Lesion, Stiffness
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
 from palpate_validation.plots import COLOURS, INK
-
-Array = NDArray[np.float64]
 
 RADIUS_M = 0.015
 REACH_M = 0.03
@@ -69,7 +67,7 @@ def closed_path(amplitude: Array, phase: Array, steps: int) -> Array:
 
 def run_cycle(model: PhantomModel, path: Array, friction: float = 0.3) -> Cycle:
     """Moves the sphere along a closed path, a step a millisecond; work by the trapezoidal rule."""
-    tissue = Tissue(model, Stiffness(friction=friction))
+    tissue = WinklerTissue(model, Stiffness(friction=friction))
     work, stored, touched, done = [], [], 0, 0.0
     last = np.zeros(3)
     for k, (a, b) in enumerate(pairwise(path)):

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.phantom import flat_phantom
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
 from palpate_validation.hertz import POISSON, YOUNG_PA, hertz_force
 from palpate_validation.plots import COLOURS, QUIET
 from palpate_validation.probing import ELASTIC, STILL, hold, static_curve
-
-Array = NDArray[np.float64]
 
 RADIUS_M = 0.030
 """Large, so that the contact covers several of the block's vertices."""
@@ -125,7 +123,7 @@ def measure() -> FlexCurves:
     block = FlexBlock()
     pressed = [block.press(float(depth)) for depth in DEPTHS_M]
     model = flat_phantom(0.12)
-    tissue = Tissue(model, ELASTIC)
+    tissue = WinklerTissue(model, ELASTIC)
     hold(tissue, 0.010, RADIUS_M)
     costs, p = [], np.array((0.0, 0.0, RADIUS_M - 0.010))
     for _ in range(300):

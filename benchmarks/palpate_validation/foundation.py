@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
+
 Profile = Callable[[Array], Array]
 
 OUTER_M = 0.12

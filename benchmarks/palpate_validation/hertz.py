@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.phantom import flat_phantom
 from palpate_validation.check import Check, Section
 from palpate_validation.plots import COLOURS, INK, QUIET
 from palpate_validation.probing import static_curve
-
-Array = NDArray[np.float64]
 
 YOUNG_PA = 1.0e4
 POISSON = 0.49

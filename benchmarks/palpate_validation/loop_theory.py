@@ -27,15 +27,15 @@ from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Reference
+from palpate_models.frames import Array
 from palpate_models.lbr import urdf
 from palpate_models.phantom import build_phantom
-from palpate_planning.setpoint import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
+from palpate_planning.setpoints import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.friction import shear_stiffness
-from palpate_tissue.tissue import Tissue
 from palpate_validation.contact_rig import CONTACT_PATH, CONTROL_PATH, DEPTH_M, scenario, start_posture
 from palpate_validation.probing import STILL
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 DT = 1e-3
@@ -142,7 +142,7 @@ def tissue_response(contrast: float) -> Array:
     radius = chosen.robot.indenter_radius_m
     forces = []
     for step in (0.0, STEP_M):
-        tissue = Tissue(build_phantom(chosen.phantom, chosen.seed), chosen.phantom.stiffness)
+        tissue = WinklerTissue(build_phantom(chosen.phantom, chosen.seed), chosen.phantom.stiffness)
         p = np.array((0.0, 0.0, radius - DEPTH_M))
         for _ in range(SETTLE_STEPS):
             tissue.step(0.0, p, STILL, radius)

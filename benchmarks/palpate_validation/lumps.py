@@ -6,17 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.phantom import flat_phantom
 from palpate_models.scenario import Lesion, Stiffness
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
 from palpate_validation.foundation import lump, static_force, uniform
 from palpate_validation.plots import COLOURS, INK
 from palpate_validation.probing import ELASTIC, hold
-
-Array = NDArray[np.float64]
 
 RADIUS_M = 0.020
 DEPTH_M = 0.010
@@ -44,14 +42,14 @@ class LumpRatios:
 
 def measure() -> LumpRatios:
     """Presses the middle of each lump, in the tissue and in the continuum."""
-    plain = hold(Tissue(flat_phantom(), ELASTIC), DEPTH_M, RADIUS_M)
+    plain = hold(WinklerTissue(flat_phantom(), ELASTIC), DEPTH_M, RADIUS_M)
     shape = (len(LUMPS_M), len(CONTRASTS))
     tissue, continuum, sharp, design = (np.empty(shape) for _ in range(4))
     base = _continuum(0.0, 1.0, EDGE_M)
     for i, radius in enumerate(LUMPS_M):
         for j, contrast in enumerate(CONTRASTS):
             lesion = Lesion(centre_m=(0.0, 0.0), radii_m=(radius, radius), contrast=contrast, edge_m=EDGE_M)
-            tissue[i, j] = hold(Tissue(flat_phantom(lesions=(lesion,)), ELASTIC), DEPTH_M, RADIUS_M) / plain
+            tissue[i, j] = hold(WinklerTissue(flat_phantom(lesions=(lesion,)), ELASTIC), DEPTH_M, RADIUS_M) / plain
             continuum[i, j] = _continuum(radius, contrast, EDGE_M) / base
             sharp[i, j] = _continuum(radius, contrast, SHARP_M) / base
             design[i, j] = _radius_of(DESIGN[i, j], contrast, radius, base)

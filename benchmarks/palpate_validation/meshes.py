@@ -6,18 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
+from palpate_models.frames import Array
 from palpate_models.phantom import flat_phantom
 from palpate_models.scenario import Lesion, Stiffness
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
 from palpate_validation.foundation import static_force, uniform
 from palpate_validation.plots import COLOURS, INK
 from palpate_validation.probing import ELASTIC, OFFSETS, hold
-
-Array = NDArray[np.float64]
 
 HALF_M = 0.08
 EDGES_M = (0.005, 0.0025)
@@ -55,7 +53,7 @@ def measure_meshes() -> MeshForces:
         model = flat_phantom(HALF_M, edge)
         for r, radius in enumerate(RADII_M):
             for o, xy in enumerate(OFFSETS):
-                tissue = Tissue(model, ELASTIC)
+                tissue = WinklerTissue(model, ELASTIC)
                 force[e, r, o] = [hold(tissue, float(depth), radius, xy, 0.2) for depth in DEPTHS_M]
     k_w, shear = uniform(wall.k_w_n_per_m3), uniform(wall.k_w_n_per_m3 * wall.length_m**2)
     continuum = np.array([[static_force(float(d), radius, k_w, shear) for d in DEPTHS_M] for radius in RADII_M])
@@ -78,7 +76,7 @@ def measure_superposition() -> Superposition:
     places = ((-0.015, 0.003), (0.015, -0.004))
     displacement, load = np.zeros((2, len(model.vertices))), np.zeros((2, len(model.vertices)))
     for k, xy in enumerate(places):
-        tissue = Tissue(model, ELASTIC)
+        tissue = WinklerTissue(model, ELASTIC)
         hold(tissue, 0.008, 0.015, xy, 1.5)
         displacement[k] = tissue.displacement
         load[k, tissue.contacts] = tissue.contact_forces
@@ -93,7 +91,7 @@ def measure_superposition() -> Superposition:
 
 def _recover(model: object, start: Array, steps: int = 200) -> Array:
     """Displacement after the tissue, dented by `start` [m], was left alone."""
-    tissue = Tissue(model, Stiffness())  # type: ignore[arg-type]
+    tissue = WinklerTissue(model, Stiffness())  # type: ignore[arg-type]
     tissue.displacement[:] = start
     tissue.disturbed = True
     for k in range(steps):

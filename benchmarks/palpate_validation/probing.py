@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Stiffness
-from palpate_tissue.tissue import Tissue
-
-Array = NDArray[np.float64]
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
 """The default wall without relaxation and friction: what static references know."""
@@ -22,7 +20,9 @@ OFFSETS = ((0.0, 0.0), (0.0025, 0.0), (0.0, 0.0029), (0.0013, 0.0008), (0.0031, 
 STILL = np.zeros(3)
 
 
-def hold(tissue: Tissue, depth: float, radius: float, xy: Sequence[float] = (0.0, 0.0), seconds: float = SETTLE_S) -> float:
+def hold(
+    tissue: WinklerTissue, depth: float, radius: float, xy: Sequence[float] = (0.0, 0.0), seconds: float = SETTLE_S
+) -> float:
     """Normal force [N] on a sphere of `radius` [m] held at `depth` [m] below z = 0, after `seconds` [s]."""
     p = np.array((*xy, radius - depth))
     force = STILL
@@ -44,6 +44,6 @@ def static_curve(
     """
     forces = np.zeros(len(depths))
     for xy in offsets:
-        tissue = Tissue(model, stiffness)
+        tissue = WinklerTissue(model, stiffness)
         forces += [hold(tissue, float(depth), radius, xy) for depth in depths]
     return forces / len(offsets)

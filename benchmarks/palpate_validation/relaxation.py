@@ -6,17 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
+from palpate_models.frames import Array
 from palpate_models.phantom import flat_phantom
 from palpate_models.scenario import Stiffness
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
 from palpate_validation.plots import COLOURS, INK
 from palpate_validation.probing import ELASTIC, STILL, hold
-
-Array = NDArray[np.float64]
 
 HALF_M = 0.04
 RADIUS_M = 0.015
@@ -49,8 +47,8 @@ def series(t: Array, g1: float, tau1: float, g2: float, tau2: float) -> Array:
 def measure(hold_s: float = HOLD_S) -> Relaxation:
     """Holds the sphere for `hold_s` [s] and fits the series to the force by least squares, from a guess of 1 s and 20 s."""
     model = flat_phantom(HALF_M)
-    instantaneous = hold(Tissue(model, ELASTIC), DEPTH_M, RADIUS_M)
-    tissue = Tissue(model, Stiffness(friction=0.0))
+    instantaneous = hold(WinklerTissue(model, ELASTIC), DEPTH_M, RADIUS_M)
+    tissue = WinklerTissue(model, Stiffness(friction=0.0))
     p = np.array((0.0, 0.0, RADIUS_M - DEPTH_M))
     force = np.array([tissue.step(0.0, p, STILL, RADIUS_M)[0][2] for _ in range(round(hold_s / tissue.dt))])
     time = tissue.dt * np.arange(1, len(force) + 1)

@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Stiffness
-from palpate_tissue.tissue import Tissue
-from palpate_validation.dart_scene import Box, Ellipsoid, Flesh
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_validation.dart_scene import Ellipsoid, Flesh, SoftBox
 
-Array = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 AREA_M2 = 2.5e-5
 """Of a vertex; any value gives the same tissue."""
 
 
-def twin(flesh: Flesh) -> Tissue:
+def twin(flesh: Flesh) -> WinklerTissue:
     """Our tissue with the same vertices and parameters, without friction and relaxation."""
-    if isinstance(flesh.shape, Box):
+    if isinstance(flesh.shape, SoftBox):
         vertices, normals = box_surface(flesh.shape)
         edges = np.empty((0, 2), dtype=np.int32)
     else:
@@ -49,7 +49,7 @@ def twin(flesh: Flesh) -> Tissue:
     wall = Stiffness(
         k_w_n_per_m3=float(k_w[0]), length_m=length, dashpot_s=flesh.damping / flesh.k_v, prony_g=(), prony_tau_s=(), friction=0.0
     )
-    return Tissue(model, wall)
+    return WinklerTissue(model, wall)
 
 
 def graph_laplacian(edges: IntArray, n: int) -> sparse.csr_array:
@@ -59,7 +59,7 @@ def graph_laplacian(edges: IntArray, n: int) -> sparse.csr_array:
     return sparse.csr_array(sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency)
 
 
-def box_surface(box: Box) -> tuple[Array, Array]:
+def box_surface(box: SoftBox) -> tuple[Array, Array]:
     """Vertices (n, 3) [m] of a box whose top is in z = 0, and outward normals; the rim of the top belongs to the top."""
     grids = [np.linspace(-size / 2, size / 2, count) for size, count in zip(box.size_m, box.counts, strict=True)]
     points = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -4,8 +4,8 @@ Compiled code is kept beside its source, or in NUMBA_CACHE_DIR, or in the user's
 anew by every process. A function compiles at its first call, so whoever has a deadline calls it once before.
 
 numba compiles a function anew when its own file has changed. What it calls is compiled into it, and may stand in another file of
-the package; so here all that is kept of a package goes when any of its files has changed. A compiled function must not call one
-of another package.
+the package; so here all that is kept for a folder goes when any file of its package, sub-packages included, has changed. A
+compiled function must not call one of another package.
 """
 
 from __future__ import annotations
@@ -32,15 +32,23 @@ def compiled(function: _F) -> _F:
         return cast("_F", numba.njit(error_model="numpy")(function))
     if dispatcher is not function:  # which it is where NUMBA_DISABLE_JIT is set
         with suppress(OSError):
-            _renew(Path(function.__code__.co_filename).parent, Path(str(dispatcher.stats.cache_path)))
+            _renew(_package(Path(function.__code__.co_filename)), Path(str(dispatcher.stats.cache_path)))
     return cast("_F", dispatcher)
+
+
+def _package(file: Path) -> Path:
+    """The folder of the top package that a file belongs to; the file's own where it belongs to none."""
+    folder = file.parent
+    while (folder.parent / "__init__.py").is_file():
+        folder = folder.parent
+    return folder
 
 
 @cache
 def _renew(package: Path, kept: Path) -> None:
     """Removes what is kept of a package unless it was made of its sources as they are."""
     digest = sha256()
-    for path in sorted(package.glob("*.py")):
+    for path in sorted(package.rglob("*.py")):
         digest.update(path.name.encode() + path.read_bytes())
     stamp = kept / STAMP
     if stamp.is_file() and stamp.read_text() == digest.hexdigest():

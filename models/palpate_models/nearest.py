@@ -5,11 +5,9 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_models.compiled import compiled
-
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 
 @compiled

@@ -301,12 +301,14 @@ class TissueChoice(_Section):
     """`default`; the name of another that an installed package registers (`fmu`, `elastic`); `none` where what the arm touches is
     real: then no tissue is simulated, nothing is known of a truth, and nothing is scored (wall clock only)."""
     fmu: str | None = None
-    """Co-simulation FMU for `implementation: fmu`; built from the phantom when empty."""
+    """File of a co-simulation FMU for `implementation: fmu`; built from the phantom when empty."""
+    fmu_map: str | None = None
+    """File of the map of its variables to topic fields (YAML); that of the abdomen FMU when empty."""
 
     @model_validator(mode="after")
     def _fmu(self) -> TissueChoice:
-        if self.fmu is not None and self.implementation != "fmu":
-            raise ValueError("tissue.fmu needs tissue.implementation: fmu")
+        if (self.fmu is not None or self.fmu_map is not None) and self.implementation != "fmu":
+            raise ValueError("tissue.fmu and tissue.fmu_map need tissue.implementation: fmu")
         return self
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -69,8 +68,6 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> Case:
     if not any(recording.counts.get(topic.name) for topic in rules.outputs(role)):
         raise RecordingError(f"{path}: has nothing that {role} sent, so there is nothing to compare with")
     loaded = load_text(text)
-    if loaded.tissue.fmu is not None:
-        os.environ["PALPATE_FMU"] = loaded.tissue.fmu
     return Case(recording, role, create(loaded), text, rules)
 
 

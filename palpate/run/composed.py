@@ -11,7 +11,7 @@ from pathlib import Path
 from time import perf_counter
 
 from palpate.run.distributed import KNOWS_PHANTOM, OBSERVERS, SIM_LIMIT, WORKERS, write_scenario_files
-from palpate.run.implementations import chosen_environment, chosen_services
+from palpate.run.implementations import chosen_services
 from palpate.run.own import load
 from palpate.run.result import Progress, RunResult, Tell, given_up
 from palpate_bus.messages.stamps import NS
@@ -54,7 +54,6 @@ def run_composed(
     begin = perf_counter()
     write_scenario_files(scenario, out)
     os.environ["PALPATE_OUT"] = str(out)
-    os.environ.update(chosen_environment(scenario))
     collector = Collector(tree=FrameTree(exam_input(scenario)))
     observing = load_services(scenario, observers, own)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import zenoh
 
-from palpate.run.implementations import NONE, chosen_environment, chosen_processes
+from palpate.run.implementations import NONE, chosen_processes
 from palpate.run.join import Absent
 from palpate.run.own import in_place
 from palpate.run.processes import LocalProcesses, compose_file, override_files, read_processes
@@ -87,7 +87,6 @@ def run_distributed(
     extra = {
         "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         "PALPATE_RECORD": str(int("recorder" in observers)),
-        **chosen_environment(scenario),
     }
     if handover_s:
         keep_places(out, processes)

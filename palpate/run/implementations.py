@@ -74,8 +74,3 @@ def installed_command(role: str, implementation: str, service: Path | None) -> t
         known = sorted(name.partition(".")[2] for name in found if name.startswith(f"{role}."))
         raise ImplementationError(f"--implementation {implementation}: for {role} there are {', '.join([DEFAULT, *known])}")
     return ("python", "-m", point.module.rpartition(".")[0])
-
-
-def chosen_environment(scenario: Scenario) -> dict[str, str]:
-    """What the chosen implementations read from the environment."""
-    return {"PALPATE_FMU": scenario.tissue.fmu} if scenario.tissue.fmu is not None else {}

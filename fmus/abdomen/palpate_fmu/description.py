@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fmu.structure import Indices, structure_2, structure_3
-from palpate_fmu.variables import Kind, Role, Sizes, Variable, variables
-
-Array = NDArray[np.float64]
+from palpate_fmu.variables import Sizes, Variable, VariableKind, VariableRole, variables
+from palpate_models.frames import Array
 
 MODEL = "abdomen"
 """The model identifier: name of binaries and prefix of functions."""
@@ -40,19 +39,19 @@ UNITS: dict[str, dict[str, str]] = {
 
 def _causality(variable: Variable) -> dict[str, str]:
     """Causality, variability and initial, where they are not FMI's defaults."""
-    if variable.role is Role.INDEPENDENT and variable.kind is Kind.READ:
+    if variable.role is VariableRole.INDEPENDENT and variable.kind is VariableKind.READ:
         return {"causality": "independent", "variability": "continuous"}
-    if variable.kind is Kind.INPUT:
+    if variable.kind is VariableKind.INPUT:
         return {"causality": "input", "variability": "continuous"}
     if variable.parameter:
         return {
             "causality": "parameter",
-            "variability": "fixed" if variable.kind is Kind.FIXED else "tunable",
+            "variability": "fixed" if variable.kind is VariableKind.FIXED else "tunable",
             "initial": "exact",
         }
-    if variable.kind is Kind.STATE:
+    if variable.kind is VariableKind.STATE:
         return {"causality": "local", "variability": "continuous", "initial": "exact"}
-    if variable.role is Role.CALCULATED:
+    if variable.role is VariableRole.CALCULATED:
         return {"causality": "calculatedParameter", "variability": "fixed", "initial": "calculated"}
     continuous = "discrete" if variable.integer else "continuous"
     return {"causality": str(variable.role), "variability": continuous, "initial": "calculated"}

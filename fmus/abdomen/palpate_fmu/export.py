@@ -50,13 +50,12 @@ def build_fmu(
     radius_m: float = 0.015,
     model: PhantomModel | None = None,
     compiling: Callable[[str], None] = lambda _: None,
-    compiled: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Writes the FMU of a phantom to `out` and returns that path.
 
     `version` is FMI's, 2 or 3; `targets` are platforms by FMI 3.0's names, all by default; `radius_m` is the indenter's
-    start value; `model` replaces the surface and background that `phantom` would give; `compiling` and `compiled` are called
-    with each platform before and after. The same arguments give the same bytes. Raises ExportError, CompileError or ValueError.
+    start value; `model` replaces the surface and background that `phantom` would give; `compiling` is called with each platform
+    before it is compiled for. The same arguments give the same bytes. Raises ExportError, CompileError or ValueError.
     """
     if version not in (2, 3):
         raise ValueError(f"FMI version {version} is not one of 2, 3")
@@ -85,7 +84,6 @@ def build_fmu(
             place = target.tuple_3 if version == 3 else target.folder_2
             compiling(target.tuple_3)
             files[f"binaries/{place}/{MODEL}{target.suffix}"] = compile_library(folder, names, target)
-            compiled(target.tuple_3)
     out.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name, content in files.items():
@@ -102,12 +100,9 @@ def build_scenario_fmu(
     version: int = 3,
     targets: Sequence[str] | None = None,
     compiling: Callable[[str], None] = lambda _: None,
-    compiled: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """`build_fmu` for the phantom and the indenter of a scenario."""
-    return build_fmu(
-        scenario.phantom, scenario.seed, out, version, targets, scenario.robot.indenter_radius_m, None, compiling, compiled
-    )
+    return build_fmu(scenario.phantom, scenario.seed, out, version, targets, scenario.robot.indenter_radius_m, None, compiling)
 
 
 def _token(content: bytes, version: int) -> str:

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fmu.variables import BRANCHES, LESIONS, Sizes, parameters
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Phantom
-
-Array = NDArray[np.float64]
 
 SAMPLES = 64
 """Vertices whose displacement an FMI 2.0 master sees."""

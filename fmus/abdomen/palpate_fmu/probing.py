@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fmu.instance import FmuInstance
-
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 GAP_M = 0.002
 """Distance from the surface at which the motion starts and ends."""

@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_fmu.variables import Role, Sizes, Variable, variables
+from palpate_fmu.variables import Sizes, Variable, VariableRole, variables
 from palpate_models.phantom import PhantomModel
 
 
@@ -29,9 +29,9 @@ def couplings(model: PhantomModel) -> tuple[NDArray[np.intp], ...]:
 
 def _unknowns(table: Sequence[Variable]) -> tuple[list[Variable], list[Variable], list[Variable]]:
     """Outputs, derivatives of states, and all that initialization calculates."""
-    outputs = [v for v in table if v.role is Role.OUTPUT and not v.settable]
+    outputs = [v for v in table if v.role is VariableRole.OUTPUT and not v.settable]
     rates = [v for v in table if v.rate_of]
-    return outputs, rates, [*outputs, *rates, *(v for v in table if v.role is Role.CALCULATED and not v.settable)]
+    return outputs, rates, [*outputs, *rates, *(v for v in table if v.role is VariableRole.CALCULATED and not v.settable)]
 
 
 def structure_3(root: ET.Element, sizes: Sizes) -> None:
@@ -55,12 +55,12 @@ class Indices:
             used += variable.count(sizes)
 
     def of(self, variable: Variable) -> range:
-        """Of all elements of a variable."""
+        """The places of all elements of a variable."""
         first = self._first[variable.name]
         return range(first, first + variable.count(self._sizes))
 
     def at(self, name: str, elements: Iterable[int]) -> Iterator[int]:
-        """Of some elements, from 0, of a variable."""
+        """The places of some elements, counted from 0, of a variable."""
         return (self._first[name] + int(k) for k in elements)
 
 

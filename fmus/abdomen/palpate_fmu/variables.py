@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from math import prod
+from typing import Any
 
 LESIONS = 8
 """Most lesions that an FMU can have."""
@@ -17,7 +18,7 @@ BRANCHES = 4
 """Most Prony branches."""
 
 
-class Kind(StrEnum):
+class VariableKind(StrEnum):
     """What a variable is for, by the C code's names."""
 
     INPUT = "INPUT"
@@ -27,7 +28,7 @@ class Kind(StrEnum):
     READ = "READ"
 
 
-class Role(StrEnum):
+class VariableRole(StrEnum):
     """How FMI classifies what can only be read."""
 
     OUTPUT = "output"
@@ -58,8 +59,8 @@ class Variable:
     unit: str | None = None
     shape: tuple[int | str, ...] = ()
     """Extents; the names of `Sizes` stand for the phantom's."""
-    kind: Kind = Kind.READ
-    role: Role = Role.OUTPUT
+    kind: VariableKind = VariableKind.READ
+    role: VariableRole = VariableRole.OUTPUT
     group: str = "NONE"
     """What the C code refreshes before it is read."""
     integer: bool = False
@@ -77,12 +78,12 @@ class Variable:
     @property
     def parameter(self) -> bool:
         """Whether it is set before or, if tunable, during the simulation and held."""
-        return self.kind in (Kind.FIXED, Kind.TUNABLE)
+        return self.kind in (VariableKind.FIXED, VariableKind.TUNABLE)
 
     @property
     def settable(self) -> bool:
         """Whether a master gives it a value, if only to start from."""
-        return self.kind is not Kind.READ
+        return self.kind is not VariableKind.READ
 
     def extents(self, sizes: Sizes) -> tuple[int, ...]:
         """Its shape for a phantom."""
@@ -94,24 +95,16 @@ class Variable:
 
 
 def _input(vr: int, name: str, member: str, unit: str, bound: float, start: tuple[float, ...], doc: str) -> Variable:
-    return Variable(vr, name, member, doc, unit, (3,), Kind.INPUT, low=-bound, high=bound, start=start)
+    return Variable(vr, name, member, doc, unit, (3,), VariableKind.INPUT, low=-bound, high=bound, start=start)
 
 
 def _parameter(
-    vr: int,
-    name: str,
-    unit: str | None,
-    low: float,
-    high: float,
-    doc: str,
-    start: float | tuple[float, ...] | None = None,
-    shape: tuple[int, ...] = (),
-    kind: Kind = Kind.FIXED,
-    member: str | None = None,
-    integer: bool = False,
+    vr: int, name: str, unit: str | None, bounds: tuple[float, float], doc: str, member: str | None = None, **more: Any
 ) -> Variable:
-    member = f"parameters.{member or name}"
-    return Variable(vr, name, member, doc, unit, shape, kind, integer=integer, low=low, high=high, start=start)
+    """A parameter between two bounds, fixed unless its `kind` is given among `more` fields."""
+    low, high = bounds
+    fields: dict[str, Any] = {"kind": VariableKind.FIXED, "low": low, "high": high} | more
+    return Variable(vr, name, f"parameters.{member or name}", doc, unit, **fields)
 
 
 def _state(
@@ -120,18 +113,18 @@ def _state(
     """A continuous state of model exchange and its derivative."""
     return (
         Variable(
-            vr, name, f"arrays.{member}", doc, "m", shape, Kind.STATE, Role.LOCAL, low=-1, high=1, nominal=1e-3,
+            vr, name, f"arrays.{member}", doc, "m", shape, VariableKind.STATE, VariableRole.LOCAL, low=-1, high=1, nominal=1e-3,
             start=0.0, behind=behind,
         ),
         Variable(
-            rate_vr, rate, f"arrays.{member}_rate", f"Derivative of {name}", "m/s", shape, Kind.READ, Role.LOCAL,
+            rate_vr, rate, f"arrays.{member}_rate", f"Derivative of {name}", "m/s", shape, VariableKind.READ, VariableRole.LOCAL,
             group="RATES", rate_of=name, behind=behind,
         ),
     )  # fmt: skip
 
 
 TABLE: tuple[Variable, ...] = (
-    Variable(0, "time", "outputs.time", "Simulated time", "s", role=Role.INDEPENDENT, group="STATE"),
+    Variable(0, "time", "outputs.time", "Simulated time", "s", role=VariableRole.INDEPENDENT, group="STATE"),
     _input(1, "indenter_position", "inputs.position", "m", 10, (0.0, 0.0, 1.0), "Centre of the sphere at the end of the step"),
     _input(4, "indenter_velocity", "inputs.velocity", "m/s", 10, (0.0, 0.0, 0.0), "Velocity of the centre, for friction"),
     _input(7, "indenter_angular_velocity", "inputs.spin", "rad/s", 100, (0.0, 0.0, 0.0), "Angular velocity, for friction"),
@@ -146,31 +139,33 @@ TABLE: tuple[Variable, ...] = (
     Variable(26, "contacts", "outputs.contacts", "Vertices in contact", group="STATE", integer=True, low=0),
     Variable(27, "breathing_excursion", "outputs.excursion", "Outward, where the profile is 1", "m", group="STATE"),
     Variable(28, "elastic_energy", "outputs.energy", "Stored in springs, Maxwell branches and skin", "J", group="ENERGY", low=0),
-    _parameter(30, "indenter_radius", "m", 0.001, 0.1, "Radius of the sphere", 0.015, kind=Kind.TUNABLE, member="radius"),
-    _parameter(31, "stiffness_scale", "1", 0.01, 100, "Factor on the foundation modulus everywhere", 1.0, member="scale"),
-    _parameter(32, "pasternak_length", "m", 0.002, 0.1, "l = sqrt(G / k_w)", member="length"),
-    _parameter(33, "dashpot", "s", 1e-4, 1, "Dashpot over foundation modulus"),
-    _parameter(34, "friction", "1", 0, 2, "Coulomb friction between indenter and skin"),
-    _parameter(35, "breathing_amplitude", "m", 0, 0.02, "Half of the peak-to-peak excursion", member="amplitude"),
-    _parameter(36, "breathing_rate", "1/min", 0, 60, "Breaths a minute", member="rate"),
-    _parameter(37, "breathing_phase", "rad", -6.2831854, 6.2831854, "Phase of breathing at time 0", 0.0, member="phase"),
-    _parameter(38, "lesion_count", None, 0, LESIONS, "How many entries of the lesion list count", integer=True),
     _parameter(
-        39, "contact_time", "s", 1e-5, 0.1, "Model exchange: within which contact and friction are restored", 1e-3
+        30, "indenter_radius", "m", (0.001, 0.1), "Radius of the sphere", "radius", start=0.015, kind=VariableKind.TUNABLE
     ),
-    _parameter(40, "prony_g", "1", 0, 1, "Relaxing fractions of the stiffness, sum below 1", shape=(BRANCHES,)),
-    _parameter(44, "prony_tau", "s", 1e-4, 1e6, "Their time constants", shape=(BRANCHES,)),
-    _parameter(48, "lesion_centre", "m", -10, 10, "Centre in the xy plane", shape=(LESIONS, 2)),
-    _parameter(64, "lesion_radii", "m", 1e-4, 10, "Half axes of the half-contrast outline", shape=(LESIONS, 2)),
-    _parameter(80, "lesion_contrast", "1", 0.001, 20, "Stiffness at the centre over that without", shape=(LESIONS,)),
-    _parameter(88, "lesion_edge", "m", 1e-4, 10, "Width of the smooth edge", shape=(LESIONS,)),
+    _parameter(31, "stiffness_scale", "1", (0.01, 100), "Factor on the foundation modulus everywhere", start=1.0, member="scale"),
+    _parameter(32, "pasternak_length", "m", (0.002, 0.1), "l = sqrt(G / k_w)", member="length"),
+    _parameter(33, "dashpot", "s", (1e-4, 1), "Dashpot over foundation modulus"),
+    _parameter(34, "friction", "1", (0, 2), "Coulomb friction between indenter and skin"),
+    _parameter(35, "breathing_amplitude", "m", (0, 0.02), "Half of the peak-to-peak excursion", member="amplitude"),
+    _parameter(36, "breathing_rate", "1/min", (0, 60), "Breaths a minute", member="rate"),
+    _parameter(37, "breathing_phase", "rad", (-6.2831854, 6.2831854), "Phase of breathing at time 0", start=0.0, member="phase"),
+    _parameter(38, "lesion_count", None, (0, LESIONS), "How many entries of the lesion list count", integer=True),
+    _parameter(
+        39, "contact_time", "s", (1e-5, 0.1), "Model exchange: within which contact and friction are restored", start=1e-3
+    ),
+    _parameter(40, "prony_g", "1", (0, 1), "Relaxing fractions of the stiffness, sum below 1", shape=(BRANCHES,)),
+    _parameter(44, "prony_tau", "s", (1e-4, 1e6), "Their time constants", shape=(BRANCHES,)),
+    _parameter(48, "lesion_centre", "m", (-10, 10), "Centre in the xy plane", shape=(LESIONS, 2)),
+    _parameter(64, "lesion_radii", "m", (1e-4, 10), "Half axes of the half-contrast outline", shape=(LESIONS, 2)),
+    _parameter(80, "lesion_contrast", "1", (0.001, 20), "Stiffness at the centre over that without", shape=(LESIONS,)),
+    _parameter(88, "lesion_edge", "m", (1e-4, 10), "Width of the smooth edge", shape=(LESIONS,)),
     Variable(
         1000, "sample_displacement", "arrays.sample_inward", "Inward displacement of sample vertices", "m", ("samples",),
         group="INWARD", versions=(2,),
     ),
     Variable(
         1500, "sample_position", "arrays.sample_position", "Rest position of sample vertices", "m", ("samples", 3),
-        role=Role.CALCULATED, versions=(2,),
+        role=VariableRole.CALCULATED, versions=(2,),
     ),
     Variable(
         5000, "surface_displacement", "arrays.inward", "Inward displacement of every vertex", "m", ("vertices",),
@@ -178,35 +173,35 @@ TABLE: tuple[Variable, ...] = (
     ),
     Variable(
         5001, "deformed_position", "arrays.position", "Vertices of the deformed surface", "m", ("vertices", 3),
-        role=Role.LOCAL, group="SHAPE", versions=(3,),
+        role=VariableRole.LOCAL, group="SHAPE", versions=(3,),
     ),
     Variable(
         5002, "deformed_normal", "arrays.normal", "Its outward normals", "1", ("vertices", 3),
-        role=Role.LOCAL, group="SHAPE", versions=(3,),
+        role=VariableRole.LOCAL, group="SHAPE", versions=(3,),
     ),
     Variable(
         5003, "rest_position", "arrays.rest_position", "Vertices at rest", "m", ("vertices", 3),
-        role=Role.CALCULATED, versions=(3,),
+        role=VariableRole.CALCULATED, versions=(3,),
     ),
     Variable(
         5004, "rest_normal", "arrays.rest_normal", "Outward normals at rest", "1", ("vertices", 3),
-        role=Role.CALCULATED, versions=(3,),
+        role=VariableRole.CALCULATED, versions=(3,),
     ),
     Variable(
         5005, "stiffness", "arrays.stiffness", "k_w with lesions", "N/m3", ("vertices",),
-        role=Role.CALCULATED, group="MATRICES", versions=(3,),
+        role=VariableRole.CALCULATED, group="MATRICES", versions=(3,),
     ),
     Variable(
         5006, "background", "arrays.background", "k_w without lesions", "N/m3", ("vertices",),
-        role=Role.CALCULATED, group="MATRICES", versions=(3,),
+        role=VariableRole.CALCULATED, group="MATRICES", versions=(3,),
     ),
     Variable(
         5007, "lesion", "arrays.lesion", "Lesion in which a vertex lies, from 0; -1: none", None, ("vertices",),
-        role=Role.CALCULATED, group="MATRICES", integer=True, versions=(3,),
+        role=VariableRole.CALCULATED, group="MATRICES", integer=True, versions=(3,),
     ),
     Variable(
         5008, "triangles", "arrays.triangles", "Vertex indices from 0, counter-clockwise seen from outside", None,
-        ("triangles", 3), role=Role.CALCULATED, integer=True, versions=(3,),
+        ("triangles", 3), role=VariableRole.CALCULATED, integer=True, versions=(3,),
     ),
     *_state(
         100_000_000, 200_000_000, "displacement", "displacement_rate", "displacement",
@@ -239,7 +234,7 @@ def c_table() -> str:
         own = [extent for extent in variable.shape if isinstance(extent, str)]
         of = own[0].upper() if own else "BEHIND" if variable.behind else "PLAIN"
         each = prod(extent for extent in variable.shape if isinstance(extent, int))
-        low, high = (bound if variable.kind is not Kind.READ else 0.0 for bound in (variable.low, variable.high))
+        low, high = (bound if variable.kind is not VariableKind.READ else 0.0 for bound in (variable.low, variable.high))
         what = f"{variable.vr}, {'INTEGER' if variable.integer else 'REAL'}, {variable.kind}, {of}, {each}"
         bounds = f"{float(low or 0)!r}, {float(high or 0)!r}"
         lines.append(f'ROW({what}, {bounds}, {variable.group}, {variable.member}, "{variable.name}")')

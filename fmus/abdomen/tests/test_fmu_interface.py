@@ -13,7 +13,7 @@ from fmpy.validation import validate_fmu
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuError, FmuInstance
-from palpate_fmu.variables import TABLE, Kind, Sizes
+from palpate_fmu.variables import TABLE, Sizes, VariableKind
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Phantom
 
@@ -93,7 +93,7 @@ def test_what_can_be_read_is_what_was_exported(fmu3: Path, phantom: Phantom) -> 
             np.testing.assert_array_equal(fmu.get(name), array)
         np.testing.assert_allclose(fmu.get("stiffness"), model.stiffness, rtol=1e-13)
         for v in TABLE:
-            if v.kind is Kind.FIXED and 3 in v.versions:
+            if v.kind is VariableKind.FIXED and 3 in v.versions:
                 assert np.isfinite(fmu.get(v.name)).all()
 
 

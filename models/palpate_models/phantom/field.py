@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.scenario import Background, Lesion
-
-Array = NDArray[np.float64]
 
 _FEATURES = 512
 """Random Fourier features of the background field: its covariance is within 1/sqrt(512) = 4 % of the Gaussian one."""

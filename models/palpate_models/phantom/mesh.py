@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
+
 IntArray = NDArray[np.int32]
 
 SUFFIXES = (".obj", ".stl", ".ply")
@@ -27,14 +28,14 @@ class MeshError(ValueError):
 
 
 @dataclass(frozen=True)
-class Surface:
+class TriangleMesh:
     """Vertices (n, 3) [m] in A and triangles (m, 3), counter-clockwise seen from outside."""
 
     vertices: Array
     triangles: IntArray
 
 
-def load_mesh(path: Path, edge_m: float) -> Surface:
+def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
     """The surface in an OBJ, STL or PLY file (metres, abdomen frame), with edges up to `edge_m` [m] where examined.
 
     Raises MeshError if the file is missing, unreadable, empty, not in metres, not at the origin, degenerate,
@@ -157,7 +158,7 @@ def orient(vertices: Array, triangles: IntArray) -> IntArray:
     return np.ascontiguousarray(out if outward > 0 else out[:, ::-1], dtype=np.int32)
 
 
-def refine(vertices: Array, triangles: IntArray, edge_m: float) -> Surface:
+def refine(vertices: Array, triangles: IntArray, edge_m: float) -> TriangleMesh:
     """The mesh with edges of at most `edge_m` [m] on the front of the examined region, without hanging vertices."""
     for _ in range(16):
         pairs, inverse = np.unique(np.sort(_half_edges(triangles), axis=1), axis=0, return_inverse=True)
@@ -183,7 +184,7 @@ def refine(vertices: Array, triangles: IntArray, edge_m: float) -> Surface:
         middle[split] = len(vertices) + np.arange(int(split.sum()))
         vertices = np.concatenate((vertices, vertices[pairs[split]].mean(axis=1)))
         triangles = _split_triangles(triangles, middle[of_face])
-    return Surface(vertices, triangles)
+    return TriangleMesh(vertices, triangles)
 
 
 def _split_triangles(triangles: IntArray, middle: IntArray) -> IntArray:

@@ -10,12 +10,12 @@ import robust_laplacian
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate_models.frames import Array
 from palpate_models.phantom.field import background_factor, lesion_field
 from palpate_models.phantom.mesh import MeshError, boundary_vertices, load_mesh, vertex_normals
 from palpate_models.phantom.parametric import parametric_surface
 from palpate_models.scenario import Phantom
 
-Array = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 _POSTERIOR_M = 0.010

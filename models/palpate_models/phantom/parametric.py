@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
+from palpate_models.frames import Array
 from palpate_models.phantom.field import smoothstep
 from palpate_models.phantom.mesh import orient, vertex_normals
-
-Array = NDArray[np.float64]
 
 EXPONENT = 2.4
 """Of the superellipse: flatter in front than an ellipse, as a relaxed supine belly is."""

@@ -25,7 +25,7 @@ from palpate_models.load import exam_input
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.field import gaussian_field
 from palpate_models.scenario import Lesion, Mode, Phantom, Scenario
-from palpate_tissue.tissue import Tissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue as Tissue
 
 SURFACE_SD, SURFACE_LENGTH = 0.0001, 0.012
 """Error of the perceived surface [m] and its correlation length: perception's own figures."""

@@ -2,7 +2,7 @@
 
 from palpate_bus.run import main
 from palpate_models.load import load_scenario
-from palpate_tissue.service import create
+from palpate_tissue.backends.winkler.service import create
 
 if __name__ == "__main__":
     main("tissue", create, load_scenario)

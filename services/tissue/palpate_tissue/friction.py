@@ -1,16 +1,21 @@
-"""Coulomb friction between indenter and skin, with the skin's own shear compliance before it slips."""
+"""Coulomb friction between indenter and skin, with the skin's own shear compliance before it slips.
+
+An elastic-plastic bristle: the skin sticks and shears by s with a constant stiffness k, and slips at the Coulomb limit,
+
+    s' = P v   while k |s| < mu N,     F = -k s
+
+P takes out what is along the normal. It is passive: k is constant, and slipping, turning and unloading only ever shorten s.
+"""
 
 from __future__ import annotations
 
-from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_models.compiled import compiled
-
-Array = NDArray[np.float64]
-Vector = tuple[float, float, float]
+from palpate_models.frames import Array
+from palpate_tissue.vectors import Vector, add, cross, divide, dot, norm, scale, subtract, velocity_at
 
 REFERENCE_K_W = 1.7e5
 REFERENCE_E = 1.0e4
@@ -29,63 +34,78 @@ def shear_stiffness(k_w: float) -> float:
     return 8 * REFERENCE_RADIUS_M * shear_modulus / (2 - POISSON)
 
 
-class Friction:
-    """An elastic-plastic bristle: skin sticks and shears with a constant stiffness, and slips at the Coulomb limit.
+class Bristle(NamedTuple):
+    """The skin under the indenter, as friction sees it."""
 
-    Passive: the spring's stiffness is constant, and slipping, turning and unloading only ever shorten it.
-    """
-
-    def __init__(self, coefficient: float, stiffness: float) -> None:
-        self.coefficient = coefficient
-        self.stiffness = stiffness
-        self.bristle: Array = np.zeros(3)
-        """How far the skin is sheared [m], which `rub` carries on."""
-        self.step(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0)  # compiles it, so that the first contact need not wait
-
-    @property
-    def stretch(self) -> Vector:
-        """How far the skin is sheared [m]."""
-        x, y, z = self.bristle.tolist()
-        return x, y, z
+    coefficient: float
+    """mu."""
+    stiffness: float
+    """k [N/m]."""
+    stretch: Array
+    """s [m], shape (3,): how far the skin is sheared. Changed in place."""
 
     def release(self) -> None:
         """Contact is lost: the skin springs back."""
-        self.bristle[:] = 0.0
+        self.stretch[:] = 0.0
 
-    def step(self, dt: float, velocity: Vector, normal: Vector, load: float) -> Vector:
-        """Friction force on the indenter [N] after `dt` [s].
+    def energy(self) -> float:
+        """What the sheared skin stores [J]."""
+        return 0.5 * self.stiffness * float(self.stretch @ self.stretch)
 
-        `velocity` [m/s] is of the indenter's surface against the tissue, `normal` of unit length, `load` the normal
-        force [N]; all in one frame.
-        """
-        return rub(self.bristle, self.coefficient, self.stiffness, dt, *velocity, *normal, load)
+
+def skin(coefficient: float, background: Array) -> Bristle:
+    """Unsheared skin over a wall of foundation moduli `background` [N/m^3], shape (n,)."""
+    return Bristle(float(coefficient), shear_stiffness(float(np.median(background))), np.zeros(3))
+
+
+class Sphere(NamedTuple):
+    """The indenter, in the abdomen frame A."""
+
+    p: Vector
+    """Its centre [m]."""
+    v: Vector
+    """Velocity of the centre [m/s]."""
+    w: Vector
+    """Angular velocity [rad/s]."""
+    radius: float
+    """[m]"""
+
+
+class Push(NamedTuple):
+    """What holding the skin on the frictionless sphere takes."""
+
+    force: Vector
+    """On the sphere [N]."""
+    normal: Vector
+    """Sum of the vertices' contact forces times their outward normals [N]."""
+    arm: Vector
+    """Centre of the contact forces from the sphere's centre [m]."""
 
 
 @compiled
-def rub(
-    bristle: Array,
-    coefficient: float,
-    stiffness: float,
-    dt: float,
-    vx: float,
-    vy: float,
-    vz: float,
-    nx: float,
-    ny: float,
-    nz: float,
-    load: float,
-) -> Vector:
-    """`Friction.step` for compiled code; `bristle` (3,) [m] is its state."""
-    limit = coefficient * load
+def shear(bristle: Bristle, velocity: Vector, normal: Vector, load: float, h: float) -> Vector:
+    """Friction force on the indenter [N] after `h` [s].
+
+    `velocity` [m/s] is of the indenter's surface against the tissue, `normal` of unit length, `load` the normal force [N].
+    """
+    s = add((bristle.stretch[0], bristle.stretch[1], bristle.stretch[2]), scale(h, velocity))
+    s = subtract(s, scale(dot(s, normal), normal))
+    pull, limit = bristle.stiffness * norm(s), bristle.coefficient * load
     if limit <= 0.0:
-        bristle[:] = 0.0
-        return 0.0, 0.0, 0.0
-    x, y, z = bristle[0] + vx * dt, bristle[1] + vy * dt, bristle[2] + vz * dt
-    along = x * nx + y * ny + z * nz
-    x, y, z = x - along * nx, y - along * ny, z - along * nz
-    pull = stiffness * sqrt(x * x + y * y + z * z)
-    if pull > limit:
-        share = limit / pull
-        x, y, z = x * share, y * share, z * share
-    bristle[0], bristle[1], bristle[2] = x, y, z
-    return -stiffness * x, -stiffness * y, -stiffness * z
+        s = (0.0, 0.0, 0.0)
+    elif pull > limit:
+        s = scale(limit / pull, s)
+    bristle.stretch[0], bristle.stretch[1], bristle.stretch[2] = s
+    return scale(-bristle.stiffness, s)
+
+
+@compiled
+def rub(bristle: Bristle, sphere: Sphere, push: Push, h: float, wrench: Array) -> None:
+    """Adds friction to a push: `wrench` (6,) gets force [N] and torque about the centre [N m] on the sphere after `h` [s].
+
+    Friction acts in the mean tangent plane, at the centre of the contact forces, against the sphere's surface there.
+    """
+    load = norm(push.normal)
+    friction = shear(bristle, velocity_at(sphere.v, sphere.w, push.arm), divide(push.normal, load), load, h)
+    wrench[0], wrench[1], wrench[2] = add(push.force, friction)
+    wrench[3], wrench[4], wrench[5] = cross(push.arm, friction)

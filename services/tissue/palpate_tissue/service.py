@@ -1,45 +1,29 @@
-"""The tissue service: the indenter's pose in, the wrench on it and the deformed surface out, at 1 kHz."""
+"""The tissue service: the indenter's pose in, the wrench on it and the deformed surface out, at 1 kHz.
+
+The physics is behind `TissueBackend`; here messages become arrays in the patient's true frame, and the truth is published.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from math import hypot
-from operator import add
+from collections.abc import Iterator, Mapping
+from math import hypot, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
-from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages import IndentationTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import pose_message, vector, wrench_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import matrix
-from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.scenario import Pose, Scenario
-from palpate_tissue import kernel
-from palpate_tissue.soft_body import SoftBody
-from palpate_tissue.surface import Surface, placed
-from palpate_tissue.tissue import Tissue
-
-Array = NDArray[np.float64]
-
-_IndentationTruth: Any = message_type("palpation_msgs/msg/IndentationTruth")
-_PhantomTruth: Any = message_type("palpation_msgs/msg/PhantomTruth")
-_Point: Any = message_type("geometry_msgs/msg/Point")
-_Pose: Any = message_type("geometry_msgs/msg/Pose")
-_Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
-_SurfaceMesh: Any = message_type("palpation_msgs/msg/SurfaceMesh")
-_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
-_Wrench: Any = message_type("geometry_msgs/msg/Wrench")
-_WrenchStamped: Any = message_type("geometry_msgs/msg/WrenchStamped")
-
-_OUT_OF_REACH_M = -3.0
-"""Depth before the first tool state: the lower end of the contract's range."""
-_NOTHING = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-"""Force [N] and torque [N m]."""
+from palpate_models.frames import Array, apply, matrix
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Pose
+from palpate_tissue.backend import TissueBackend
+from palpate_tissue.surface import SkinSurface
 
 _log = logging.getLogger("palpate.tissue")
 
@@ -49,25 +33,23 @@ class TissueService(Service):
 
     role: ClassVar[str] = "tissue"
 
-    def __init__(self, model: PhantomModel, body: SoftBody, pose: Pose, facts: Mapping[str, Any]) -> None:
-        """A soft body with its rest surface and true stiffness, at its true pose in world; `facts` are for log and report."""
-        self._model = model
-        self._tissue = body
-        self._facts = {"vertices": len(model.vertices), **facts}
-        rules = contract()
-        self._surface = Surface(self._model)
-        self._surface_period = rules.topics["sim/surface"].period
-        self._truth_period = rules.topics["truth/indentation"].period
+    def __init__(self, backend: TissueBackend, truth: PhantomModel, pose: Pose, facts: Mapping[str, Any]) -> None:
+        """A tissue whose true stiffness is that of `truth`, at its true pose in world; `facts` are for log and report."""
+        self._tissue = backend
+        self._truth = truth
+        self._facts = {"vertices": len(truth.vertices), **facts}
+        topics = contract().topics
+        self._surface_period = topics["sim/surface"].period
+        self._truth_period = topics["truth/indentation"].period
+        self._out_of_reach = topics["truth/indentation"].ranges["depth"][0]
+        """Depth before the first tool state [m]."""
+        self._surface = SkinSurface(truth)
         self._X_WA = matrix(pose)
-        self._R_AW = np.ascontiguousarray(self._X_WA[:3, :3].T)
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
         self._p_WA = self._X_WA[:3, 3].copy()
-        self._origin: list[float] = self._p_WA.tolist()
-        self._triangles = self._model.triangles.astype(np.uint32).ravel()
-        self._motion = np.zeros((3, 3))
-        """The indenter's position [m], velocity [m/s] and angular velocity [rad/s], in A."""
-        self._load, self._load_W = np.zeros((2, 3)), np.zeros((2, 3))
-        """Force [N] and torque [N m] on it, in A and in world."""
+        self._triangles = truth.triangles.astype(np.uint32).ravel()
+        self._p_A: Array = np.zeros(3)
+        """The indenter's centre [m]."""
         self._peak_n = self._recent_peak_n = 0.0
         self._contact_steps = 0
         self._onsets = 0
@@ -75,19 +57,12 @@ class TissueService(Service):
 
     def start(self) -> Outbox:
         """The truth about the phantom, latched; logs the facts."""
-        model = self._model
+        truth = self._truth
         _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
-        surface = _SurfaceMesh(header(0, "abdomen"), _flat(model.vertices), _flat(model.normals), self._triangles)
-        x, y, z, w = Rotation.from_matrix(self._R_WA).as_quat().tolist()
-        return {
-            "truth/phantom": _PhantomTruth(
-                surface,
-                model.stiffness.copy(),
-                model.background.copy(),
-                model.lesion.copy(),
-                _Pose(_Point(*self._p_WA.tolist()), _Quaternion(x, y, z, w)),
-            )
-        }
+        surface = SurfaceMesh(header(0, "abdomen"), _flat(truth.vertices), _flat(truth.normals), self._triangles)
+        pose = pose_message(self._R_WA, self._p_WA)
+        message = PhantomTruth(surface, truth.stiffness.copy(), truth.background.copy(), truth.lesion.copy(), pose)
+        return {"truth/phantom": message}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One millisecond of tissue."""
@@ -96,34 +71,14 @@ class TissueService(Service):
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
         """The same: first the wrench, for which the robot waits."""
         tool = inbox.latest("sim/tool_state")
-        if tool is None:
-            self._tissue.idle(t / NS)
-            force_W, torque_W = _NOTHING
-        else:
-            position, linear, angular = tool.pose.position, tool.twist.linear, tool.twist.angular
-            x, y, z = self._origin
-            motion_W = np.array(
-                (
-                    (position.x - x, position.y - y, position.z - z),
-                    (linear.x, linear.y, linear.z),
-                    (angular.x, angular.y, angular.z),
-                )
-            )
-            kernel.turn(motion_W, self._R_AW, self._motion)
-            p_A, v_A, w_A = self._motion
-            self._load[0], self._load[1] = self._tissue.step(t / NS, p_A, v_A, float(tool.radius), w_A)
-            kernel.turn(self._load, self._R_WA, self._load_W)
-            force_W, torque_W = self._load_W.tolist() if self._tissue.touching else _NOTHING
-        force = _Vector3(*force_W)
-        wrench = _Wrench(force, _Vector3(*torque_W))
-        yield {"sim/contact_wrench": _WrenchStamped(header(t, "world"), wrench)}
-        if tool is not None:
-            self._count(force)
+        F_W = self._wrench(t, tool)
+        yield {"sim/contact_wrench": WrenchStamped(header(t, "world"), wrench_message(F_W))}
+        self._count(F_W)
         outbox: dict[str, Message | list[Message]] = {}
         if t % self._surface_period == 0:
             outbox["sim/surface"] = self._surface_message(t)
         if t % self._truth_period == 0:
-            outbox["truth/indentation"] = self._truth(t, tool, force_W)
+            outbox["truth/indentation"] = self._indentation(t, tool, F_W[:3])
             self._peak_n, self._recent_peak_n = max(self._peak_n, self._recent_peak_n), 0.0
         if outbox:
             yield outbox
@@ -137,55 +92,50 @@ class TissueService(Service):
             "contact_onsets": self._onsets,
         }
 
-    def _count(self, force: Message) -> None:
-        """Counts the step and the force on the indenter, a Vector3 [N]."""
+    def _wrench(self, t: int, tool: Message | None) -> Array:
+        """Steps the tissue to `t` [ns]; force [N] and torque [N m] on the indenter, about its centre, world axes, shape (6,)."""
+        if tool is None:
+            self._tissue.idle(t / NS)
+            return np.zeros(6)
+        v_W, w_W = tool.twist.linear, tool.twist.angular
+        motion_W = np.array(((v_W.x, v_W.y, v_W.z), (w_W.x, w_W.y, w_W.z), vector(tool.pose.position) - self._p_WA))
+        v_A, w_A, self._p_A = motion_W @ self._R_WA  # each row times R_AW' = R_WA
+        F_A = self._tissue.step(t / NS, self._p_A, v_A, float(tool.radius), w_A)
+        return (np.array(F_A) @ self._R_WA.T).ravel() if self._tissue.touching else np.zeros(6)
+
+    def _count(self, F_W: Array) -> None:
+        """Counts the step and the force on the indenter."""
         touching = self._tissue.touching
         if touching:
             self._contact_steps += 1
             self._onsets += not self._touching
-            size = (force.x * force.x + force.y * force.y + force.z * force.z) ** 0.5
-            self._recent_peak_n = max(self._recent_peak_n, size)
+            x, y, z = F_W[:3].tolist()
+            self._recent_peak_n = max(self._recent_peak_n, sqrt(x * x + y * y + z * z))
         self._touching = touching
 
     def _surface_message(self, t: int) -> Message:
-        vertices_A = self._tissue.deformed_vertices
-        vertices_W = placed(vertices_A, self._R_WA, self._p_WA)
-        normals_W = self._surface.normals(self._tissue.inward, self._R_WA)
-        return _SurfaceMesh(header(t, "world"), vertices_W, normals_W, self._triangles)
+        vertices_W = apply(self._X_WA, self._tissue.deformed_vertices)
+        normals_W = (self._R_WA @ self._surface.normals(self._tissue.inward)).T
+        return SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_W), self._triangles)
 
-    def _truth(self, t: int, tool: Message | None, force_W: Sequence[float]) -> Message:
+    def _indentation(self, t: int, tool: Message | None, f_W: Array) -> Message:
+        """Where the indenter is against the rest surface, and the force on it along the normal there and across."""
         if tool is None:
-            return _IndentationTruth(header(t, "world"), _OUT_OF_REACH_M, 0.0, 0.0, 0.0, 0, _Point(0.0, 0.0, 0.0), 0.0)
-        under = self._surface.nearest(self._motion[0], self._tissue.excursion(t / NS))
-        place_W = np.empty((2, 3))
-        kernel.turn(np.stack((under.normal, under.position)), self._R_WA, place_W)
-        (nx, ny, nz), point = place_W.tolist()
-        fx, fy, fz = force_W
-        normal_force = fx * nx + fy * ny + fz * nz
-        return _IndentationTruth(
-            header(t, "world"),
-            float(tool.radius) - under.height,
-            max(normal_force, 0.0),
-            hypot(fx - normal_force * nx, fy - normal_force * ny, fz - normal_force * nz),
-            self._recent_peak_n,
-            len(self._tissue.contacts),
-            _Point(*map(add, point, self._origin)),
-            under.stiffness,
+            return IndentationTruth(header(t, "world"), self._out_of_reach, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
+        under = self._surface.nearest(self._p_A, self._tissue.excursion(t / NS))
+        n_W, p_W = self._R_WA @ under.normal, self._R_WA @ under.position + self._p_WA
+        normal_force = float(f_W @ n_W)
+        return IndentationTruth(
+            header=header(t, "world"),
+            depth=float(tool.radius) - under.height,
+            normal_force=max(normal_force, 0.0),
+            tangential_force=hypot(*(f_W - normal_force * n_W).tolist()),
+            peak_force=self._recent_peak_n,
+            contacts=len(self._tissue.contacts),
+            surface_point=Point(*p_W.tolist()),
+            stiffness=under.stiffness,
         )
 
 
 def _flat(array: Array) -> NDArray[np.float32]:
     return array.astype(np.float32).ravel()
-
-
-def create(scenario: Scenario) -> TissueService:
-    """The tissue of a scenario; with scoring, the one role that may look at its phantom."""
-    phantom = scenario.phantom
-    model = build_phantom(phantom, scenario.seed)
-    tissue = Tissue(model, phantom.stiffness, phantom.breathing, contract().roles[TissueService.role].period / NS)
-    facts = {
-        "stability_dt_rate": round(tissue.dt * tissue.mechanics.rate, 4),  # passive below 2
-        "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),
-        "substeps": tissue.substeps,
-    }
-    return TissueService(model, tissue, phantom.pose.true, facts)

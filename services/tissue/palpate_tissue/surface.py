@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate_models.compiled import compiled
+from palpate_models.frames import Array
 from palpate_models.nearest import nearest_vertex
 from palpate_models.phantom import PhantomModel
-
-Array = NDArray[np.float64]
-Index = NDArray[np.uint32]
-Single = NDArray[np.float32]
+from palpate_tissue.vectors import Vector, add, divide, dot, norm, row, scale, subtract
 
 _FAR_M = 0.15
 """Further away than this, the nearest vertex stands for the nearest point."""
+_NO_FACES: NDArray[np.uint32] = np.empty(0, np.uint32)
 
 
-@dataclass(frozen=True)
-class RestPoint:
+class RestPoint(NamedTuple):
     """The point of the rest surface that is nearest to a point p, in A."""
 
     position: Array
@@ -35,43 +32,114 @@ class RestPoint:
     """k_w there [N/m^3]."""
 
 
-class Surface:
+class Skin(NamedTuple):
+    """The rest surface: n vertices, m triangles."""
+
+    vertices: Array
+    """[m], shape (n, 3)."""
+    normals: Array
+    """Outward unit normals, shape (n, 3)."""
+    breathing: Array
+    """Share of the breathing excursion, shape (n,)."""
+    stiffness: Array
+    """k_w [N/m^3], shape (n,)."""
+    triangles: NDArray[np.uint32]
+    """Shape (m, 3)."""
+
+
+class SkinSurface:
     """Queries on a phantom's surface."""
 
     def __init__(self, model: PhantomModel) -> None:
-        self._model = model
-        corners = model.vertices[model.triangles]
-        sides = corners[:, 1:] - corners[:, :1]
-        self._triangles = np.ascontiguousarray(model.triangles, np.uint32)
+        triangles = model.triangles.astype(np.uint32)
+        self._skin = Skin(model.vertices, model.normals, model.breathing, model.stiffness, triangles)
         self._faces = _incident_faces(model)
-        # Maps an offset from the first corner to its barycentric coordinates, shape (m, 2, 3).
-        self._gradient = _gradient(model, np.linalg.pinv(sides.transpose(0, 2, 1)).astype(np.float64))
-        self.normals(np.zeros(len(model.vertices)), np.eye(3))  # compiles what it calls, and so do the next two
-        placed(model.vertices, np.eye(3), np.zeros(3))
-        self._fields = np.column_stack((model.breathing, model.stiffness))
-        self.nearest(model.vertices[0].copy())
+        self._gradient = _gradient(model)
+        self.nearest(model.vertices[0].copy())  # compiles it before it has a deadline
 
     def nearest(self, p: Array, excursion: float = 0.0) -> RestPoint:
         """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m]."""
-        model = self._model
-        distance, vertex = nearest_vertex(p, model.vertices)
-        faces = self._faces[vertex]
-        found = np.empty(8)
-        rest_point(
-            p, vertex, distance <= _FAR_M, excursion, faces, self._triangles, model.vertices, model.normals, self._fields, found
-        )
-        return RestPoint(found[0:3], found[3:6], float(found[6]), float(found[7]))
+        distance, vertex = nearest_vertex(p, self._skin.vertices)
+        faces = self._faces[vertex] if distance <= _FAR_M else _NO_FACES
+        position, normal, height, stiffness = rest_point(self._skin, faces, vertex, tuple(p.tolist()), excursion)
+        return RestPoint(np.array(position), np.array(normal), height, stiffness)
 
-    def normals(self, inward: Array, R: Array) -> Single:
-        """Unit vertex normals, in axes that `R` (3, 3) takes them to, one after the other, shape (3 n,).
+    def normals(self, inward: Array) -> Array:
+        """Unit normals of the surface whose vertices have moved `inward` by (n,) [m] along their normals, shape (3, n).
 
-        Of the surface whose vertices have moved `inward` by (n,) [m] along their normals: n + grad u, normalised. Exact for a
-        plane, and otherwise to first order in u times curvature.
+        n + grad u, normalised. Exact for a plane, and otherwise to first order in u times curvature.
         """
-        return tilted(inward, self._model.normals, *self._gradient, R)
+        tilted: Array = self._skin.normals.T + (self._gradient @ inward).reshape(3, -1)
+        tilted /= np.sqrt(np.einsum("ij,ij->j", tilted, tilted))
+        return tilted
 
 
-def _incident_faces(model: PhantomModel) -> list[Index]:
+@compiled
+def rest_point(
+    skin: Skin, faces: NDArray[np.uint32], vertex: int, p: Vector, excursion: float
+) -> tuple[Vector, Vector, float, float]:
+    """The point of the `faces` around a `vertex` that is nearest to `p` [m], as the fields of `RestPoint`.
+
+    At a breathing excursion [m]. It is interpolated between the corners of its face; without faces it is the vertex itself.
+    """
+    corner, weights = (vertex, vertex, vertex), (1.0, 0.0, 0.0)
+    shifted = subtract(p, scale(excursion * skin.breathing[vertex], row(skin.normals, vertex)))
+    least = np.inf
+    for face in faces:
+        a, b, c = skin.triangles[face, 0], skin.triangles[face, 1], skin.triangles[face, 2]
+        square, at = nearest_on_triangle(shifted, row(skin.vertices, a), row(skin.vertices, b), row(skin.vertices, c))
+        if square < least:
+            least, corner, weights = square, (int(a), int(b), int(c)), at
+    normal = _mean(skin.normals, corner, weights)
+    normal = divide(normal, norm(normal))
+    rest = _mean(skin.vertices, corner, weights)
+    breathing = stiffness = 0.0
+    for k in range(3):
+        breathing += weights[k] * skin.breathing[corner[k]]
+        stiffness += weights[k] * skin.stiffness[corner[k]]
+    position = add(rest, scale(excursion * breathing, normal))
+    offset = subtract(p, position)
+    return position, normal, dot(offset, normal) if len(faces) else norm(offset), stiffness
+
+
+@compiled
+def nearest_on_triangle(p: Vector, a: Vector, b: Vector, c: Vector) -> tuple[float, Vector]:
+    """Square distance [m^2] of `p` from a triangle, and the barycentric coordinates of its nearest point.
+
+    The point a + v (b - a) + w (c - a) is p's projection on the plane where that lies inside, else the nearest one of a side.
+    """
+    ab, ac, ap = subtract(b, a), subtract(c, a), subtract(p, a)
+    bc = subtract(c, b)
+    g11, g12, g22, r1, r2 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ab, ap), dot(ac, ap)
+    determinant = g11 * g22 - g12 * g12
+    v, w = (g22 * r1 - g12 * r2) / determinant, (g11 * r2 - g12 * r1) / determinant
+    if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
+        return _square_distance(ap, ab, ac, v, w), (1.0 - v - w, v, w)
+    on_ab, on_ac = min(max(r1 / g11, 0.0), 1.0), min(max(r2 / g22, 0.0), 1.0)
+    on_bc = min(max(dot(bc, subtract(p, b)) / dot(bc, bc), 0.0), 1.0)
+    least, best = np.inf, (1.0, 0.0, 0.0)
+    for v, w in ((on_ab, 0.0), (0.0, on_ac), (1.0 - on_bc, on_bc)):
+        square = _square_distance(ap, ab, ac, v, w)
+        if square < least:
+            least, best = square, (1.0 - v - w, v, w)
+    return least, best
+
+
+@compiled
+def _square_distance(ap: Vector, ab: Vector, ac: Vector, v: float, w: float) -> float:
+    """|ap - v ab - w ac|^2."""
+    offset = subtract(ap, add(scale(v, ab), scale(w, ac)))
+    return dot(offset, offset)
+
+
+@compiled
+def _mean(table: Array, corner: tuple[int, int, int], weights: Vector) -> Vector:
+    """The rows of three corners, weighted."""
+    mean = add(scale(weights[0], row(table, corner[0])), scale(weights[1], row(table, corner[1])))
+    return add(mean, scale(weights[2], row(table, corner[2])))
+
+
+def _incident_faces(model: PhantomModel) -> list[NDArray[np.uint32]]:
     """The triangles at each vertex."""
     corner = model.triangles.ravel()
     order = np.argsort(corner, kind="stable")
@@ -79,13 +147,11 @@ def _incident_faces(model: PhantomModel) -> list[Index]:
     return np.split((order // 3).astype(np.uint32), first)
 
 
-def _gradient(model: PhantomModel, flat: Array) -> tuple[Index, Index, Array]:
-    """Surface gradient [1/m] of a field at the vertices, area-weighted from the triangles: rows of vertices in CSR form.
-
-    Where each begins, (n + 1,), the vertices it takes the field at, (k,), and their three slopes, (k, 3).
-    """
+def _gradient(model: PhantomModel) -> sparse.csr_array:
+    """Surface gradient [1/m] of a field at the vertices, area-weighted from triangles, shape (3 n, n): all x, all y, all z."""
     m, n = len(model.triangles), len(model.vertices)
     sides = model.vertices[model.triangles[:, 1:]] - model.vertices[model.triangles[:, :1]]
+    flat = np.linalg.pinv(sides.transpose(0, 2, 1))  # an offset from the first corner to its barycentric coordinates, (m, 2, 3)
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     total = np.bincount(model.triangles.ravel(), np.repeat(area, 3), n)
     slopes = np.concatenate((-flat.sum(axis=1, keepdims=True), flat), axis=1)  # of the three hat functions, (m, 3, 3)
@@ -94,118 +160,4 @@ def _gradient(model: PhantomModel, flat: Array) -> tuple[Index, Index, Array]:
     rows = np.broadcast_to(model.triangles[:, :, None], (m, 3, 3)).ravel()
     columns = np.broadcast_to(model.triangles[:, None, :], (m, 3, 3)).ravel()
     axes = [sparse.csr_array((values[..., axis].ravel(), (rows, columns)), shape=(n, n)) for axis in range(3)]
-    slope = np.column_stack([part.data for part in axes])
-    return axes[0].indptr.astype(np.uint32), axes[0].indices.astype(np.uint32), slope
-
-
-@compiled
-def tilted(inward: Array, normals: Array, indptr: Index, indices: Index, slope: Array, R: Array) -> Single:
-    """The unit normals of a deformed surface, turned by `R`; see `Surface.normals` and `_gradient`."""
-    out = np.empty(normals.size, np.float32)
-    for i in range(inward.shape[0]):
-        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
-        for j in range(indptr[i], indptr[i + 1]):
-            u = inward[indices[j]]
-            x += slope[j, 0] * u
-            y += slope[j, 1] * u
-            z += slope[j, 2] * u
-        length = sqrt(x * x + y * y + z * z)
-        x, y, z = x / length, y / length, z / length
-        for k in range(3):
-            out[3 * i + k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z
-    return out
-
-
-@compiled
-def placed(vertices: Array, R: Array, p: Array) -> Single:
-    """Points (n, 3) in other axes and from another origin, R x + p, one after the other, shape (3 n,)."""
-    out = np.empty(vertices.size, np.float32)
-    for i in range(vertices.shape[0]):
-        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        for k in range(3):
-            out[3 * i + k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + p[k]
-    return out
-
-
-@compiled
-def nearest_on_faces(p: Array, faces: Index, triangles: Index, vertices: Array, weights: Array) -> int:
-    """The face, among some, that is nearest to `p` (3,); `weights` (3,) get the barycentric coordinates of its nearest point."""
-    best = -1
-    least = np.inf
-    for face in faces:
-        a, b, c = vertices[triangles[face, 0]], vertices[triangles[face, 1]], vertices[triangles[face, 2]]
-        d11 = d12 = d22 = d1 = d2 = 0.0
-        for k in range(3):
-            ab, ac, ap = b[k] - a[k], c[k] - a[k], p[k] - a[k]
-            d11 += ab * ab
-            d12 += ab * ac
-            d22 += ac * ac
-            d1 += ab * ap
-            d2 += ac * ap
-        determinant = d11 * d22 - d12 * d12
-        v, w = (d22 * d1 - d12 * d2) / determinant, (d11 * d2 - d12 * d1) / determinant
-        if v < 0.0 or w < 0.0 or v + w > 1.0:  # outside: the nearest point is on one of the sides
-            on_ab = min(max(d1 / d11, 0.0), 1.0)
-            on_ac = min(max(d2 / d22, 0.0), 1.0)
-            # Along bc, from b: (p - b).(c - b) = (ap - ab).(ac - ab).
-            on_bc = min(max((d2 - d1 - d12 + d11) / (d11 - 2.0 * d12 + d22), 0.0), 1.0)
-            closest = np.inf
-            for tv, tw in ((on_ab, 0.0), (0.0, on_ac), (1.0 - on_bc, on_bc)):
-                distance = _square_distance(p, a, b, c, tv, tw)
-                if distance < closest:
-                    closest, v, w = distance, tv, tw
-        distance = _square_distance(p, a, b, c, v, w)
-        if distance < least:
-            least, best = distance, int(face)
-            weights[0], weights[1], weights[2] = 1.0 - v - w, v, w
-    return best
-
-
-@compiled
-def rest_point(
-    p: Array,
-    vertex: int,
-    near: bool,
-    excursion: float,
-    faces: Index,
-    triangles: Index,
-    vertices: Array,
-    normals: Array,
-    fields: Array,
-    out: Array,
-) -> None:
-    """The rest point under `p` (3,), near a vertex with its `faces`: position, unit normal, height and stiffness in `out` (8,).
-
-    Where `p` is not `near`, the vertex itself. `fields` (n, 2): share of the breathing excursion, k_w [N/m^3].
-    """
-    weights = np.empty(3)
-    a = b = c = vertex
-    weights[0], weights[1], weights[2] = 1.0, 0.0, 0.0
-    if near:
-        shifted = np.empty(3)
-        for k in range(3):
-            shifted[k] = p[k] - excursion * fields[vertex, 0] * normals[vertex, k]
-        face = nearest_on_faces(shifted, faces, triangles, vertices, weights)
-        a, b, c = triangles[face, 0], triangles[face, 1], triangles[face, 2]
-    length = height = distance = 0.0
-    for k in range(3):
-        out[3 + k] = weights[0] * normals[a, k] + weights[1] * normals[b, k] + weights[2] * normals[c, k]
-        length += out[3 + k] * out[3 + k]
-    lift = excursion * (weights[0] * fields[a, 0] + weights[1] * fields[b, 0] + weights[2] * fields[c, 0])
-    for k in range(3):
-        out[3 + k] /= sqrt(length)
-        out[k] = weights[0] * vertices[a, k] + weights[1] * vertices[b, k] + weights[2] * vertices[c, k] + lift * out[3 + k]
-        height += (p[k] - out[k]) * out[3 + k]
-        distance += (p[k] - out[k]) ** 2
-    out[6] = height if near else sqrt(distance)
-    out[7] = weights[0] * fields[a, 1] + weights[1] * fields[b, 1] + weights[2] * fields[c, 1]
-
-
-@compiled
-def _square_distance(p: Array, a: Array, b: Array, c: Array, v: float, w: float) -> float:
-    """Of `p` from the point a + v (b - a) + w (c - a)."""
-    total = 0.0
-    for k in range(3):
-        offset = p[k] - (a[k] + v * (b[k] - a[k]) + w * (c[k] - a[k]))
-        total += offset * offset
-    return total
+    return sparse.csr_array(sparse.vstack(axes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, is_dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ from palpate_bus.messages.stamps import header
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_models.frames import matrix
-from palpate_models.load import load_scenario, redacted
-from palpate_models.scenario import Scenario
-from palpate_tissue.backends.fmu.mapping import MapError
-from palpate_tissue.backends.fmu.service import chosen_role, create
+from palpate_models.load import ScenarioError, load_scenario, redacted
+from palpate_models.scenario import Scenario, TissueChoice
+from palpate_tissue.backends.fmu.mapping import MapError, load_map
+from palpate_tissue.backends.fmu.service import create, hosted
+from palpate_tissue.backends.winkler.service import create as create_winkler
 
 SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.amplitude_m=0.003", "phantom.pose.true.rpy_rad=[0.05, -0.1, 0.3]")
 
@@ -27,6 +29,11 @@ SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.amplitude_m=0.003", "phan
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
     return load_scenario("rlq_guarding", SETTINGS)
+
+
+def chosen(scenario: Scenario, **fields: str) -> Scenario:
+    """The scenario with an FMU as its tissue."""
+    return scenario.model_copy(update={"tissue": TissueChoice(implementation="fmu", **fields)})
 
 
 class Playback:
@@ -69,21 +76,19 @@ def assert_alike(topic: str, ours: Any, theirs: Any, skip: tuple[str, ...] = ())
 
 
 @pytest.mark.parametrize("version", [3, 2])
-def test_it_sends_what_the_native_tissue_sends(
-    version: int, scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    native_tissue = pytest.importorskip("palpate_tissue.service").create(scenario)
+def test_it_sends_what_the_native_tissue_sends(version: int, scenario: Scenario, tmp_path: Path) -> None:
+    native_tissue = create_winkler(scenario)
     if version == 2:  # by file; FMI 3.0 is built on the fly
-        monkeypatch.setenv("PALPATE_FMU", str(build_scenario_fmu(scenario, tmp_path / "a.fmu", 2, [native()])))
-    hosted = create(scenario)
-    assert hosted.role == chosen_role() == "tissue"
-    begin, expected = hosted.start(), native_tissue.start()
+        scenario = chosen(scenario, fmu=str(build_scenario_fmu(scenario, tmp_path / "a.fmu", 2, [native()])))
+    service = create(scenario)
+    assert service.role == "tissue"
+    begin, expected = service.start(), native_tissue.start()
     assert begin.keys() == expected.keys()
     assert_alike("truth/phantom", begin["truth/phantom"], expected["truth/phantom"])
     inbox, peak = Playback(), 0.0
     for k in range(600):
         inbox.tool = tool(scenario, k)
-        ours, theirs = hosted.step(k * MS, inbox), native_tissue.step(k * MS, inbox)  # type: ignore[arg-type]
+        ours, theirs = service.step(k * MS, inbox), native_tissue.step(k * MS, inbox)  # type: ignore[arg-type]
         assert ours.keys() == theirs.keys()
         for topic in ours:
             rest = version == 2 and topic == "sim/surface"
@@ -91,21 +96,42 @@ def test_it_sends_what_the_native_tissue_sends(
             assert_alike(topic, ours[topic], theirs[topic], ("peak_force", *(("vertices", "normals") if rest else ())))
         peak = max(peak, abs(theirs["sim/contact_wrench"].wrench.force.z))
     assert peak > 5
-    facts = hosted.finish()
+    facts = service.finish()
     assert facts["fmi_version"] == f"{version}.0"
     assert facts["steps"] == 600
 
 
-def test_another_role_needs_a_file(scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_of_another_role_is_for_a_file_of_ones_own(scenario: Scenario, tmp_path: Path) -> None:
     path = tmp_path / "map.yaml"
     path.write_text("role: assessment\noutputs: {}\n")
-    monkeypatch.setenv("PALPATE_FMU_MAP", str(path))
-    assert chosen_role() == "assessment"
-    with pytest.raises(MapError, match="which FMU plays the role assessment"):
-        create(redacted(scenario))
+    with pytest.raises(MapError, match=r"fmu_map = .*map\.yaml: its role is assessment.*--service"):
+        create(chosen(scenario, fmu_map=str(path)))
+    fmu = build_scenario_fmu(scenario, tmp_path / "a.fmu", 3, [native()])
+    with pytest.raises(MapError, match="lacks topics that the role assessment must send"):  # so it was asked as an assessment
+        hosted(fmu, load_map(path), redacted(scenario))
 
 
-def test_a_missing_file_is_said(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PALPATE_FMU", "nowhere.fmu")
-    with pytest.raises(MapError, match=r"PALPATE_FMU=nowhere\.fmu: no such file"):
-        create(scenario)
+def test_a_map_of_ones_own_is_read_from_the_scenario(scenario: Scenario, tmp_path: Path) -> None:
+    path = tmp_path / "map.yaml"
+    with resources.as_file(resources.files("palpate_tissue.backends.fmu") / "maps" / "tissue.yaml") as packaged:
+        path.write_text(packaged.read_text(encoding="utf-8") + "parameters: {friction: 0.0, stiffness_scale: 2.0}\n")
+    inbox, forces = Playback(), []
+    for case in (chosen(scenario), chosen(scenario, fmu_map=str(path))):
+        service = create(case)
+        for k in range(300):
+            inbox.tool = tool(scenario, k)
+            sent = service.step(k * MS, inbox)  # type: ignore[arg-type]
+        forces.append(sent["sim/contact_wrench"].wrench.force.z)  # type: ignore[union-attr]
+        service.finish()
+    assert forces[1] > 1.5 * forces[0] > 0
+
+
+def test_a_missing_file_is_said(scenario: Scenario) -> None:
+    with pytest.raises(MapError, match=r"FMU nowhere\.fmu: no such file"):
+        create(chosen(scenario, fmu="nowhere.fmu"))
+
+
+def test_a_file_without_the_choice_is_refused() -> None:
+    for field in ("fmu", "fmu_map"):
+        with pytest.raises(ScenarioError, match=r"need tissue\.implementation: fmu"):
+            load_scenario("rlq_guarding", (f"tissue.{field}=x",))

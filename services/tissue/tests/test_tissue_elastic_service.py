@@ -8,7 +8,8 @@ import pytest
 from palpate.run.implementations import chosen_processes, chosen_services
 from palpate.run.processes import ServiceProcess
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages.codec import decode, encode, message_type
+from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
+from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
 from palpate_models.load import load_scenario
 from palpate_models.phantom import flat_phantom
@@ -42,10 +43,8 @@ class OneTopic:
 
 
 def tool_state(t, p, radius=0.015):
-    point, vector = message_type("geometry_msgs/msg/Point"), message_type("geometry_msgs/msg/Vector3")
-    pose = message_type("geometry_msgs/msg/Pose")(point(*p), message_type("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0))
-    twist = message_type("geometry_msgs/msg/Twist")(vector(0.0, 0.0, 0.0), vector(0.0, 0.0, 0.0))
-    return message_type("palpation_msgs/msg/ToolState")(header(t, "world"), pose, twist, radius)
+    pose = Pose(Point(*p), Quaternion(0.0, 0.0, 0.0, 1.0))
+    return ToolState(header(t, "world"), pose, Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), radius)
 
 
 def test_the_scenario_chooses_it_for_process_and_composition():

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from palpate_benchmarks import tissue as bench
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages.codec import decode, encode, message_type
+from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
+from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.frames import matrix
 from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Breathing, Lesion, Phantom, Pose, Registration, Scenario
-from palpate_tissue.service import create
-from palpate_tissue.surface import Surface, nearest_on_faces
+from palpate_models.scenario import Breathing, Lesion, Phantom, Registration, Scenario
+from palpate_models.scenario import Pose as TruePose
+from palpate_tissue.backends.winkler.service import create
+from palpate_tissue.surface import SkinSurface, nearest_on_triangle
 
 LESION = Lesion(centre_m=(-0.02, 0.0))
 
 
 def tool_state(t, p, v=(0.0, 0.0, 0.0), radius=0.015):
-    point, vector = message_type("geometry_msgs/msg/Point"), message_type("geometry_msgs/msg/Vector3")
-    pose = message_type("geometry_msgs/msg/Pose")(point(*p), message_type("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0))
-    twist = message_type("geometry_msgs/msg/Twist")(vector(*v), vector(0.0, 0.0, 0.0))
-    return message_type("palpation_msgs/msg/ToolState")(header(t, "world"), pose, twist, radius)
+    pose = Pose(Point(*p), Quaternion(0.0, 0.0, 0.0, 1.0))
+    return ToolState(header(t, "world"), pose, Twist(Vector3(*v), Vector3(0.0, 0.0, 0.0)), radius)
 
 
 class OneTopic:
@@ -102,10 +101,10 @@ def test_truth_tells_the_phantom():
 
 def test_wrench_and_depth_follow_the_true_pose_of_the_patient():
     """Turning patient and tool together turns the wrench; the registration error changes nothing."""
-    turned = Pose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.2, -0.1, 0.5))
+    turned = TruePose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.2, -0.1, 0.5))
     cases = [
         scenario(),
-        scenario(pose=Registration(true=turned, error=Pose(xyz_m=(0.01, 0.02, 0.03), rpy_rad=(0.1, 0.0, 0.0)))),
+        scenario(pose=Registration(true=turned, error=TruePose(xyz_m=(0.01, 0.02, 0.03), rpy_rad=(0.1, 0.0, 0.0)))),
     ]
     poses = [matrix(case.phantom.pose.true) for case in cases]
     outs = [press(create(case), X_WA, at=(0.0053, 0.001)) for case, X_WA in zip(cases, poses, strict=True)]
@@ -164,35 +163,34 @@ def test_report_counts_contact():
 
 def test_nearest_rest_point_against_brute_force():
     model = build_phantom(Phantom(), 0)
-    surface = Surface(model)
+    surface = SkinSurface(model)
     rng = np.random.default_rng(0)
-    triangles = model.triangles.astype(np.uint32)
-    everything, weights = np.arange(len(triangles), dtype=np.uint32), np.zeros(3)
+    corners = model.vertices[model.triangles]
     for p in np.column_stack((rng.uniform(-0.1, 0.1, (40, 2)), rng.uniform(-0.03, 0.05, 40))):
-        face = nearest_on_faces(p, everything, triangles, model.vertices, weights)
-        brute = np.linalg.norm(p - weights @ model.vertices[triangles[face]])
+        brute = np.sqrt(min(nearest_on_triangle(tuple(p), *map(tuple, triangle))[0] for triangle in corners))
         assert abs(surface.nearest(p).height) == pytest.approx(brute, abs=1e-5)
 
 
 def test_nearest_point_of_a_triangle_by_sampling():
     rng = np.random.default_rng(1)
-    triangle, one, weights = np.array([[0, 1, 2]], dtype=np.uint32), np.zeros(1, np.uint32), np.zeros(3)
     v, w = np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 201))
     inside = v + w <= 1
     grid = np.column_stack(((1 - v - w)[inside], v[inside], w[inside]))
     for _ in range(200):
         corners, p = rng.normal(size=(3, 3)), 2 * rng.normal(size=3)
-        nearest_on_faces(p, one, triangle, corners, weights)
-        assert weights.min() >= -1e-12
-        assert weights.sum() == pytest.approx(1)
+        square, weights = nearest_on_triangle(tuple(p), *map(tuple, corners))
+        assert min(weights) >= -1e-12
+        assert sum(weights) == pytest.approx(1)
+        distance = np.linalg.norm(np.array(weights) @ corners - p)
+        assert distance == pytest.approx(np.sqrt(square))
         sampled = np.linalg.norm(grid @ corners - p, axis=1).min()
-        assert np.linalg.norm(weights @ corners - p) == pytest.approx(sampled, abs=1e-2)
-        assert np.linalg.norm(weights @ corners - p) <= sampled + 1e-12
+        assert distance == pytest.approx(sampled, abs=1e-2)
+        assert distance <= sampled + 1e-12
 
 
 def test_nearest_rest_point_breathes():
     model = build_phantom(Phantom(), 0)
-    surface = Surface(model)
+    surface = SkinSurface(model)
     p = np.array((0.0, 0.02, 0.02))
     assert surface.nearest(p).height - surface.nearest(p, 0.006).height == pytest.approx(0.006, rel=0.05)
 
@@ -208,8 +206,7 @@ def test_normals_of_a_dent_are_those_of_the_mesh():
         np.add.at(mesh, model.triangles[:, k], cross)
     mesh /= np.linalg.norm(mesh, axis=1, keepdims=True)
     near = (np.abs(model.vertices[:, :2]) < 0.08).all(axis=1) & (model.normals[:, 2] > 0)
-    turn = Rotation.from_euler("xyz", (0.3, -0.2, 0.5)).as_matrix()
-    normals = Surface(model).normals(inward, turn).reshape(-1, 3) @ turn
+    normals = SkinSurface(model).normals(inward).T
     angle = np.degrees(np.arccos(np.clip((normals * mesh).sum(axis=1), -1, 1)))
     assert angle[near].max() < 2
 

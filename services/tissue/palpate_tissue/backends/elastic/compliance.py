@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Lesion
 from palpate_tissue.backends.elastic.cache import content_key, remembered
@@ -28,7 +29,6 @@ from palpate_tissue.backends.elastic.kernel import LayerKernel
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W, ModulusField
 from palpate_tissue.backends.elastic.solid import Grid, graded_grid, skin_compliance
 
-Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 PITCH_M = 0.0125

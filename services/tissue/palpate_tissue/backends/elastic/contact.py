@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
+
 Mask = NDArray[np.bool_]
 
 _GUESSES = 25

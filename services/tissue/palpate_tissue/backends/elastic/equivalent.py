@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
 from palpate_models.phantom.field import edge_distance
 from palpate_models.scenario import Lesion
 from palpate_tissue.backends.elastic.cache import content_key, remembered
 from palpate_tissue.backends.elastic.compliance import Compliance, uniform_compliance
 from palpate_tissue.backends.elastic.contact import ContactSolver
-
-Array = NDArray[np.float64]
 
 LEAST_EFFECT = 0.02
 """A lesion that changes the skin's stiffness by less nowhere is not in the truth's mask."""

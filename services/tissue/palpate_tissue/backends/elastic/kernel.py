@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import simpson
 from scipy.interpolate import CubicSpline
 from scipy.special import j0
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 SELF_WEIGHT = 3.92
 """Displacement that a vertex's own pressure adds, over its force / sqrt(area): what makes the sum of 1/r over a lattice equal the
@@ -61,7 +60,7 @@ class LayerKernel:
         return near if self._base is None else near - self._by_base(distance)
 
     def at_own_place(self, area: Array) -> Array:
-        """Of vertices of `area` [m^2], k at their own place [1/m], same shape."""
+        """K at a vertex's own place [1/m], for vertices of `area` [m^2], same shape."""
         own = SELF_WEIGHT / np.sqrt(area)
         return own if self._base is None else own - self._by_base(np.zeros_like(area))
 

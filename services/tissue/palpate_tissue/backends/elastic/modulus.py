@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
 from palpate_models.phantom.field import lesion_field, smoothstep
 from palpate_models.scenario import Lesion
 from palpate_tissue.friction import REFERENCE_E, REFERENCE_K_W
-
-Array = NDArray[np.float64]
 
 YOUNG_OVER_K_W = REFERENCE_E / REFERENCE_K_W
 """Young's modulus over foundation modulus of a wall that is equally stiff at 10 mm depth [m]."""

@@ -33,4 +33,4 @@ def create(scenario: Scenario, pitch_m: float = PITCH_M) -> TissueService:
         "lesion_depths_m": [lesion.depth_m for lesion in phantom.lesions],
         "equivalent_stiffness_ratio": round(float((shown.stiffness / shown.background).max()), 3),
     }
-    return TissueService(shown, tissue, phantom.pose.true, facts)
+    return TissueService(tissue, shown, phantom.pose.true, facts)

@@ -14,9 +14,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel, flat_phantom
 from palpate_models.scenario import Breathing, Lesion, Stiffness
 from palpate_tissue.backends.elastic.compliance import POISSON, Compliance, compliance
@@ -24,7 +24,6 @@ from palpate_tissue.backends.elastic.contact import ContactSolver
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 
-Array = NDArray[np.float64]
 Profile = Literal["sphere", "paraboloid"]
 
 

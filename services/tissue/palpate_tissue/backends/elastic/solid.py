@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
+
 IntArray = NDArray[np.intp]
 
 

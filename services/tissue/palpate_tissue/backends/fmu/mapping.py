@@ -25,7 +25,7 @@ class MapError(ValueError):
     """A map that does not fit the contract or the FMU. Names the entry and what is allowed."""
 
 
-class Kind(StrEnum):
+class FrameChange(StrEnum):
     """How values change with the frame."""
 
     PLAIN = "plain"
@@ -36,7 +36,7 @@ class Kind(StrEnum):
 class _Entry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: Kind = Kind.PLAIN
+    kind: FrameChange = FrameChange.PLAIN
     unit: str | None = None
     """Unit of the topic's field, where the contract does not give one."""
 

@@ -16,17 +16,16 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.settings import Settings
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
-from palpate_models.frames import matrix
+from palpate_models.frames import Array, matrix
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
-from palpate_tissue.backends.fmu.wiring import Array, Wiring
+from palpate_tissue.backends.fmu.wiring import Wiring
 
-_log = logging.getLogger("palpate.fmu_host")
+_log = logging.getLogger("palpate.tissue")
 
 MOST_STEPS = 1000
 """Steps an FMU of fixed step size may be behind in one call; more is a mistake."""
@@ -110,12 +109,6 @@ def host(role: str, *arguments: Any, **options: Any) -> FmuService:
     return service
 
 
-def chosen_role() -> str:
-    """The role of this process: that of the map that PALPATE_FMU_MAP names, or tissue."""
-    path = Settings.read().fmu_map
-    return load_map(path).role if path else "tissue"
-
-
 def packaged_map(name: str) -> FmuMap:
     """A map that comes with this package."""
     with resources.as_file(resources.files("palpate_tissue.backends.fmu").joinpath("maps", f"{name}.yaml")) as path:
@@ -123,25 +116,30 @@ def packaged_map(name: str) -> FmuMap:
 
 
 def create(scenario: Scenario) -> FmuService:
-    """The FMU that PALPATE_FMU names, tied by the map that PALPATE_FMU_MAP names.
+    """The FMU `tissue.fmu` of a scenario, tied to the tissue's topics by the map `tissue.fmu_map`.
 
-    By default the abdomen of the scenario, built here, in the role of the tissue.
+    By default the abdomen of the scenario, built here. Raises MapError for a map of another role: see `hosted`.
     """
-    settings = Settings.read()
-    table = load_map(settings.fmu_map) if settings.fmu_map else None
-    if settings.fmu is None:
-        if table is not None and table.role != "tissue":
-            raise MapError(f"PALPATE_FMU is not set: which FMU plays the role {table.role}?")
-        with tempfile.TemporaryDirectory() as folder:
-            fmu_file = build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()])
-            return _host(fmu_file, table, scenario)
-    return _host(settings.fmu, table, scenario)
+    chosen = scenario.tissue
+    table = load_map(Path(chosen.fmu_map)) if chosen.fmu_map else None
+    if table is not None and table.role != "tissue":
+        raise MapError(
+            f"tissue.fmu_map = {chosen.fmu_map}: its role is {table.role}, not tissue; "
+            "for another role use `hosted` in a file of your own (--service ROLE=FILE.py)"
+        )
+    if chosen.fmu:
+        return hosted(Path(chosen.fmu), table, scenario)
+    with tempfile.TemporaryDirectory() as folder:
+        return hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
 
 
-def _host(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
-    """The patient's true pose is in the scenario of the tissue alone: other roles get a scenario with the registered one."""
+def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
+    """An FMU in the role of its map, by default the tissue's. Raises MapError, FmuError.
+
+    The frame `abdomen` is the patient's true one for the tissue; the scenario that other roles get has the registered one there.
+    """
     if not fmu_file.is_file():
-        raise MapError(f"PALPATE_FMU={fmu_file}: no such file")
+        raise MapError(f"FMU {fmu_file}: no such file")
     table = table or packaged_map("tissue_fmi2" if _fmi_version(fmu_file) == "2.0" else "tissue")
     X_WA = matrix(scenario.phantom.pose.true)
     frames = {"world": np.eye(4), "abdomen": X_WA}

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.codec import Message
 from palpate_fmu.instance import FmuInstance, FmuVariable, Port
-from palpate_models.frames import inverse
+from palpate_models.frames import Array, inverse
 from palpate_tissue.backends.fmu.fields import Make, maker, reader, size
-from palpate_tissue.backends.fmu.mapping import FmuMap, InputEntry, Kind, MapError, OutputEntry, _Entry
+from palpate_tissue.backends.fmu.mapping import FmuMap, FrameChange, InputEntry, MapError, OutputEntry, _Entry
 from palpate_tissue.backends.fmu.units import fmu_unit, parse_unit
 
-Array = NDArray[np.float64]
 Change = Callable[[Any], Any]
 
 
@@ -138,7 +137,7 @@ class Wiring:
 
     def _turn(self, entry: _Entry, topic: Topic, where: str, into_fmu: bool) -> Change:
         """From the topic's frame to the FMU's, or back. Points and vectors only."""
-        if entry.kind is Kind.PLAIN:
+        if entry.kind is FrameChange.PLAIN:
             return _same
         ours, theirs = self._table.frame, topic.frame
         for frame, owner in ((ours, "the map"), (theirs, f"the contract for {topic.name}")):
@@ -149,7 +148,7 @@ class Wiring:
         X = inverse(self._frames[str(ours)]) @ self._frames[str(theirs)]
         X = X if into_fmu else inverse(X)
         turned = np.ascontiguousarray(X[:3, :3].T)
-        moved = X[:3, 3] if entry.kind is Kind.POINT else np.zeros(3)
+        moved = X[:3, 3] if entry.kind is FrameChange.POINT else np.zeros(3)
         return lambda values: np.reshape(values, (-1, 3)) @ turned + moved
 
     def _scale(self, entry: _Entry, topic: Topic, path: str, variable: FmuVariable, where: str, into_fmu: bool) -> Change:

@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
+from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Stiffness
-
-Array = NDArray[np.float64]
 
 STEP_LIMIT = 1.8
 """Largest dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps and more."""

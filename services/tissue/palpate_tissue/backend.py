@@ -1,0 +1,60 @@
+"""What the service asks of the physics behind it: one class to write for another tissue."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models.frames import Array
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Breathing
+
+
+class TissueBackend(ABC):
+    """A soft body with a skin of n vertices that a sphere presses. Everything is in the abdomen frame A and in SI units."""
+
+    touching: bool = False
+    """Whether the sphere holds a vertex after the step."""
+
+    def __init__(self, model: PhantomModel, breathing: Breathing, dt: float) -> None:
+        self.model = model
+        """The body at rest."""
+        self.dt = dt
+        """Period of a step [s]."""
+        self._amplitude = breathing.amplitude_m
+        self._pulse = 2 * math.pi * breathing.rate_per_min / 60
+
+    @abstractmethod
+    def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
+        """Advances by one period to time `t_s` [s] with the sphere's centre at `p_A` [m], and returns the wrench on it.
+
+        `v_A` [m/s] and `w_A` [rad/s] are the sphere's velocities, `radius` [m]. The result is the force [N] that the tissue
+        exerts on the sphere and its torque about the centre [N m], each of shape (3,), the mean over the period. Raises
+        ValueError for a position that is not finite.
+        """
+
+    @abstractmethod
+    def idle(self, t_s: float) -> None:
+        """Advances by one period to time `t_s` [s] with no sphere anywhere."""
+
+    @property
+    @abstractmethod
+    def contacts(self) -> NDArray[np.intp]:
+        """Vertices in contact after the step, shape (k,)."""
+
+    @property
+    @abstractmethod
+    def inward(self) -> Array:
+        """How far each vertex is from its place at rest [m] along its inward normal, breathing included, shape (n,)."""
+
+    @property
+    def deformed_vertices(self) -> Array:
+        """The surface as it is now [m], shape (n, 3)."""
+        return self.model.vertices - self.inward[:, None] * self.model.normals
+
+    def excursion(self, t_s: float) -> float:
+        """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
+        return self._amplitude * math.sin(self._pulse * t_s) if self._amplitude else 0.0

@@ -1,0 +1,1 @@
+"""The Winkler-Pasternak tissue: springs under the skin, coupled by its shear."""

@@ -1,0 +1,154 @@
+"""One step of the Winkler-Pasternak tissue, compiled: the equations of the README, vertex by vertex.
+
+    u* = u - h C^-1 K (u - sum_k y_k)         `move_freely`
+    u  = max(u*, w),  f = C (u - u*) / h      `hold`: w is where the sphere holds a vertex
+    y_k = e_k y_k + (1 - e_k) g_k u           `relax`
+
+The FMU's C source has the same equations.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models.compiled import compiled
+from palpate_models.frames import Array
+from palpate_tissue.friction import Bristle, Push, Sphere, rub
+from palpate_tissue.near import RIM
+from palpate_tissue.vectors import add, divide, dot, row, scale, subtract
+
+Index = NDArray[np.uint16] | NDArray[np.uint32]
+"""Unsigned: a signed index may be negative to numba, and looking each time doubles the cost of the field's step."""
+_USUAL = 7
+"""Entries of most rows of the field's matrix: a vertex and its six neighbours."""
+
+
+class Wall(NamedTuple):
+    """The wall: n vertices and b Prony branches, with its matrices for steps of h."""
+
+    u: Array
+    """Displacement along the inward normals [m], shape (n,). Changed in place."""
+    y: Array
+    """What of it has relaxed [m], shape (b, n). Changed in place."""
+    indptr: Index
+    indices: Index
+    rate: Array
+    """A = -h C^-1 K, a matrix of shape (n, n) in CSR form."""
+    decay: Array
+    """e_k = exp(-h / tau_k), shape (b,)."""
+    feed: Array
+    """(1 - e_k) g_k, shape (b,)."""
+    h: float
+    """[s]"""
+
+
+class Patch(NamedTuple):
+    """Vertices that the sphere might hold while its centre stays near `origin`; m of them."""
+
+    origin: Array
+    """[m], shape (3,)."""
+    vertex: NDArray[np.uint32]
+    """Which vertices, shape (m,)."""
+    n: Array
+    """Their outward normals, shape (m, 3)."""
+    X: Array
+    """Their positions from `origin` [m], shape (m, 3)."""
+    beta: Array
+    """Their share of the breathing excursion, shape (m,)."""
+    gain: Array
+    """C / h [N/m], shape (m,)."""
+    f: Array
+    """Their contact forces along the inward normals after the step [N], shape (m,). Changed in place."""
+
+
+@compiled
+def step(
+    wall: Wall, patch: Patch, bristle: Bristle, motion: Array, radius: float, excursion: float, disturbed: bool, wrench: Array
+) -> bool:
+    """One step at a breathing `excursion` [m]. Whether the sphere touches: then `wrench` (6,) gets force and torque on it.
+
+    `motion` (3, 3) has the position [m], the velocity [m/s] and the angular velocity [rad/s] of the sphere of `radius` [m] as
+    rows; `wrench` force [N] and torque about the centre [N m], and is left alone out of contact. A wall that was never
+    `disturbed` is at rest exactly, and stays so until it is touched.
+    """
+    sphere = Sphere(row(motion, 0), row(motion, 1), row(motion, 2), radius)
+    if disturbed:
+        move_freely(wall)
+    touching, push = hold(wall, patch, sphere, excursion)
+    if touching:
+        rub(bristle, sphere, push, wall.h, wrench)
+    if disturbed or touching:
+        relax(wall)
+    return touching
+
+
+@compiled
+def move_freely(wall: Wall) -> None:
+    """The wall as it moves by itself: u += A (u - sum_k y_k)."""
+    u, rate, indices = wall.u, wall.rate, wall.indices
+    strain = u.copy()
+    for k in range(len(wall.y)):
+        strain -= wall.y[k]
+    begin = wall.indptr[0]
+    for i in range(len(u)):
+        end = wall.indptr[i + 1]
+        total = u[i]
+        if end - begin == _USUAL:  # the compiler unrolls it: a quarter faster
+            for j in range(_USUAL):
+                total += rate[begin + j] * strain[indices[begin + j]]
+        else:
+            for j in range(begin, end):
+                total += rate[j] * strain[indices[j]]
+        u[i] = total
+        begin = end
+
+
+@compiled
+def hold(wall: Wall, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bool, Push]:
+    """Holds the vertices under the sphere on its surface, at a breathing `excursion` [m]. Whether there are any, and the push.
+
+    A vertex X of outward normal n moves along it; with d = p - X and s = -d.n it meets the sphere's lower side at
+    w = s + c, c^2 = R^2 - |d|^2 + s^2. The frictionless sphere pushes along its own normal there, f (n + (d + s n) / c):
+    f is the part along n, and the rest is borne by the tissue's guidance. As f holds the vertex exactly on the sphere, tool and
+    field exchange the same work.
+    """
+    u, R = wall.u, sphere.radius
+    p = subtract(sphere.p, (patch.origin[0], patch.origin[1], patch.origin[2]))
+    load = 0.0
+    force = normal = moment = (0.0, 0.0, 0.0)
+    for k in range(len(patch.vertex)):
+        patch.f[k] = 0.0
+        i, n = patch.vertex[k], row(patch.n, k)
+        d = subtract(p, row(patch.X, k))
+        s = -dot(n, d)
+        square = R * R - dot(d, d) + s * s
+        if square <= R * R * RIM * RIM:
+            continue
+        c = sqrt(square)
+        w = s + c
+        gap = w + excursion * patch.beta[k] - u[i]
+        if gap <= 0.0:
+            continue
+        u[i] += gap
+        f = patch.gain[k] * gap
+        patch.f[k] = f
+        load += f
+        normal = add(normal, scale(f, n))
+        force = add(force, add(scale(f, n), scale(f / c, add(d, scale(s, n)))))
+        moment = subtract(moment, scale(f, add(d, scale(w, n))))  # the vertex is at X - w n
+    if load <= 0.0:
+        return False, Push(force, normal, moment)
+    return True, Push(force, normal, divide(moment, load))
+
+
+@compiled
+def relax(wall: Wall) -> None:
+    """The Prony branches, exact for a displacement held over the step: y_k = e_k y_k + (1 - e_k) g_k u."""
+    for k in range(len(wall.decay)):
+        y, e, feed = wall.y[k], wall.decay[k], wall.feed[k]
+        for i in range(len(y)):
+            y[i] = y[i] * e + feed * wall.u[i]

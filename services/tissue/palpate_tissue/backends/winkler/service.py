@@ -1,0 +1,23 @@
+"""The default tissue in its role."""
+
+from __future__ import annotations
+
+from palpate_bus.contract import contract
+from palpate_bus.messages.stamps import NS
+from palpate_models.phantom import build_phantom
+from palpate_models.scenario import Scenario
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_tissue.service import TissueService
+
+
+def create(scenario: Scenario) -> TissueService:
+    """The tissue of a scenario; with scoring, the one role that may look at its phantom."""
+    phantom = scenario.phantom
+    model = build_phantom(phantom, scenario.seed)
+    tissue = WinklerTissue(model, phantom.stiffness, phantom.breathing, contract().roles[TissueService.role].period / NS)
+    facts = {
+        "stability_dt_rate": round(tissue.dt * tissue.mechanics.rate, 4),  # passive below 2
+        "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),
+        "substeps": tissue.substeps,
+    }
+    return TissueService(tissue, model, phantom.pose.true, facts)

@@ -1,0 +1,157 @@
+"""The Winkler-Pasternak tissue: an explicit field with contact solved exactly, vertex by vertex.
+
+State: displacement u of every vertex along its inward rest normal [m], and one internal variable a Prony branch and vertex.
+
+    C u' + K (u - sum_k y_k) = f,     y_k' = (g_k u - y_k) / tau_k,     f >= 0,  u >= w,  f (u - w) = 0
+
+w(p) is where the sphere holds a vertex on its inward normal. See the README for the derivation, and `kernel.py` for the step.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models.frames import Array
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Breathing, Stiffness
+from palpate_tissue import friction
+from palpate_tissue.backend import TissueBackend
+from palpate_tissue.backends.winkler import kernel
+from palpate_tissue.backends.winkler.kernel import Patch, Wall
+from palpate_tissue.backends.winkler.mechanics import assemble
+from palpate_tissue.near import Near, Search
+
+_NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
+_MARGIN_M = 0.005
+"""The vertices near the sphere are searched anew when it has moved this far."""
+
+
+class WinklerTissue(TissueBackend):
+    """A soft surface that a sphere presses. Raises StabilityError if the mesh is too fine for the period."""
+
+    def __init__(
+        self,
+        model: PhantomModel,
+        stiffness: Stiffness | None = None,
+        breathing: Breathing | None = None,
+        dt: float = 1e-3,
+    ) -> None:
+        stiffness = stiffness or Stiffness()
+        super().__init__(model, breathing or Breathing(), dt)
+        self.mechanics = assemble(model, stiffness)
+        self.substeps = self.mechanics.substeps(dt)
+        self.friction = friction.skin(stiffness.friction, model.background)
+        n, h = len(model.vertices), dt / self.substeps
+        self.displacement: Array = np.zeros(n)
+        """u [m] along the inward rest normal, shape (n,)."""
+        self.branches: Array = np.zeros((len(stiffness.prony_g), n))
+        """y_k = g_k z_k [m]: what has relaxed, a row (n,) for each Prony branch."""
+        self.disturbed = False
+        """Whether anything has ever moved; until then the field is left at its exact rest."""
+        self._prony_g = stiffness.prony_g
+        self._wall = self._wall_of(stiffness, h)
+        self._gain = self.mechanics.damping / h
+        self._excursion = 0.0
+        self._free = np.flatnonzero(~model.fixed)
+        self._search = Search(model.vertices[self._free], model.normals[self._free], self._amplitude, _MARGIN_M)
+        self._near: Near | None = None
+        self._patch = self._nothing = self._patch_of(Near([0.0, 0.0, 0.0], 0.0, 0.0, _NONE, np.zeros((0, 3)), np.zeros((0, 3))))
+        self._motion: Array = np.zeros((3, 3))
+        """The sphere's centre [m], velocity [m/s] and angular velocity [rad/s], as rows."""
+        self._last: list[float] | None = None
+        self._press(self._nothing, 0.0, np.zeros(6))  # compiles it before contact
+
+    def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
+        """See `TissueBackend`. The period is cut into equal sub-steps, in which the sphere moves on a straight line."""
+        end = p_A.tolist()
+        if not math.isfinite(sum(end)):
+            raise ValueError(f"tissue: the indenter's position is not finite: {end}")
+        start = self._last or end  # where the sphere was a period ago
+        self._last = end
+        motion = self._motion
+        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
+        wrench = np.zeros(6)
+        if self.substeps == 1:
+            self._substep(self.excursion(t_s), end, radius, wrench)
+            return wrench[:3], wrench[3:]
+        part = np.zeros(6)
+        for k in range(1, self.substeps + 1):
+            share = k / self.substeps
+            motion[0] = at = [a + share * (b - a) for a, b in zip(start, end, strict=True)]
+            part[:] = 0.0
+            self._substep(self.excursion(t_s - self.dt * (1 - share)), at, radius, part)
+            wrench += part / self.substeps
+        return wrench[:3], wrench[3:]
+
+    def idle(self, t_s: float) -> None:
+        """See `TissueBackend`."""
+        for k in range(1, self.substeps + 1):
+            self._excursion = self.excursion(t_s - self.dt * (1 - k / self.substeps))
+            self._press(self._nothing, 0.0, np.zeros(6))
+
+    def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
+        self._excursion = excursion
+        if self._near is None or not self._near.holds(p, radius):
+            self._gather(p, radius)
+        self._press(self._patch, radius, wrench)
+
+    def _press(self, patch: Patch, radius: float, wrench: Array) -> None:
+        """One explicit step; `wrench` (6,) gets force [N] and torque [N m] on the sphere, and is left alone out of contact."""
+        touching = kernel.step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
+        if touching:
+            self.disturbed = True
+        elif self.touching:
+            self.friction.release()
+        self.touching = touching
+
+    def _gather(self, p: list[float], radius: float) -> None:
+        """Finds what a sphere near `p` [m] might touch."""
+        deepest = float(self.displacement[self._patch.vertex].max(initial=0.0))
+        self._near = self._search.around(p, radius, deepest)
+        self._patch = self._patch_of(self._near)
+
+    def _patch_of(self, near: Near) -> Patch:
+        index = self._free[near.vertex]
+        beta, gain = self.model.breathing[index], self._gain[index]
+        return Patch(np.array(near.origin), index.astype(np.uint32), near.n, near.X, beta, gain, np.zeros(len(index)))
+
+    def _wall_of(self, stiffness: Stiffness, h: float) -> Wall:
+        """The wall with its matrices for steps of `h` [s]."""
+        A = -h * self.mechanics.stiffness
+        A.data /= np.repeat(self.mechanics.damping, np.diff(A.indptr))  # row i by C_i
+        indptr, columns = A.indptr.astype(np.uint32), A.indices.astype(np.uint32)
+        if A.shape[0] <= np.iinfo(np.uint16).max:  # the whole field goes through the cache at each step: the less the better
+            columns = columns.astype(np.uint16)
+        decay: Array = np.exp(-h / np.array(stiffness.prony_tau_s))
+        feed: Array = np.array(stiffness.prony_g) * (1 - decay)
+        return Wall(self.displacement, self.branches, indptr, columns, A.data, decay, feed, h)
+
+    @property
+    def contacts(self) -> NDArray[np.intp]:
+        """Vertices in contact after the step, shape (k,)."""
+        return self._patch.vertex[self._patch.f > 0].astype(np.intp) if self.touching else _NONE
+
+    @property
+    def contact_forces(self) -> Array:
+        """Their contact forces f > 0 along their inward normals [N], shape (k,)."""
+        return self._patch.f[self._patch.f > 0] if self.touching else np.empty(0)
+
+    @property
+    def inward(self) -> Array:
+        """How far each vertex is from its place at rest [m] along its inward normal, breathing included, shape (n,)."""
+        if self._excursion:
+            return self.displacement - self._excursion * self.model.breathing
+        return self.displacement
+
+    def energy(self) -> float:
+        """Elastic energy [J] stored in the springs, the Maxwell branches' included, and in the sheared skin."""
+        u, K = self.displacement, self.mechanics.stiffness
+        stored = 0.5 * (1 - sum(self._prony_g)) * (u @ (K @ u))
+        for g, y in zip(self._prony_g, self.branches, strict=True):
+            if g > 0:
+                stretch = u - y / g
+                stored += 0.5 * g * (stretch @ (K @ stretch))
+        return float(stored + self.friction.energy())
