@@ -9,26 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import MS
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, duration_message
+from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
 from palpate_control.service import create as create_control
 from palpate_models import lbr
 from palpate_models.frames import matrix
 from palpate_models.load import exam_input
 from palpate_models.scenario import Background, Phantom, Scenario, Stiffness
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.messages import setpoint_message
+from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.poses import least_twist, pose
-from palpate_planning.setpoint import ControlMode, Setpoint
+from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint
 from palpate_robot.plant import Plant
 from palpate_robot.service import RobotService
 from palpate_tissue.service import TissueService
@@ -128,11 +127,10 @@ class _Script:
 
     def __post_init__(self) -> None:
         chosen = scenario(self.contrast)
-        kinematics = Kinematics(chosen.robot, chosen.limits)
+        kinematics = ArmKinematics(chosen.robot, chosen.limits)
         self.R = least_twist(np.array((0.0, 0.0, -1.0)), kinematics.pose(lbr.HOME)[:3, :3])
         self.top = matrix(chosen.phantom.pose.true)[:3, 3] + (0.0, 0.0, chosen.robot.indenter_radius_m)
         self.ready = kinematics.solve(self._at(-ABOVE_M), lbr.HOME).q
-        self._valid = duration_message((contract().topics["planning/setpoint"].expiry_ms or 0) * MS)
 
     def _at(self, depth: float) -> Array:
         return pose(self.R, self.top - (0.0, 0.0, depth))
@@ -147,10 +145,9 @@ class _Script:
         if t % (10 * MS):
             return {}
         now = t / NS
-        setpoint = Setpoint(ControlMode.CARTESIAN, self._at(self.depth(now)), self.ready)
-        message = setpoint_message(t, setpoint, self._valid)
-        message.stiffness = setpoint.stiffness * (1, 1, self.stiffness / setpoint.stiffness[2], 1, 1, 1)
-        return {"planning/setpoint": message}
+        setpoint = cartesian_setpoint(t, self.R, self._at(self.depth(now))[:3, 3], self.ready)
+        stiffness = CARTESIAN_STIFFNESS * (1, 1, self.stiffness / CARTESIAN_STIFFNESS[2], 1, 1, 1)
+        return {"planning/setpoint": replace(setpoint, stiffness=stiffness).message()}
 
 
 def _smooth(t: float) -> float:

@@ -27,7 +27,7 @@ from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Mode, Reference, Setpoint
 from palpate_models.lbr import urdf
 from palpate_models.phantom import build_phantom
-from palpate_planning.setpoint import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
+from palpate_planning.setpoints import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
 from palpate_tissue.friction import shear_stiffness
 from palpate_tissue.tissue import Tissue
 from palpate_validation.contact_rig import CONTACT_PATH, CONTROL_PATH, DEPTH_M, scenario, start_posture

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from palpate_models import lbr
+from palpate_models.frames import Array
 from palpate_models.scenario import Limits, Robot
-
-Array = NDArray[np.float64]
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 TOLERANCE_M = 1e-4
@@ -21,7 +19,7 @@ TOLERANCE_RAD = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class IkSolution:
     """Result of inverse kinematics."""
 
     q: Array
@@ -32,7 +30,7 @@ class Solution:
     error_rad: float
 
 
-class Kinematics:
+class ArmKinematics:
     """The arm as pinocchio sees it. W: world, I: indenter (origin at the sphere's centre), S: F/T sensor."""
 
     def __init__(self, robot: Robot, limits: Limits) -> None:
@@ -76,7 +74,7 @@ class Kinematics:
         *,
         spin_free: bool = False,
         iterations: int = 60,
-    ) -> Solution:
+    ) -> IkSolution:
         """Joint positions that put the indenter at X_WI; with `spin_free` the turn about the tool's axis does not matter.
 
         Damped least squares (Nakamura & Hanafusa 1986) on six or five task coordinates, with the null space drawn to
@@ -107,7 +105,7 @@ class Kinematics:
             q = q + A.T @ np.linalg.solve(A @ A.T + damping, scale * b - A @ pull) + pull
             q = np.clip(q, -self.upper, self.upper)
         _, q, error_m, error_rad = best
-        return Solution(q, error_m < TOLERANCE_M and error_rad < TOLERANCE_RAD, error_m, error_rad)
+        return IkSolution(q, error_m < TOLERANCE_M and error_rad < TOLERANCE_RAD, error_m, error_rad)
 
 
 def _turn_of_axis(z_I: Array) -> Array:
