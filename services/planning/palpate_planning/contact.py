@@ -8,7 +8,7 @@ import numpy as np
 
 from palpate_models.frames import Array
 from palpate_planning.kinematics import ArmKinematics
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.tool_weight import ToolWeight
 
 CONTACT_ON_N = 0.15
@@ -50,7 +50,7 @@ class ContactSensing:
     """Turns sensor readings into contact, against the surface perceived so far."""
 
     def __init__(
-        self, kinematics: ArmKinematics, weight: ToolWeight, surface: RestSurface, radius: float, period_s: float
+        self, kinematics: ArmKinematics, weight: ToolWeight, surface: PerceivedSurface, radius: float, period_s: float
     ) -> None:
         """`radius` of the sphere [m]; a reading comes every `period_s`."""
         self.surface = surface

@@ -17,7 +17,7 @@ from palpate_planning.motion_planning import NoPathError, timed_motion
 from palpate_planning.poses import centre, pose
 from palpate_planning.scene import CollisionScene
 from palpate_planning.segments import REACH, Segment, SegmentPlanner
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import JointTrajectory
 
 Ints = NDArray[np.int64]
@@ -35,7 +35,7 @@ class PerceivedAbdomen:
     """Mesh of the surface [m], shape (k, 3)."""
     triangles: Ints
     """Vertex indices, shape (l, 3)."""
-    surface: RestSurface
+    surface: PerceivedSurface
     noise: float = 0.0
     """Standard deviation of the surface that perception estimates, its motion included [m]."""
 

@@ -27,7 +27,9 @@ class IkSolution:
     ok: bool
     """Whether the pose is met to `TOLERANCE_M` and `TOLERANCE_RAD` within the limits."""
     error_m: float
+    """Distance of the sphere's centre from the one asked for [m]."""
     error_rad: float
+    """Angle of the orientation, or of the tool axis where spin is free, from the one asked for [rad]."""
 
 
 class ArmKinematics:
@@ -39,7 +41,7 @@ class ArmKinematics:
         self._indenter = self.model.getFrameId("indenter")
         self._sensor = self.model.getFrameId("ft_sensor")
         self._R_WS: Array = self.data.oMf[self._sensor].rotation
-        """A view of what pinocchio has computed last."""
+        """A view of the pose that pinocchio computed last."""
         self.upper: Array = lbr.POSITION_LIMIT - limits.joint_margin_rad
         """Highest joint positions that planning uses [rad], shape (7,); the lowest are their negatives."""
 
@@ -50,7 +52,7 @@ class ArmKinematics:
         return X_WI
 
     def poses(self, q: Array) -> tuple[Array, Array]:
-        """X_WI, column by column in memory, and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3)."""
+        """X_WI and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3), at joint positions q [rad]."""
         model, data = self.model, self.data
         pin.forwardKinematics(model, data, q)
         X_WI: Array = pin.updateFramePlacement(model, data, self._indenter).homogeneous

@@ -41,7 +41,7 @@ STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
 
 
-class Stage(Enum):
+class StrokeStage(Enum):
     """Part of a stroke."""
 
     DESCEND = "descending"
@@ -53,16 +53,16 @@ class Stage(Enum):
     DONE = "done"
 
 
-PRESSING: Final = (Stage.SLIDE, Stage.HOLD, Stage.SETTLE, Stage.DESCEND)
+PRESSING: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE, StrokeStage.DESCEND)
 """Stages in which the tissue is pressed, or is about to be."""
-AT_DEPTH: Final = (Stage.SLIDE, Stage.HOLD, Stage.SETTLE)
+AT_DEPTH: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE)
 
 
 class PalpationStep(NamedTuple):
     """What a step of the palpation did."""
 
     setpoint: Setpoint
-    stage: Stage
+    stage: StrokeStage
     depth_setpoint: float
     """[m]"""
     steady: bool
@@ -112,15 +112,15 @@ class Palpation:
     def free_goal(self) -> Array | None:
         """Where the free motion under way ends [rad], shape (7,); None on a path."""
         free = self._motion.segment.free
-        return None if free is None or self.failed or self.stage is Stage.DONE else np.asarray(free.q[-1])
+        return None if free is None or self.failed or self.stage is StrokeStage.DONE else np.asarray(free.q[-1])
 
     # --- interruptions ------------------------------------------------------------------------------------------------
 
     def abandon(self, why: str) -> None:
         """Lifts off and ends."""
         self._recovery.give_up(why)
-        if self.stage not in (Stage.LIFT, Stage.DONE):
-            self._enter(Stage.LIFT)
+        if self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
+            self._enter(StrokeStage.LIFT)
 
     def pause(self) -> None:
         """Lifts off along the normal and waits there; `resume` comes back to where it was."""
@@ -128,7 +128,7 @@ class Palpation:
         if self.stage in PRESSING:
             stop = self._motion.along.position + self._motion.stopping_distance
             self._recovery.resume_at = min(stop, self._motion.segment.path.length)
-            self._enter(Stage.LIFT)
+            self._enter(StrokeStage.LIFT)
 
     def resume(self, contact: ContactMeasurement) -> None:
         """Goes on after a pause, from where the arm is now: while the driver held, the tissue has pushed it.
@@ -156,35 +156,35 @@ class Palpation:
         self._recovery.return_to_path(contact)
         if contact.force > self._limits.force_soft_stop_n and self.stage in PRESSING:
             self._recovery.soft_stop(contact.force, self._motion.segment.path, self._motion.along.position)
-            self._enter(Stage.LIFT)
-        if self.stage is Stage.SLIDE:
+            self._enter(StrokeStage.LIFT)
+        if self.stage is StrokeStage.SLIDE:
             self._slide()
-        elif self.stage is Stage.LIFT:
+        elif self.stage is StrokeStage.LIFT:
             self._lift()
-        elif self.stage is Stage.TRANSFER:
+        elif self.stage is StrokeStage.TRANSFER:
             self._transfer(rate)
-        elif self.stage is Stage.DESCEND:
+        elif self.stage is StrokeStage.DESCEND:
             self._descend(contact)
-        elif self.stage is Stage.SETTLE:
+        elif self.stage is StrokeStage.SETTLE:
             self._settle(contact)
-        elif self.stage is Stage.HOLD and self._time >= HOLD_S:
-            self._enter(Stage.LIFT)
-        self._motion.regulate(contact, in_contact=contact.touching and self.stage is not Stage.LIFT)
+        elif self.stage is StrokeStage.HOLD and self._time >= HOLD_S:
+            self._enter(StrokeStage.LIFT)
+        self._motion.regulate(contact, in_contact=contact.touching and self.stage is not StrokeStage.LIFT)
         return self._report(t, contact, rate)
 
-    def _enter(self, stage: Stage) -> None:
+    def _enter(self, stage: StrokeStage) -> None:
         self.stage = stage
         self._time = 0.0
         self._settled = 0.0
 
     def _next_segment(self) -> None:
         if self._number + 1 == len(self._segments):
-            self._enter(Stage.DONE)
+            self._enter(StrokeStage.DONE)
             return
         self._number += 1
         segment = self._segments[self._number]
         self._motion.start(segment)
-        self._enter(Stage.DESCEND if segment.contact else Stage.TRANSFER)
+        self._enter(StrokeStage.DESCEND if segment.contact else StrokeStage.TRANSFER)
 
     def _descend(self, contact: ContactMeasurement) -> None:
         if not self._onset.done:
@@ -194,7 +194,7 @@ class Palpation:
         stopped = self._motion.slowdown(0.7, 1.0, 0.0) < STOPPED
         self._settled = self._settled + self._period_s if stopped else 0.0
         if there or self._settled > SETTLED_S:  # at depth, or as deep as the force allows
-            self._enter(Stage.SETTLE)
+            self._enter(StrokeStage.SETTLE)
 
     def _probe(self, contact: ContactMeasurement) -> None:
         """The first descent: slow, down to where the tissue begins, wherever the camera said it would be."""
@@ -215,23 +215,23 @@ class Palpation:
         near = abs(self._motion.regulation.reference - contact.depth) < SETTLED_M
         self._settled = self._settled + self._period_s if near else 0.0
         if self._settled >= SETTLED_S or self._time >= SETTLE_MAX_S:
-            self._enter(Stage.SLIDE if self._motion.segment.path.length > 0 else Stage.HOLD)
+            self._enter(StrokeStage.SLIDE if self._motion.segment.path.length > 0 else StrokeStage.HOLD)
 
     def _slide(self) -> None:
         self._motion.deepen()
         if self._motion.slide():
-            self._enter(Stage.LIFT)
+            self._enter(StrokeStage.LIFT)
 
     def _lift(self) -> None:
         self._motion.brake()
         if not self._motion.depth.step(-self._height, LIFT_MPS) or self._recovery.paused:
             return
         if self.failed:
-            self._enter(Stage.DONE)
+            self._enter(StrokeStage.DONE)
         elif self._recovery.displacement is not None:
             return
         elif self._recovery.resume_at is not None:
-            self._enter(Stage.TRANSFER)
+            self._enter(StrokeStage.TRANSFER)
         else:
             self._next_segment()
 
@@ -258,7 +258,7 @@ class Palpation:
                 self._next_segment()
         elif motion.travel(recovery.resume_at):
             recovery.resume_at = None
-            self._enter(Stage.DESCEND)
+            self._enter(StrokeStage.DESCEND)
 
     def _report(self, t: int, contact: ContactMeasurement, rate: float) -> PalpationStep:
         motion = self._motion
@@ -269,5 +269,5 @@ class Palpation:
             setpoint = self._recovery.displacement.move(setpoint)
         limited = motion.regulation.limited or (motion.short_of_depth and self.stage in AT_DEPTH)
         fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
-        steady = contact.touching and (self.stage is Stage.HOLD or (self.stage is Stage.SLIDE and fast))
+        steady = contact.touching and (self.stage is StrokeStage.HOLD or (self.stage is StrokeStage.SLIDE and fast))
         return PalpationStep(setpoint, self.stage, motion.regulation.reference, steady, limited, motion.target)

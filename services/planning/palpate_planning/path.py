@@ -13,7 +13,7 @@ from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.scenario import Limits
 from palpate_planning.poses import angular_velocity, frame, least_twist
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import SpeedLimit
 
 Ints = NDArray[np.int64]
@@ -106,7 +106,7 @@ def _orientation(y: Array) -> Array:
     return frame(-n / np.sqrt(n @ n), y[6:9])
 
 
-def lay(surface: RestSurface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:
+def lay(surface: PerceivedSurface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:
     """A curve in A's xy plane laid onto the surface: s (k,), p and n (k, 3) in world, R (k, 3, 3) by least twist."""
     p, n = surface.at(xy)
     s = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))

@@ -12,7 +12,7 @@ from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.path import PathPoint, SurfacePath
 from palpate_planning.poses import centre
-from palpate_planning.timing import Axis
+from palpate_planning.timing import JerkLimitedAxis
 
 SOFT_STOPS_MAX = 3
 """With this many soft stops the examination is given up."""
@@ -34,7 +34,7 @@ class Displacement:
         """`gap` [m], world axes, shape (3,): the arm's centre less the one that the path asks for; not zero."""
         length = float(np.linalg.norm(gap))
         self._direction = gap / length
-        self._length = Axis(length, RETURN_ACCELERATION, 10 * RETURN_ACCELERATION, period_s)
+        self._length = JerkLimitedAxis(length, RETURN_ACCELERATION, 10 * RETURN_ACCELERATION, period_s)
 
     def move(self, setpoint: Setpoint) -> Setpoint:
         """The set-point, displaced by what is left of the gap."""

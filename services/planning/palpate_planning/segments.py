@@ -15,7 +15,7 @@ from palpate_planning.motion_planning import NoPathError
 from palpate_planning.path import SurfacePath, lay
 from palpate_planning.poses import centre, least_twist, pose
 from palpate_planning.scene import CollisionScene
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import JointTrajectory
 
 HOVER_M = 0.02
@@ -63,7 +63,7 @@ class SegmentPlanner:
         self,
         kinematics: ArmKinematics,
         scene: CollisionScene,
-        surface: RestSurface,
+        surface: PerceivedSurface,
         postures: Array,
         radius: float,
         depth: float,

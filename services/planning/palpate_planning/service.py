@@ -1,4 +1,4 @@
-"""Planning as a service: messages to arrays and back. The examination itself is in `examination`."""
+"""Planning as a service: messages to arrays and back. The examination itself is in `exam_sequence`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from palpate_models.scenario import ExamInput, Scenario
 from palpate_planning.background import WORKER
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
-from palpate_planning.examination import Examination
+from palpate_planning.exam_sequence import ExamSequence
 from palpate_planning.messages import path_message, state_message
 from palpate_planning.periods import Periods
 from palpate_planning.status import Observation, PerceptionFailure, Phase
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 
 NEEDED = ("robot", "assessment", "supervisor")
 """Roles whose loss ends the exam, whatever its phase."""
@@ -41,12 +41,12 @@ class PlanningService(Service):
     role: ClassVar[str] = "planning"
 
     def __init__(self, known: ExamInput, *, lockstep: bool = True) -> None:
-        """`lockstep` as in `Examination`."""
+        """`lockstep` as in `ExamSequence`."""
         roles = contract().roles
         self._known = known
         self._X_WA = np.array(known.X_WA)
         _let_the_worker_give_way()
-        self._exam = Examination(known, Periods(roles["planning"].period, roles["camera"].period), lockstep=lockstep)
+        self._exam = ExamSequence(known, Periods(roles["planning"].period, roles["camera"].period), lockstep=lockstep)
         self._supervisor_silence = (contract().topics["planning/setpoint"].expiry_ms or 0) * MS
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
@@ -124,7 +124,7 @@ class PlanningService(Service):
         vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
         normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
         try:
-            surface = RestSurface.from_mesh(vertices, normals, self._X_WA)
+            surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA)
         except ValueError as error:
             return PerceptionFailure(f"perception/surface: {error}")
         return PerceivedAbdomen(

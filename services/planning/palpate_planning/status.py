@@ -10,7 +10,7 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.frames import Array
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
-from palpate_planning.palpation import Stage
+from palpate_planning.palpation import StrokeStage
 
 
 class Phase(IntEnum):
@@ -31,13 +31,13 @@ class Phase(IntEnum):
 
 
 PHASE_OF: Final = {
-    Stage.DESCEND: Phase.INDENT,
-    Stage.SETTLE: Phase.INDENT,
-    Stage.SLIDE: Phase.SCAN,
-    Stage.HOLD: Phase.SCAN,
-    Stage.LIFT: Phase.RETRACT,
-    Stage.TRANSFER: Phase.RETRACT,
-    Stage.DONE: Phase.RETRACT,
+    StrokeStage.DESCEND: Phase.INDENT,
+    StrokeStage.SETTLE: Phase.INDENT,
+    StrokeStage.SLIDE: Phase.SCAN,
+    StrokeStage.HOLD: Phase.SCAN,
+    StrokeStage.LIFT: Phase.RETRACT,
+    StrokeStage.TRANSFER: Phase.RETRACT,
+    StrokeStage.DONE: Phase.RETRACT,
 }
 """The phase to which each stage of a stroke belongs."""
 PALPATING: Final = frozenset(PHASE_OF.values())

@@ -11,7 +11,7 @@ from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
 from palpate_planning.path import ACCELERATION, PathPoint
 from palpate_planning.segments import HOVER_M, Segment
 from palpate_planning.setpoints import NORMAL_STIFFNESS, cartesian_setpoint, joint_setpoint
-from palpate_planning.timing import Axis
+from palpate_planning.timing import JerkLimitedAxis
 
 DEPTH_ACCELERATION = 0.5
 """[m/s^2]"""
@@ -59,12 +59,12 @@ class StrokeMotion:
         self.depth = self._depth_axis(-HOVER_M)
         """Target depth [m], negative above the surface."""
 
-    def _depth_axis(self, depth: float) -> Axis:
+    def _depth_axis(self, depth: float) -> JerkLimitedAxis:
         self._regulator.reset(depth)
-        return Axis(depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05, self._period_s)
+        return JerkLimitedAxis(depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05, self._period_s)
 
-    def _path_axis(self, position: float) -> Axis:
-        return Axis(position, self._acceleration, 10 * self._acceleration, self._period_s)
+    def _path_axis(self, position: float) -> JerkLimitedAxis:
+        return JerkLimitedAxis(position, self._acceleration, 10 * self._acceleration, self._period_s)
 
     # --- where on which segment ---------------------------------------------------------------------------------------
 

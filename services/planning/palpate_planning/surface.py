@@ -23,7 +23,7 @@ STEEPEST = 10.0
 """Largest slope kept: past this (84 degrees) a height field says nothing."""
 
 
-class HeightField:
+class BicubicField:
     """Height and slopes over a plane, interpolated by bicubic B-splines (twice continuously differentiable)."""
 
     def __init__(self, x: Array, y: Array, values: Array) -> None:
@@ -38,17 +38,17 @@ class HeightField:
         return np.asarray(self._spline(np.minimum(np.maximum(xy, self._low), self._high)))
 
 
-class RestSurface:
+class PerceivedSurface:
     """The perceived surface z = h(x, y) in frame A with outward normals. Points in and out are in W unless named otherwise."""
 
-    def __init__(self, X_WA: Array, field: HeightField) -> None:
+    def __init__(self, X_WA: Array, field: BicubicField) -> None:
         self._X_WA = X_WA
         self._field = field
         self.offset = 0.0
         """Shift of the whole surface along its outward normals [m], from the onset of force."""
 
     @staticmethod
-    def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> RestSurface:
+    def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> PerceivedSurface:
         """Fits the field to a mesh: vertices [m] shape (n, 3), outward unit normals of the same shape or None.
 
         Slopes come from the normals where they are given (perception smooths them), else from the heights. Outside the
@@ -80,13 +80,13 @@ class RestSurface:
         if len(columns) == 1:
             slopes = np.gradient(values[..., 0], *axes)
             values = np.stack((values[..., 0], *slopes), axis=-1)
-        return RestSurface(X_WA, HeightField(axes[0], axes[1], values))
+        return PerceivedSurface(X_WA, BicubicField(axes[0], axes[1], values))
 
     @staticmethod
-    def plane(X_WA: Array) -> RestSurface:
+    def plane(X_WA: Array) -> PerceivedSurface:
         """The xy plane of A: what is assumed while nothing has been perceived."""
         line = np.linspace(-1.0, 1.0, 9)
-        return RestSurface(X_WA, HeightField(line, line, np.zeros((9, 9, 3))))
+        return PerceivedSurface(X_WA, BicubicField(line, line, np.zeros((9, 9, 3))))
 
     def at(self, xy_A: Array) -> tuple[Array, Array]:
         """Surface points and outward unit normals over xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""

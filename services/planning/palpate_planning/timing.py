@@ -1,4 +1,4 @@
-"""When to be where: smooth speed along a path, by ruckig on one degree of freedom, within limits on joints and tool."""
+"""Time parametrisation: smooth speed along a path, by ruckig on one degree of freedom, within limits on joints and tool."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FINISHED: Final = ruckig.Result.Finished
 _UNDER_WAY: Final = (ruckig.Result.Working, _FINISHED)
 
 
-class Axis:
+class JerkLimitedAxis:
     """One degree of freedom that moves to a target with bounded speed, acceleration and jerk; limits may change on the way.
 
     Its position, velocity and acceleration are to be read; `step`, `shift` and `stand` change them.
@@ -181,7 +181,7 @@ def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, p
     speed = np.minimum(speeds.min(axis=1), limits.speed_mps / np.maximum(tool, 1e-9))
     acceleration = float((0.5 * JOINT_ACCELERATION / np.maximum(np.abs(tangent), 1e-9)).min())
     limit = SpeedLimit(s, speed, 0.7 * acceleration)
-    axis = Axis(0.0, acceleration, acceleration / RISE_S, period_s)
+    axis = JerkLimitedAxis(0.0, acceleration, acceleration / RISE_S, period_s)
     positions, rates = [0.0], [0.0]
     while not axis.step(float(s[-1]), limit.at(axis.position + axis.velocity * period_s)):
         positions.append(axis.position)

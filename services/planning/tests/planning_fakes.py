@@ -16,12 +16,12 @@ from palpate_models.scenario import Exam as ExamSettings
 from palpate_models.scenario import ExamInput, Robot, Scenario
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
-from palpate_planning.examination import Examination
+from palpate_planning.exam_sequence import ExamSequence
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
 from palpate_planning.status import ExamStep, Observation, PerceptionFailure, Phase
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.tool_weight import ToolWeight
 
 PERIODS = Periods(contract().roles["planning"].period, contract().roles["camera"].period)
@@ -58,7 +58,7 @@ def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
     half = (exam.region_m[0] / 2 + 0.04, exam.region_m[1] / 2 + 0.04)
     vertices, triangles = grid_mesh(half)
     p_W = apply(X_WA, vertices)
-    surface = RestSurface.from_mesh(p_W, None, X_WA)
+    surface = PerceivedSurface.from_mesh(p_W, None, X_WA)
     nx, ny = (round(size / exam.spacing_m) + 1 for size in exam.region_m)
     xy, lines = [], []
     for j, y in enumerate(np.linspace(-exam.region_m[1] / 2, exam.region_m[1] / 2, ny)):
@@ -81,7 +81,7 @@ class World:
     def __init__(self, settings: ExamInput, force: Callable[[float], float] | None = None, offset: float = 0.0) -> None:
         """`force` by true depth; the true surface lies `offset` [m] outward of the perceived one."""
         self.settings, self.force = settings, force or hertz(2.4)
-        self.exam = Examination(settings, PERIODS)
+        self.exam = ExamSequence(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
         self.weight = ToolWeight.of(settings.robot)
         self.bias = np.array([0.7, -0.4, 1.1])

@@ -8,7 +8,7 @@ from planning_fakes import World, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models import lbr
-from palpate_planning.palpation import Stage
+from palpate_planning.palpation import StrokeStage
 from palpate_planning.status import Phase
 
 PHASES = [Phase.HOME, Phase.LOOK, Phase.PLAN, Phase.APPROACH, Phase.INDENT, Phase.SCAN, Phase.RETRACT, Phase.RETURN]
@@ -144,7 +144,7 @@ def test_an_arm_that_was_pushed_a_little_aside_lifts_before_it_goes_back(phase: 
 
 def test_an_arm_that_was_pushed_into_the_tissue_between_two_strokes_lifts_before_it_goes_on() -> None:
     world = World(known(region_m=(0.025, 0.025), pattern="raster"))
-    world.run(lambda: getattr(world.exam._course.palpation, "stage", None) is Stage.TRANSFER)
+    world.run(lambda: getattr(world.exam._course.palpation, "stage", None) is StrokeStage.TRANSFER)
     assert world.exam._course.palpation is not None
     assert world.exam._course.palpation.free_goal is None
     world.step()

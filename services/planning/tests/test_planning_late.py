@@ -14,7 +14,7 @@ from palpate_models.scenario import Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import TrajectoryFollower
 from palpate_planning.kinematics import ArmKinematics
-from palpate_planning.palpation import Palpation, Stage
+from palpate_planning.palpation import Palpation, StrokeStage
 from palpate_planning.path import SurfacePath
 from palpate_planning.periods import MS
 from palpate_planning.segments import Segment
@@ -133,5 +133,5 @@ def test_after_a_pause_in_a_free_motion_the_palpation_goes_on_with_the_next_segm
     palpation.pause()
     palpation.skip_free_motion()
     steps = [palpation.step(t, ABOVE) for t in ticks(0, 10 * MS, len(MOTION))]
-    assert steps[-1].stage is Stage.DONE
+    assert steps[-1].stage is StrokeStage.DONE
     assert np.array_equal(steps[-1].setpoint.q, MOTION.q[-1])

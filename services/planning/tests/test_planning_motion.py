@@ -16,7 +16,7 @@ from palpate_planning.look import look_postures
 from palpate_planning.motion_planning import NoPathError, plan
 from palpate_planning.poses import centre, least_twist, pose
 from palpate_planning.scene import CollisionScene, with_skirt
-from palpate_planning.timing import JOINT_ACCELERATION, Axis, SpeedLimit, joint_trajectory, rounded
+from palpate_planning.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
 
 LIMITS = Limits()
 KINEMATICS = ArmKinematics(BASE, LIMITS)
@@ -163,7 +163,7 @@ def test_speed_limit_brakes_ahead_of_a_slow_place() -> None:
 
 
 def test_axis_moves_to_its_target_at_rest() -> None:
-    axis = Axis(0.0, 0.5, 5.0, PERIOD_S)
+    axis = JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S)
     speeds = []
     while not axis.step(0.1, 0.05):
         speeds.append(axis.velocity)
@@ -182,7 +182,7 @@ def test_a_speed_limit_between_its_places_is_numpys_to_the_bit() -> None:
 
 
 def test_an_axis_that_counts_from_elsewhere_moves_on_alike() -> None:
-    axis, shifted = Axis(0.0, 0.5, 5.0, PERIOD_S), Axis(0.0, 0.5, 5.0, PERIOD_S)
+    axis, shifted = JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S), JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S)
     for k in range(100):
         if k == 10:
             shifted.shift(0.25)
@@ -192,12 +192,12 @@ def test_an_axis_that_counts_from_elsewhere_moves_on_alike() -> None:
 
 
 def test_an_axis_that_stood_still_starts_from_rest() -> None:
-    axis = Axis(0.0, 0.5, 5.0, PERIOD_S)
+    axis = JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S)
     for _ in range(20):
         axis.step(0.1, 0.05)
     assert axis.velocity > 0.02
     axis.stand()
-    fresh = Axis(axis.position, 0.5, 5.0, PERIOD_S)
+    fresh = JerkLimitedAxis(axis.position, 0.5, 5.0, PERIOD_S)
     assert axis.velocity == axis.acceleration == 0.0
     for _ in range(30):
         assert axis.step(0.1, 0.05) == fresh.step(0.1, 0.05)

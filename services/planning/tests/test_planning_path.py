@@ -9,7 +9,7 @@ from palpate_planning.path import SurfacePath, lay
 from palpate_planning.poses import centre
 from palpate_planning.recovery import Displacement
 from palpate_planning.stroke_motion import stroke_setpoint
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 
 DOWN = np.diag((1.0, -1.0, -1.0))
 
@@ -19,7 +19,7 @@ def dome_path(samples: int) -> SurfacePath:
     xy = np.column_stack((np.linspace(-0.05, 0.05, samples), np.full(samples, 0.01))) if samples > 1 else np.zeros((1, 2))
     x, y = np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(-0.1, 0.1, 0.01))
     vertices = np.column_stack((x.ravel(), y.ravel(), -(x.ravel() ** 2) / 0.5 - y.ravel() ** 2))
-    s, p, n, R = lay(RestSurface.from_mesh(vertices, None, np.eye(4)), xy, DOWN)
+    s, p, n, R = lay(PerceivedSurface.from_mesh(vertices, None, np.eye(4)), xy, DOWN)
     q = np.outer(1.0 + s, np.arange(1.0, 8.0)) ** 2
     visits = np.array([0, samples // 2, samples - 1]) if samples > 1 else np.zeros(1, int)
     return SurfacePath(s, p, n, R, q, np.array([7, 3, 5])[: len(visits)], visits)

@@ -18,12 +18,12 @@ from palpate_planning.free_motion import FreeMotion, TrajectoryFollower
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.look import look_postures
 from palpate_planning.motion_planning import NoPathError
-from palpate_planning.palpation import Palpation, PalpationStep, Stage
+from palpate_planning.palpation import Palpation, PalpationStep, StrokeStage
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import Stops
-from palpate_planning.surface import RestSurface
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import RestartRamp
 from palpate_planning.tool_weight import ToolWeight
 
@@ -40,7 +40,7 @@ ASSESS_PATIENCE = 30 * SECOND
 """Time that the assessment may take for its final findings [ns]."""
 
 
-class Examination:
+class ExamSequence:
     """Runs one examination. `step` each planning period; `status` says where it stands."""
 
     def __init__(self, known: ExamInput, periods: Periods, *, lockstep: bool = True) -> None:
@@ -50,7 +50,7 @@ class Examination:
         self._sense = ContactSensing(
             self._kinematics,
             ToolWeight.of(known.robot),
-            RestSurface.plane(np.array(known.X_WA)),
+            PerceivedSurface.plane(np.array(known.X_WA)),
             known.robot.indenter_radius_m,
             periods.step_s,
         )
@@ -199,7 +199,7 @@ class Examination:
                 self._periods.step_s,
                 course.perceived.noise,
             )
-            course.enter(Phase.INDENT, now.t, Stage.DESCEND.value)
+            course.enter(Phase.INDENT, now.t, StrokeStage.DESCEND.value)
             return self._palpate(now)
         elif now.t - course.since >= REST:
             self._sense.weight.tare(course.contact.R_WS, now.reading.wrench_S)
@@ -213,7 +213,7 @@ class Examination:
         step = course.palpation.step(now.t, course.contact, course.rate)
         self._report(step, course.palpation, now.t)
         self._sense.surface.offset = course.palpation.surface_offset
-        if step.stage is Stage.DONE:
+        if step.stage is StrokeStage.DONE:
             course.go_home(now, course.palpation.failed)
         return step.setpoint
 
