@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -27,6 +27,7 @@ from palpate_models.load import exam_input
 from palpate_models.scenario import Background, Phantom, Scenario, Stiffness
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.poses import least_twist, pose
+from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.service import RobotService
 from palpate_tissue.backends.winkler.service import create as create_tissue
@@ -142,21 +143,9 @@ class _Script:
         if t % contract().topics[TOPIC].period:
             return {}
         now = t / NS
-        X_WD = self._at(self.depth(now))
-        setpoint = Setpoint(
-            stamp=t,
-            mode=ControlMode.CARTESIAN,
-            R_WD=X_WD[:3, :3],
-            p_WD=X_WD[:3, 3],
-            V_WD=np.zeros(6),
-            F_W=np.zeros(6),
-            stiffness=np.array([3000.0, 3000.0, self.stiffness, 250.0, 250.0, 100.0]),
-            damping_ratio=np.full(6, 0.8),
-            q=self.ready,
-            qd=np.zeros(7),
-            joint_stiffness=np.full(7, 20.0),
-        )
-        return {TOPIC: setpoint.message()}
+        setpoint = cartesian_setpoint(t, self.R, self._at(self.depth(now))[:3, 3], self.ready)
+        stiffness = CARTESIAN_STIFFNESS * (1, 1, self.stiffness / CARTESIAN_STIFFNESS[2], 1, 1, 1)
+        return {TOPIC: replace(setpoint, stiffness=stiffness).message()}
 
 
 def _smooth(t: float) -> float:

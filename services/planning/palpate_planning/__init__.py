@@ -1,1 +1,1 @@
-"""Planning: the exam state machine, coverage execution, pose generation, collision-free motion, timing, depth regulation."""
+"""Planning: sequence of the examination, coverage, pose generation, collision-free motion, timing, depth regulation."""

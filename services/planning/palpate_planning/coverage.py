@@ -1,8 +1,8 @@
-"""The order of things on the surface: from targets to strokes, each a smooth curve in the abdomen's xy plane.
+"""Coverage: from targets to strokes, each a smooth curve in the abdomen's xy plane.
 
 Snake: lines joined by arcs, one stroke in contact. Raster: a stroke a line, retracted in between. Mode point: a stroke a
-target. A skipped target ends a stroke: what the arm can't reach it must not slide over either. So does a break: the way
-between two targets that are themselves in reach may lead out of it.
+target. A skipped target ends a stroke: the arm must not slide over what it cannot reach. So does a break: the way between two
+targets that are in reach may itself be out of reach.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from palpate_models.frames import Array
 from palpate_models.scenario import Mode, Pattern
 
-Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 

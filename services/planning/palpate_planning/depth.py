@@ -1,4 +1,4 @@
-"""Depth regulation: the sphere's true depth at its set-point, on soft and stiff tissue, and never more than so much force.
+"""Depth regulation: the sphere's true depth at its set-point, on soft and stiff tissue, within a limit of force.
 
 Depth d is measured: radius minus the signed distance of the sphere's centre (forward kinematics) from the perceived rest
 surface. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F - F_ff)/K_z. So
@@ -20,7 +20,7 @@ EXPONENT = 1.45
 FORCE_FRACTION = 0.9
 """Part of the working force limit at which depth yields."""
 FEED_FORWARD = 0.9
-"""a: below one, so that even a rigid surface does not wind the force up."""
+"""a, below one so that the force cannot build up by itself even on a rigid surface."""
 FORCE_LAG_S = 0.02
 """Low-pass of the measured force."""
 RATE_LAG_S = 0.03
@@ -33,15 +33,16 @@ INTEGRAL_MAX_M = 0.004
 INTEGRAL_FADE_S = 0.1
 """Out of contact the integral fades."""
 GUARD_PER_S = 10.0
-"""w."""
+"""w, the rate of the guard [1/s]: its depth follows the excess force over K_z."""
 GUARD_MAX_M = 0.02
 YIELD_LAG_S = 0.03
 """Smoothing of d_r."""
 YIELD_MPS = 0.08
+"""Fastest d_r towards the surface."""
 RETURN_MPS = 0.02
-"""Fastest d_r towards the surface and, after yielding, back into the tissue."""
+"""Fastest d_r back into the tissue after yielding."""
 MODEL_DEPTH_M = 0.003
-"""Shallower than this the power law says little."""
+"""Shallower than this the power law is not used."""
 RATE_MAX_MPS = 0.2
 """Greatest rate of the commanded depth that is passed on for control to extrapolate by."""
 LIMITED_M = 0.0002
@@ -81,7 +82,7 @@ class DepthRegulator:
         self._command = depth
 
     def shift(self, change: float) -> None:
-        """Counts depths from another zero from now on: every depth is `change` [m] more."""
+        """Moves the zero of all depths: every depth reads `change` [m] more."""
         self._command += change
 
     def update(self, target: float, depth: float, force: float, in_contact: bool) -> Regulation:

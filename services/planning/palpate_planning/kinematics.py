@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from palpate_models import lbr
+from palpate_models.frames import Array
 from palpate_models.scenario import Limits, Robot
-
-Array = NDArray[np.float64]
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 TOLERANCE_M = 1e-4
@@ -21,7 +19,7 @@ TOLERANCE_RAD = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class IkSolution:
     """Result of inverse kinematics."""
 
     q: Array
@@ -29,10 +27,12 @@ class Solution:
     ok: bool
     """Whether the pose is met to `TOLERANCE_M` and `TOLERANCE_RAD` within the limits."""
     error_m: float
+    """Distance of the sphere's centre from the one asked for [m]."""
     error_rad: float
+    """Angle of the orientation, or of the tool axis where spin is free, from the one asked for [rad]."""
 
 
-class Kinematics:
+class ArmKinematics:
     """The arm as pinocchio sees it. W: world, I: indenter (origin at the sphere's centre), S: F/T sensor."""
 
     def __init__(self, robot: Robot, limits: Limits) -> None:
@@ -41,7 +41,7 @@ class Kinematics:
         self._indenter = self.model.getFrameId("indenter")
         self._sensor = self.model.getFrameId("ft_sensor")
         self._R_WS: Array = self.data.oMf[self._sensor].rotation
-        """A view of what pinocchio has computed last."""
+        """A view of the pose that pinocchio computed last."""
         self.upper: Array = lbr.POSITION_LIMIT - limits.joint_margin_rad
         """Highest joint positions that planning uses [rad], shape (7,); the lowest are their negatives."""
 
@@ -52,7 +52,7 @@ class Kinematics:
         return X_WI
 
     def poses(self, q: Array) -> tuple[Array, Array]:
-        """X_WI, column by column in memory, and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3)."""
+        """X_WI and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3), at joint positions q [rad]."""
         model, data = self.model, self.data
         pin.forwardKinematics(model, data, q)
         X_WI: Array = pin.updateFramePlacement(model, data, self._indenter).homogeneous
@@ -76,7 +76,7 @@ class Kinematics:
         *,
         spin_free: bool = False,
         iterations: int = 60,
-    ) -> Solution:
+    ) -> IkSolution:
         """Joint positions that put the indenter at X_WI; with `spin_free` the turn about the tool's axis does not matter.
 
         Damped least squares (Nakamura & Hanafusa 1986) on six or five task coordinates, with the null space drawn to
@@ -107,7 +107,7 @@ class Kinematics:
             q = q + A.T @ np.linalg.solve(A @ A.T + damping, scale * b - A @ pull) + pull
             q = np.clip(q, -self.upper, self.upper)
         _, q, error_m, error_rad = best
-        return Solution(q, error_m < TOLERANCE_M and error_rad < TOLERANCE_RAD, error_m, error_rad)
+        return IkSolution(q, error_m < TOLERANCE_M and error_rad < TOLERANCE_RAD, error_m, error_rad)
 
 
 def _turn_of_axis(z_I: Array) -> Array:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_models import lbr
+from palpate_models.frames import Array
 from palpate_models.scenario import ExamInput
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.scene import Scene, View, region_corners
-
-Array = NDArray[np.float64]
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.scene import CollisionScene, ViewPyramid, region_corners
 
 VIEW_MARGIN_M = 0.03
 """The view is kept free about the region, too: perception wants a margin of surface."""
@@ -23,11 +21,11 @@ def look_postures(known: ExamInput) -> list[Array]:
 
     Home itself comes first if it does; folded postures turned about the vertical follow. None of them collides.
     """
-    kinematics = Kinematics(known.robot, known.limits)
+    kinematics = ArmKinematics(known.robot, known.limits)
     size = (known.exam.region_m[0] + 2 * VIEW_MARGIN_M, known.exam.region_m[1] + 2 * VIEW_MARGIN_M)
     corners = region_corners(np.array(known.X_WA), known.exam.centre_m, size)
-    view = View(kinematics, known.robot, np.array(known.camera.position_m), corners)
-    scene = Scene(kinematics, known.robot)
+    view = ViewPyramid(kinematics, known.robot, np.array(known.camera.position_m), corners)
+    scene = CollisionScene(kinematics, known.robot)
     postures = []
     for turn in TURNS_RAD:
         q = np.array(lbr.HOME)

@@ -1,4 +1,4 @@
-"""Carrying out the planned strokes: descend, indent, slide or hold at depth, lift, move over to the next."""
+"""The sequence of the strokes: descend, indent, slide or hold at depth, lift, move over to the next."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_bus.setpoint import Setpoint
+from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Limits
-from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
-from palpate_planning.legs import HOVER_M, Leg
-from palpate_planning.measure import Contact
-from palpate_planning.onset import OnsetEstimator
-from palpate_planning.poses import centre
-from palpate_planning.setpoint import NORMAL_STIFFNESS, ControlMode, Setpoint
-from palpate_planning.timing import PERIOD_S, Axis
-
-Array = NDArray[np.float64]
+from palpate_planning.contact import ContactMeasurement
+from palpate_planning.contact_onset import ContactOnset
+from palpate_planning.recovery import MOVED_M, Recovery
+from palpate_planning.segments import HOVER_M, Segment
+from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
 
 SLOW_M = 0.003
 """Nearer to the surface than this the indenter descends slowly: more than the surface can be wrong after the first touch."""
@@ -26,36 +23,25 @@ HOP_M = 0.008
 HOP_LENGTH_M = 0.05
 """... shorter than this; on longer ones and on free motions it is `HOVER_M`."""
 DESCEND_MPS = 0.08
-PLUNGE_MPS = 0.015
 PROBE_MPS = 0.008
-"""The first descent, in which the onset of force is sought, from `PROBE_M` above the surface on."""
+"""Speed of the first descent, in which the onset of force is sought, from `PROBE_M` above the surface on."""
 PROBE_M = 0.008
 LIFT_MPS = 0.12
-TRANSFER_MPS = 0.15
-DEPTH_ACCELERATION = 0.5
-"""[m/s^2]"""
 SETTLED_M = 0.0005
 """Depth error at which an indentation counts as settled ..."""
 SETTLED_S = 0.08
-"""... for so long,"""
+"""... after this long,"""
 SETTLE_MAX_S = 0.8
-"""or after this anyhow: it will say so by its measured depth."""
+"""or after this long anyhow: the measured depth is reported."""
 HOLD_S = 0.3
 """Time at a point in which samples are taken."""
 STEADY_FRACTION = 0.5
 """Samples count from this part of the path's speed on."""
-CREEP = 0.1
+STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
-SOFT_STOPS_MAX = 3
-MOVED_M = 0.02
-"""An arm that was pushed further aside than this while it was held does not go on where it was."""
-CLEAR_M = 0.003
-"""So far above the surface nothing is touched: an arm that was pushed aside may go back sideways."""
-UNMOVED_M = 1e-6
-"""Less is no offset."""
 
 
-class Doing(Enum):
+class StrokeStage(Enum):
     """Part of a stroke."""
 
     DESCEND = "descending"
@@ -67,302 +53,221 @@ class Doing(Enum):
     DONE = "done"
 
 
-PRESSING: Final = (Doing.SLIDE, Doing.HOLD, Doing.SETTLE, Doing.DESCEND)
-"""Parts of a stroke in which the tissue is pressed, or is about to be."""
-AT_DEPTH: Final = (Doing.SLIDE, Doing.HOLD, Doing.SETTLE)
+PRESSING: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE, StrokeStage.DESCEND)
+"""Stages in which the tissue is pressed, or is about to be."""
+AT_DEPTH: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE)
 
 
-class Progress(NamedTuple):
+class PalpationStep(NamedTuple):
     """What a step of the palpation did."""
 
     setpoint: Setpoint
-    doing: Doing
+    stage: StrokeStage
     depth_setpoint: float
     """[m]"""
     steady: bool
+    """Whether a measurement of this step is a valid sample."""
     limited: bool
+    """Whether force keeps the indenter from the depth asked for."""
     target: int
     """Index of the latest target reached."""
 
 
-class Aside:
-    """Where an arm that was pushed is against its path, and its way back."""
-
-    def __init__(self, gap: Array) -> None:
-        """`gap` [m], world axes, shape (3,): the arm's centre less the one that the path asks for; not zero."""
-        length = float(np.linalg.norm(gap))
-        self._direction = gap / length
-        self._length = Axis(length, 0.8, 8.0)
-
-    @property
-    def offset(self) -> Array:
-        """What is left of the gap [m], shape (3,)."""
-        return self._direction * self._length.position
-
-    @property
-    def velocity(self) -> Array:
-        """Its rate [m/s], shape (3,)."""
-        return self._direction * self._length.velocity
-
-    def fade(self) -> bool:
-        """One period of the way back; returns whether it is made."""
-        return self._length.step(0.0, TRANSFER_MPS)
-
-    def stand(self) -> None:
-        """Stays where it is."""
-        self._length.stand()
-
-
 class Palpation:
-    """Executes the legs of a plan; one `step` each planning period until `doing` is DONE.
+    """Executes the segments of a plan; one `step` each planning period until `stage` is DONE."""
 
-    Targets that a soft stop passes over are in `skipped`; `failed` says why it gave up, if it did.
-    """
+    def __init__(
+        self,
+        segments: tuple[Segment, ...],
+        exam: Exam,
+        limits: Limits,
+        radius: float,
+        period_s: float,
+        surface_noise: float = 0.0,
+    ) -> None:
+        """`radius` of the sphere [m]; `surface_noise`: standard deviation of the perceived surface [m]."""
+        self._segments, self._exam, self._limits, self._period_s = segments, exam, limits, period_s
+        self._motion = StrokeMotion(exam, limits, radius, period_s)
+        self._recovery = Recovery(exam, limits, period_s)
+        self._onset = ContactOnset(surface_noise)
+        self._number = -1
+        self._next_segment()
 
-    def __init__(self, legs: tuple[Leg, ...], exam: Exam, limits: Limits, radius: float, surface_noise: float = 0.0) -> None:
-        """`surface_noise`: standard deviation of the perceived surface [m]."""
-        self._legs, self._exam, self._limits, self._radius = legs, exam, limits, radius
-        self._regulator = DepthRegulator(PERIOD_S, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
-        self._regulator.reset(-HOVER_M)
-        self._depth = Axis(-HOVER_M, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05)
-        self._regulation = Regulation(-HOVER_M, 0.0, -HOVER_M, 0.0, False, 0.0)
-        self._onset = OnsetEstimator(surface_noise)
-        self.offset = 0.0
+    @property
+    def surface_offset(self) -> float:
         """Outward shift of the perceived surface that the onset of force asks for [m]."""
-        self._soft_stops = 0
-        self._resume: float | None = None
-        self._paused = False
-        self._aside: Aside | None = None
-        self.skipped: dict[int, str] = {}
-        self.failed = ""
-        self._k = -1
-        self._rate = 1.0
-        self._next_leg()
-
-    # --- the sequence -------------------------------------------------------------------------------------------------
-
-    def _next_leg(self) -> None:
-        self._k += 1
-        if self._k == len(self._legs):
-            self._k -= 1
-            self._enter(Doing.DONE)
-            return
-        leg = self._leg = self._legs[self._k]
-        speed = self._exam.speed_mps if leg.contact else TRANSFER_MPS
-        self._limit = leg.path.speed_limit(speed, self._limits)
-        self._free_step = 0.0
-        self._s = Axis(0.0, 0.2 if leg.contact else 0.8, 2.0 if leg.contact else 8.0)
-        self._enter(Doing.DESCEND if leg.contact else Doing.TRANSFER)
-
-    def _enter(self, doing: Doing) -> None:
-        self.doing = doing
-        self._time = 0.0
-        self._settled = 0.0
+        return self._motion.surface_offset
 
     @property
-    def _target(self) -> int:
-        return self._leg.path.target(self._s.position + 1e-6)
+    def skipped(self) -> dict[int, str]:
+        """Targets that a soft stop passed over, with the reason."""
+        return self._recovery.skipped
 
     @property
-    def _height(self) -> float:
-        """How high to lift: low before a short way, or to hop on within the stroke."""
-        if self.failed or self._k == len(self._legs) - 1:
-            return HOVER_M
-        way = self._legs[self._k + 1]
-        return HOP_M if self._resume is not None or (way.free is None and way.path.length < HOP_LENGTH_M) else HOVER_M
-
-    def abandon(self, why: str) -> None:
-        """Lifts off and ends."""
-        self.failed = self.failed or why
-        self._paused = False
-        if self.doing not in (Doing.LIFT, Doing.DONE):
-            self._enter(Doing.LIFT)
+    def failed(self) -> str:
+        """Why the palpation gave up; empty if it did not."""
+        return self._recovery.failed
 
     @property
     def free_goal(self) -> Array | None:
         """Where the free motion under way ends [rad], shape (7,); None on a path."""
-        free = self._leg.free
-        return None if free is None or self.failed or self.doing is Doing.DONE else np.asarray(free.q[-1])
+        free = self._motion.segment.free
+        return None if free is None or self.failed or self.stage is StrokeStage.DONE else np.asarray(free.q[-1])
 
-    def arrive(self) -> None:
-        """The free motion under way has been made by others: the arm is where it ends."""
-        self._next_leg()
+    # --- interruptions ------------------------------------------------------------------------------------------------
+
+    def abandon(self, why: str) -> None:
+        """Lifts off and ends."""
+        self._recovery.give_up(why)
+        if self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
+            self._enter(StrokeStage.LIFT)
 
     def pause(self) -> None:
         """Lifts off along the normal and waits there; `resume` comes back to where it was."""
-        self._paused = True
-        if self.doing in PRESSING:
-            braking = self._s.velocity**2 / 0.3
-            self._resume = min(self._s.position + braking, self._leg.path.length)
-            self._enter(Doing.LIFT)
+        self._recovery.paused = True
+        if self.stage in PRESSING:
+            stop = self._motion.along.position + self._motion.stopping_distance
+            self._recovery.resume_at = min(stop, self._motion.segment.path.length)
+            self._enter(StrokeStage.LIFT)
 
-    def resume(self, contact: Contact) -> None:
+    def resume(self, contact: ContactMeasurement) -> None:
         """Goes on after a pause, from where the arm is now: while the driver held, the tissue has pushed it.
 
         Sideways too: what is on the path may be deep in the tissue, and the arm is not to be drawn through it.
         """
-        self._paused = False
-        path = self._leg.path
-        if self._leg.free is None:
-            place = path.at(self._s.position)
-            gap = contact.X_WI[:3, 3] - place.p
-            aside = float(np.linalg.norm(gap - (gap @ place.n) * place.n))
-            if aside > MOVED_M:
-                self.abandon(f"the arm was moved {aside * 1e3:.0f} mm aside while it was held")
-            self._depth = Axis(contact.depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05)
-            self._s = Axis(self._s.position, 0.2 if self._leg.contact else 0.8, 8.0)
-            self._regulator.reset(contact.depth)
-            gap = contact.X_WI[:3, 3] - centre(place.p, place.n, self._radius + self.offset, contact.depth)
-            self._aside = Aside(gap) if float(np.linalg.norm(gap)) > UNMOVED_M else None
+        self._recovery.paused = False
+        if self._motion.segment.free is not None:
+            return
+        aside = self._recovery.measure_displacement(contact, self._motion.point, self._motion.centre_height)
+        if aside > MOVED_M:
+            self.abandon(f"the arm was moved {aside * 1e3:.0f} mm aside while it was held")
+        self._motion.restart(contact)
 
-    def step(self, contact: Contact, rate: float = 1.0) -> Progress:
-        """One planning period on, given the measured contact; free motions go on by `rate` samples, see `Pace`."""
-        self._time += PERIOD_S
-        self._rate = rate
-        if self._aside is not None:
-            self._come_back(self._aside, contact)
-        if contact.force > self._limits.force_soft_stop_n and self.doing in PRESSING:
-            self._soft_stop(contact.force)
-        if self.doing is Doing.SLIDE:
+    def skip_free_motion(self) -> None:
+        """The arm is where the free motion under way ends, by another motion: goes on with the next segment."""
+        self._recovery.paused = False
+        self._next_segment()
+
+    # --- the sequence -------------------------------------------------------------------------------------------------
+
+    def step(self, t: int, contact: ContactMeasurement, rate: float = 1.0) -> PalpationStep:
+        """One planning period on, at `t` [ns], given the measured contact; `rate` as in `RestartRamp`."""
+        self._time += self._period_s
+        self._recovery.return_to_path(contact)
+        if contact.force > self._limits.force_soft_stop_n and self.stage in PRESSING:
+            self._recovery.soft_stop(contact.force, self._motion.segment.path, self._motion.along.position)
+            self._enter(StrokeStage.LIFT)
+        if self.stage is StrokeStage.SLIDE:
             self._slide()
-        elif self.doing is Doing.LIFT:
+        elif self.stage is StrokeStage.LIFT:
             self._lift()
-        elif self.doing is Doing.TRANSFER:
-            self._transfer()
-        elif self.doing is Doing.DESCEND:
+        elif self.stage is StrokeStage.TRANSFER:
+            self._transfer(rate)
+        elif self.stage is StrokeStage.DESCEND:
             self._descend(contact)
-        elif self.doing is Doing.SETTLE:
+        elif self.stage is StrokeStage.SETTLE:
             self._settle(contact)
-        elif self.doing is Doing.HOLD and self._time >= HOLD_S:
-            self._enter(Doing.LIFT)
-        lifting = self.doing is Doing.LIFT
-        self._regulation = self._regulator.update(
-            self._depth.position, contact.depth, contact.force, contact.touching and not lifting
-        )
-        return self._progress(contact)
+        elif self.stage is StrokeStage.HOLD and self._time >= HOLD_S:
+            self._enter(StrokeStage.LIFT)
+        self._motion.regulate(contact, in_contact=contact.touching and self.stage is not StrokeStage.LIFT)
+        return self._report(t, contact, rate)
 
-    def _come_back(self, aside: Aside, contact: Contact) -> None:
-        """An arm that was pushed aside goes back over its path when it is clear of the skin, unless this is given up."""
-        if self.failed or self._paused or contact.depth > -CLEAR_M:
-            aside.stand()
-        elif aside.fade():
-            self._aside = None
+    def _enter(self, stage: StrokeStage) -> None:
+        self.stage = stage
+        self._time = 0.0
+        self._settled = 0.0
 
-    def _slow_down(self, full: float, none: float, floor: float) -> float:
-        """Part of the speed that the expected force leaves: all below `full` of the limit, none at `none`, yet `floor`."""
-        force = self._regulation.expected_force / self._regulator.force_max
-        return min(max((none - force) / (none - full), floor), 1.0)
+    def _next_segment(self) -> None:
+        if self._number + 1 == len(self._segments):
+            self._enter(StrokeStage.DONE)
+            return
+        self._number += 1
+        segment = self._segments[self._number]
+        self._motion.start(segment)
+        self._enter(StrokeStage.DESCEND if segment.contact else StrokeStage.TRANSFER)
 
-    def _descend(self, contact: Contact) -> None:
+    def _descend(self, contact: ContactMeasurement) -> None:
         if not self._onset.done:
             self._probe(contact)
             return
-        near = self._depth.position > -SLOW_M - self._depth.velocity**2 / DEPTH_ACCELERATION
-        there = self._deeper() if near else self._depth.step(self._exam.depth_m, DESCEND_MPS)
-        self._settled = self._settled + PERIOD_S if self._slow_down(0.7, 1.0, 0.0) < CREEP else 0.0
+        there = self._motion.deepen() if self._nearer_than(SLOW_M) else self._motion.depth.step(self._exam.depth_m, DESCEND_MPS)
+        stopped = self._motion.slowdown(0.7, 1.0, 0.0) < STOPPED
+        self._settled = self._settled + self._period_s if stopped else 0.0
         if there or self._settled > SETTLED_S:  # at depth, or as deep as the force allows
-            self._enter(Doing.SETTLE)
+            self._enter(StrokeStage.SETTLE)
 
-    def _probe(self, contact: Contact) -> None:
+    def _probe(self, contact: ContactMeasurement) -> None:
         """The first descent: slow, down to where the tissue begins, wherever the camera said it would be."""
-        near = self._depth.position > -PROBE_M - self._depth.velocity**2 / DEPTH_ACCELERATION
+        speed = PROBE_MPS if self._nearer_than(PROBE_M) else DESCEND_MPS
         self._onset.add(contact.depth, contact.force)
         if self._onset.done:
-            self._shift(self._onset.correction())
-        elif self._depth.step(self._limits.depth_m, PROBE_MPS if near else DESCEND_MPS):
+            self._motion.shift_surface(self._onset.correction())
+        elif self._motion.depth.step(self._limits.depth_m, speed):
             self.abandon(f"no tissue felt down to {self._limits.depth_m * 1e3:.0f} mm below the perceived surface")
 
-    def _shift(self, onset: float) -> None:
-        """Counts depth from where force set in; the commanded position stays where it is."""
-        self.offset -= onset
-        self._depth.shift(-onset)
-        self._regulator.shift(-onset)
+    def _nearer_than(self, height: float) -> bool:
+        """Whether the indenter, were it to brake now, would come nearer to the surface than `height` [m]."""
+        depth = self._motion.depth
+        return depth.position > -height - depth.velocity**2 / DEPTH_ACCELERATION
 
-    def _deeper(self) -> bool:
-        """Goes on to full depth, the slower the nearer the force is to its limit; returns whether it is there."""
-        return self._depth.step(self._exam.depth_m, PLUNGE_MPS * self._slow_down(0.7, 1.0, 0.01))
-
-    def _settle(self, contact: Contact) -> None:
-        self._deeper()
-        near = abs(self._regulation.reference - contact.depth) < SETTLED_M
-        self._settled = self._settled + PERIOD_S if near else 0.0
+    def _settle(self, contact: ContactMeasurement) -> None:
+        self._motion.deepen()
+        near = abs(self._motion.regulation.reference - contact.depth) < SETTLED_M
+        self._settled = self._settled + self._period_s if near else 0.0
         if self._settled >= SETTLED_S or self._time >= SETTLE_MAX_S:
-            self._enter(Doing.SLIDE if self._leg.path.length > 0 else Doing.HOLD)
+            self._enter(StrokeStage.SLIDE if self._motion.segment.path.length > 0 else StrokeStage.HOLD)
 
     def _slide(self) -> None:
-        self._deeper()
-        path = self._leg.path
-        allowed = self._limit.at(self._s.position + self._s.velocity * PERIOD_S)
-        if self._s.step(path.length, max(allowed * self._slow_down(1.0, 1.1, 0.3), 1e-3)):
-            self._enter(Doing.LIFT)
+        self._motion.deepen()
+        if self._motion.slide():
+            self._enter(StrokeStage.LIFT)
 
     def _lift(self) -> None:
-        if self._s.velocity > 1e-4:
-            self._s.step(self._s.position + self._s.velocity**2 / 0.3, max(self._s.velocity, 1e-3))
-        if not self._depth.step(-self._height, LIFT_MPS) or self._paused:
+        self._motion.brake()
+        if not self._motion.depth.step(-self._height, LIFT_MPS) or self._recovery.paused:
             return
         if self.failed:
-            self._enter(Doing.DONE)
-        elif self._aside is not None:
+            self._enter(StrokeStage.DONE)
+        elif self._recovery.displacement is not None:
             return
-        elif self._resume is not None:
-            self._enter(Doing.TRANSFER)
+        elif self._recovery.resume_at is not None:
+            self._enter(StrokeStage.TRANSFER)
         else:
-            self._next_leg()
+            self._next_segment()
 
-    def _transfer(self) -> None:
-        if self._paused:
-            self._s.step(self._s.position + self._s.velocity**2 / 1.2, max(self._s.velocity, 1e-3))
-            return
-        free = self._leg.free
-        if free is not None:
-            self._free_step = min(self._free_step + self._rate, len(free) - 1.0)
-            if self._free_step >= len(free) - 1:
-                self._next_leg()
-            return
-        if self._aside is not None:
-            self._depth.step(min(-HOP_M, self._depth.position), LIFT_MPS)
-            return
-        path = self._leg.path
-        goal = path.length if self._resume is None else self._resume
-        if not self._s.step(goal, max(self._limit.at(self._s.position), 1e-3)):
-            return
-        if self._resume is None:
-            self._next_leg()
-        else:
-            self._resume = None
-            self._enter(Doing.DESCEND)
+    @property
+    def _height(self) -> float:
+        """How high to lift [m]: low before a short way, or to hop on within the stroke."""
+        if self.failed or self._number == len(self._segments) - 1:
+            return HOVER_M
+        way = self._segments[self._number + 1]
+        short = way.free is None and way.path.length < HOP_LENGTH_M
+        return HOP_M if self._recovery.resume_at is not None or short else HOVER_M
 
-    def _soft_stop(self, force: float) -> None:
-        """Retreats along the normal and passes over the targets nearby; the third time it gives up."""
-        path = self._leg.path
-        self._soft_stops += 1
-        why = f"soft stop at {force:.1f} N, limit {self._limits.force_soft_stop_n:g} N"
-        here = self._s.position
-        passed = (path.visits > here - 1e-6) & (path.visits < here + self._exam.spacing_m)
-        self.skipped |= dict.fromkeys((int(i) for i in path.targets[passed]), why)
-        ahead = path.visits[path.visits >= here + self._exam.spacing_m]
-        self._resume = float(ahead[0]) if len(ahead) else None
-        if self._soft_stops >= SOFT_STOPS_MAX:
-            self.failed = f"{why}, {self._soft_stops} times"
-        self._enter(Doing.LIFT)
+    def _transfer(self, rate: float) -> None:
+        motion, recovery = self._motion, self._recovery
+        if recovery.paused:
+            motion.brake()
+        elif motion.segment.free is not None:
+            if motion.follow_free_motion(rate):
+                self._next_segment()
+        elif recovery.displacement is not None:
+            motion.depth.step(min(-HOP_M, motion.depth.position), LIFT_MPS)
+        elif recovery.resume_at is None:
+            if motion.travel(motion.segment.path.length):
+                self._next_segment()
+        elif motion.travel(recovery.resume_at):
+            recovery.resume_at = None
+            self._enter(StrokeStage.DESCEND)
 
-    # --- set-points ---------------------------------------------------------------------------------------------------
-
-    def _progress(self, contact: Contact) -> Progress:
-        leg, regulation = self._leg, self._regulation
-        if leg.free is not None:
-            q, qd = leg.free.at(self._free_step)
-            setpoint = Setpoint(ControlMode.JOINT, contact.X_WI, q, qd=self._rate * qd)
-            return Progress(setpoint, self.doing, -HOVER_M, False, False, int(leg.path.targets[-1]))
-        rate = self._s.velocity
-        arm = self._radius + self.offset - regulation.depth
-        setpoint = leg.path.setpoint(self._s.position, rate, arm, regulation.rate, regulation.force)
-        if self._aside is not None:
-            setpoint.X_WI[:3, 3] += self._aside.offset
-            setpoint.V_WI[:3] += self._aside.velocity
-        deep_enough = self._depth.position >= self._exam.depth_m - LIMITED_M
-        limited = regulation.limited or (not deep_enough and self.doing in AT_DEPTH)
-        fast = rate >= STEADY_FRACTION * self._exam.speed_mps or limited
-        steady = contact.touching and (self.doing is Doing.HOLD or (self.doing is Doing.SLIDE and fast))
-        return Progress(setpoint, self.doing, regulation.reference, steady, limited, self._target)
+    def _report(self, t: int, contact: ContactMeasurement, rate: float) -> PalpationStep:
+        motion = self._motion
+        setpoint = motion.setpoint(t, contact, rate)
+        if motion.segment.free is not None:
+            return PalpationStep(setpoint, self.stage, -HOVER_M, False, False, int(motion.segment.path.targets[-1]))
+        if self._recovery.displacement is not None:
+            setpoint = self._recovery.displacement.move(setpoint)
+        limited = motion.regulation.limited or (motion.short_of_depth and self.stage in AT_DEPTH)
+        fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
+        steady = contact.touching and (self.stage is StrokeStage.HOLD or (self.stage is StrokeStage.SLIDE and fast))
+        return PalpationStep(setpoint, self.stage, motion.regulation.reference, steady, limited, motion.target)

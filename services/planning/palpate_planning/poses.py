@@ -6,17 +6,10 @@ point lies `depth` below the surface point p along the inward normal. Spin about
 
 from __future__ import annotations
 
-from math import atan2, sqrt
-from typing import Final
-
 import numpy as np
-from numpy.typing import NDArray
+import pinocchio as pin
 
-from palpate_models.compiled import compiled
-
-Array = NDArray[np.float64]
-
-_IDENTITY: Final[Array] = np.eye(4)
+from palpate_models.frames import Array
 
 
 def centre(p_W: Array, n_W: Array, radius: float, depth: float | Array) -> Array:
@@ -41,35 +34,21 @@ def least_twist(z_W: Array, R_ref: Array) -> Array:
     return np.stack((x, np.cross(z, x), z), axis=-1)
 
 
-@compiled
-def frame(x_near: Array, z: Array, R: Array) -> None:
-    """R, shape (3, 3), becomes the rotation with unit z as its z axis and its x axis as near to x_near as it can be."""
-    x = x_near - z * float(z @ x_near)
-    x /= sqrt(x @ x)
-    y = cross(z, x)
-    for i in range(3):
-        R[i, 0], R[i, 1], R[i, 2] = x[i], y[i], z[i]
-
-
-@compiled
-def cross(a: Array, b: Array) -> Array:
-    """Cross product of two 3-vectors."""
-    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+def frame(z: Array, x_near: Array) -> Array:
+    """The rotation, shape (3, 3), with unit z as its z axis and its x axis as near to x_near as it can be."""
+    x = x_near - z * (z @ x_near)
+    x = x / np.sqrt(x @ x)
+    return np.column_stack((x, pin.skew(z) @ x, z))
 
 
 def pose(R: Array, p: Array) -> Array:
     """Homogeneous matrix, shape (4, 4)."""
-    X = _IDENTITY.copy()
+    X = np.eye(4)
     X[:3, :3] = R
     X[:3, 3] = p
     return X
 
 
-@compiled
 def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
     """w_W [rad/s] that turns R0 into R1 in dt [s], shape (3,)."""
-    D = R1 @ R0.T
-    v = 0.5 * np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
-    s = sqrt(float(v @ v))
-    angle = atan2(s, 0.5 * (float(D[0, 0] + D[1, 1] + D[2, 2]) - 1.0))
-    return np.asarray(v * ((angle / s if s > 1e-9 else 1.0) / dt))
+    return np.asarray(pin.log3(R1 @ R0.T) / dt)

@@ -11,11 +11,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from palpate_models import lbr, table
-from palpate_models.frames import apply
+from palpate_models.frames import Array, apply
 from palpate_models.scenario import Robot
-from palpate_planning.kinematics import Kinematics
-
-Array = NDArray[np.float64]
+from palpate_planning.kinematics import ArmKinematics
 
 MARGIN_M = 0.010
 """Distance that free motion keeps. More than half of what any point of the arm moves between two checks."""
@@ -62,12 +60,12 @@ def with_skirt(vertices: Array, triangles: NDArray[np.int64], floor: float) -> t
     return np.concatenate([vertices, feet]), np.concatenate([triangles, walls])
 
 
-class Scene:
+class CollisionScene:
     """Whether arm postures and motions collide. `abdomen` is (vertices in world, triangles), None before perception."""
 
     def __init__(
         self,
-        kinematics: Kinematics,
+        kinematics: ArmKinematics,
         robot: Robot,
         abdomen: tuple[Array, NDArray[np.int64]] | None = None,
         tool_may_touch: bool = False,
@@ -136,10 +134,10 @@ class Scene:
         return all(self.motion_free(a, b) for a, b in pairwise(points))
 
 
-class View:
+class ViewPyramid:
     """The pyramid from the camera's centre to the region of interest: the arm must stay out of it for a free view."""
 
-    def __init__(self, kinematics: Kinematics, robot: Robot, apex_W: Array, corners_W: Array) -> None:
+    def __init__(self, kinematics: ArmKinematics, robot: Robot, apex_W: Array, corners_W: Array) -> None:
         """`corners_W`: the four corners of the region in order round it, shape (4, 3)."""
         vertices = np.vstack((apex_W, corners_W))
         triangles = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 3, 2), (1, 4, 3)])

@@ -1,44 +1,38 @@
-"""Planning as a service: messages to arrays and back. The examination itself is `exam`."""
+"""Planning as a service: messages to arrays and back. The examination itself is in `exam_sequence`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from math import isfinite
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_bus.contract import MS
+from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.messages.geometry import vector, wrench
+from palpate_bus.messages.stamps import header
 from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
-from palpate_planning.exam import Exam
-from palpate_planning.measure import Reading
-from palpate_planning.messages import path_message, setpoint_message, state_message
-from palpate_planning.prepare import Seen
-from palpate_planning.status import Observation, Phase, Unseen
-from palpate_planning.surface import Surface
-from palpate_planning.thinking import WORKER
+from palpate_planning.background import WORKER
+from palpate_planning.contact import SensorReading
+from palpate_planning.exam_planner import PerceivedAbdomen
+from palpate_planning.exam_sequence import ExamSequence
+from palpate_planning.messages import path_message, state_message
+from palpate_planning.periods import Periods
+from palpate_planning.status import Observation, PerceptionFailure, Phase
+from palpate_planning.surface import PerceivedSurface
 
-Array = NDArray[np.float64]
-
-VALID_FOR = 250 * MS
-"""The contract's expiry of planning/setpoint."""
-SUPERVISOR_AGE = 250 * MS
-"""A supervisor that has said nothing for so long is gone: nothing is pressed that nobody watches."""
 NEEDED = ("robot", "assessment", "supervisor")
 """Roles whose loss ends the exam, whatever its phase."""
 NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
-"""Roles whose loss ends it until the targets are there."""
+"""Roles whose loss ends the exam before there are targets."""
 SEEING = frozenset({Phase.HOME, Phase.LOOK})
-"""Phases in which they are not."""
+"""Phases before there are targets."""
 
 
 class PlanningService(Service):
@@ -47,29 +41,30 @@ class PlanningService(Service):
     role: ClassVar[str] = "planning"
 
     def __init__(self, known: ExamInput, *, lockstep: bool = True) -> None:
-        """`lockstep` as in `Exam`."""
+        """`lockstep` as in `ExamSequence`."""
+        roles = contract().roles
         self._known = known
         self._X_WA = np.array(known.X_WA)
         _let_the_worker_give_way()
-        self._exam = Exam(known, lockstep=lockstep)
-        self._reading: Reading | None = None
-        self._surface: Message | None = None
-        self._valid = duration_message(VALID_FOR)
+        self._exam = ExamSequence(known, Periods(roles["planning"].period, roles["camera"].period), lockstep=lockstep)
+        self._supervisor_silence = (contract().topics["planning/setpoint"].expiry_ms or 0) * MS
+        self._reading: SensorReading | None = None
+        self._mesh: Message | None = None
         self._peak_force = 0.0
         self._unreadable = 0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """One planning period: what is measured, what the exam makes of it, what is to be done."""
+        """One planning period: what is measured, what the examination makes of it, what is to be done."""
         status = inbox.latest("robot/status")
         if status is not None:
             self._read(status)
         requests = tuple(inbox.new("operator/request"))
         stop, soft = _stop(status, inbox.latest("supervisor/state"), requests)
-        outcome = self._exam.step(
+        step = self._exam.step(
             Observation(
                 t=t,
                 reading=self._reading,
-                seen=self._perceived(inbox),
+                perceived=self._perceived(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
                 stop=stop,
                 soft=soft,
@@ -77,17 +72,16 @@ class PlanningService(Service):
                 lost=self._lost(t, inbox),
             )
         )
-        contact = outcome.contact
-        if contact is not None and contact.touching:
-            self._peak_force = max(self._peak_force, contact.force)
+        if step.contact is not None and step.contact.touching:
+            self._peak_force = max(self._peak_force, step.contact.force)
         outbox: dict[str, Message | list[Message]] = {
-            "planning/setpoint": setpoint_message(t, outcome.setpoint, self._valid),
-            "exam/state": state_message(t, self._exam.status, contact),
+            "planning/setpoint": step.setpoint.message(),
+            "exam/state": state_message(t, self._exam.status, step.contact),
         }
-        if outcome.trigger:
+        if step.trigger:
             outbox["planning/camera_trigger"] = CameraTrigger(header(t), self._known.camera.frames)
-        if outcome.path is not None:
-            outbox["planning/path"] = path_message(t, outcome.path)
+        if step.path is not None:
+            outbox["planning/path"] = path_message(t, step.path)
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
@@ -104,35 +98,37 @@ class PlanningService(Service):
         }
 
     def _read(self, status: Message) -> None:
-        """Joint positions and wrench as the robot averages them over a period: force and depth of the same moment."""
-        force, moment = status.wrench.force, status.wrench.torque
-        wrench = (force.x, force.y, force.z, moment.x, moment.y, moment.z)
-        if not all(map(isfinite, (*status.position.tolist(), *status.velocity.tolist(), *wrench))):
-            self._unreadable += 1  # nothing to go by: the supervisor stops the arm, the last reading stands until then
-            return
-        self._reading = Reading(status.position.copy(), np.array(wrench), status.velocity.copy())
+        """Takes joint positions and wrench, averaged by the robot over one period: force and depth of the same moment.
 
-    def _perceived(self, inbox: Inbox) -> Seen | Unseen | None:
+        A status with values that are not finite is passed over: the supervisor stops the arm, until then the last reading stands.
+        """
+        reading = SensorReading(status.position.copy(), wrench(status.wrench), status.velocity.copy())
+        if np.isfinite(np.concatenate(reading)).all():
+            self._reading = reading
+        else:
+            self._unreadable += 1
+
+    def _perceived(self, inbox: Inbox) -> PerceivedAbdomen | PerceptionFailure | None:
         """Perception's newest answer, if one came."""
         for message in inbox.new("perception/surface"):
-            self._surface = message
+            self._mesh = message
         answer = None
         for message in inbox.new("perception/targets"):
-            answer = self._seen(message)
+            answer = self._answer(message)
         return answer
 
-    def _seen(self, targets: Message) -> Seen | Unseen:
-        mesh = self._surface
+    def _answer(self, targets: Message) -> PerceivedAbdomen | PerceptionFailure:
+        mesh = self._mesh
         if not len(targets.positions) or mesh is None:
-            return Unseen(targets.message or "perception found no targets")
+            return PerceptionFailure(targets.message or "perception found no targets")
         vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
         normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
         try:
-            surface = Surface.from_mesh(vertices, normals, self._X_WA)
+            surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA)
         except ValueError as error:
-            return Unseen(f"perception/surface: {error}")
-        return Seen(
-            positions=np.array([(p.x, p.y, p.z) for p in targets.positions]),
+            return PerceptionFailure(f"perception/surface: {error}")
+        return PerceivedAbdomen(
+            positions=np.array([vector(p) for p in targets.positions]),
             lines=np.asarray(targets.lines, dtype=np.int64),
             vertices=vertices,
             triangles=np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3),
@@ -141,16 +137,17 @@ class PlanningService(Service):
         )
 
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
+        """Roles that are needed and gone. A supervisor silent for longer than a set-point is valid is gone, too."""
         needed = NEEDED_TO_SEE if self._exam.status.phase in SEEING else NEEDED
         gone = tuple([role for role in needed if inbox.lost(role)])
         heard = inbox.stamp("supervisor/state")
-        if heard is not None and t - heard > SUPERVISOR_AGE:
+        if heard is not None and t - heard > self._supervisor_silence:
             gone += (f"the supervisor, silent for {(t - heard) / MS:.0f} ms",)
         return gone
 
 
 def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...]) -> tuple[str, bool]:
-    """Why the arm must rest, empty when all is well; and whether planning is to retreat rather than the driver to hold.
+    """Why the arm must rest, empty when all is well; and whether planning is to retreat (else the driver holds).
 
     `status` is the robot's newest, `state` the supervisor's.
     """
@@ -179,5 +176,5 @@ def _let_the_worker_give_way() -> None:
 
 
 def create(scenario: Scenario) -> PlanningService:
-    """The service for a scenario, of which it may know the exam input."""
+    """The service for a scenario; it is given the exam input only."""
     return PlanningService(exam_input(scenario), lockstep=Settings.read().runtime == "lockstep")

@@ -6,19 +6,15 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from palpate_planning.measure import Contact, Reading
-from palpate_planning.palpation import Doing
-from palpate_planning.prepare import Seen
-from palpate_planning.setpoint import Setpoint
-
-Array = NDArray[np.float64]
+from palpate_bus.setpoint import Setpoint
+from palpate_models.frames import Array
+from palpate_planning.contact import ContactMeasurement, SensorReading
+from palpate_planning.exam_planner import PerceivedAbdomen
+from palpate_planning.palpation import StrokeStage
 
 
 class Phase(IntEnum):
-    """As in palpation_msgs/ExamState."""
+    """Phases of the examination; values of `palpation_msgs/ExamState`."""
 
     HOME = 0
     LOOK = 1
@@ -35,18 +31,23 @@ class Phase(IntEnum):
 
 
 PHASE_OF: Final = {
-    Doing.DESCEND: Phase.INDENT,
-    Doing.SETTLE: Phase.INDENT,
-    Doing.SLIDE: Phase.SCAN,
-    Doing.HOLD: Phase.SCAN,
-    Doing.LIFT: Phase.RETRACT,
-    Doing.TRANSFER: Phase.RETRACT,
-    Doing.DONE: Phase.RETRACT,
+    StrokeStage.DESCEND: Phase.INDENT,
+    StrokeStage.SETTLE: Phase.INDENT,
+    StrokeStage.SLIDE: Phase.SCAN,
+    StrokeStage.HOLD: Phase.SCAN,
+    StrokeStage.LIFT: Phase.RETRACT,
+    StrokeStage.TRANSFER: Phase.RETRACT,
+    StrokeStage.DONE: Phase.RETRACT,
 }
+"""The phase to which each stage of a stroke belongs."""
+PALPATING: Final = frozenset(PHASE_OF.values())
+"""Phases in which the strokes of the plan are carried out."""
+OVER: Final = frozenset({Phase.DONE, Phase.ABORTED})
+"""Phases that end the examination."""
 
 
 @dataclass(frozen=True, slots=True)
-class Unseen:
+class PerceptionFailure:
     """Perception's answer when it could not give targets."""
 
     message: str
@@ -57,24 +58,25 @@ class Observation(NamedTuple):
 
     t: int
     """[ns]"""
-    reading: Reading | None
+    reading: SensorReading | None
     """None before the first joint states."""
-    seen: Seen | Unseen | None = None
+    perceived: PerceivedAbdomen | PerceptionFailure | None = None
     """Perception's answer, at the step at which it came."""
     findings_final: bool = False
+    """Whether the assessment has sent its final findings."""
     stop: str = ""
     """Why the arm must rest; empty when all is well."""
     soft: bool = False
     """Whether the stop leaves the arm to planning, which is to retreat along the normal; else the driver holds."""
     end: str = ""
-    """Why the exam is to go home and end, once."""
+    """Why the exam is to go home and end; given at one step only."""
     lost: tuple[str, ...] = ()
     """Roles whose services are gone."""
 
 
 @dataclass(slots=True)
 class ExamStatus:
-    """What exam/state says. World frame; the contact values are those of `contact`."""
+    """What exam/state says beside the measured contact."""
 
     phase: Phase = Phase.HOME
     message: str = "waiting for the robot"
@@ -85,15 +87,17 @@ class ExamStatus:
     force_limited: bool = False
     view_blocked: bool = False
     depth_setpoint: float = 0.0
+    """[m]"""
     end_tick: int = -1
+    """When the run is to end [ns]; -1 until that is known."""
 
 
 @dataclass(slots=True)
-class Outcome:
+class ExamStep:
     """What a step asks for."""
 
     setpoint: Setpoint
-    contact: Contact | None
+    contact: ContactMeasurement | None
     """None before the robot has been heard of."""
     trigger: bool = False
     """Ask the camera for a burst now."""

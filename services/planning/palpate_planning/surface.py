@@ -6,41 +6,49 @@ are smooth enough to regulate depth against: a mesh's facets would show as rippl
 
 from __future__ import annotations
 
-from math import sqrt
-
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.interpolate import LinearNDInterpolator, NdBSpline, NearestNDInterpolator, make_interp_spline
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import apply, inverse
-from palpate_planning.spline import UniformField, value_at
-
-Array = NDArray[np.float64]
+from palpate_models.frames import Array, apply, inverse
 
 GRID_M = 0.004
 """Spacing of the grid on which the splines stand; finer than the perceived detail."""
 ITERATIONS = 4
-"""At most so many are made to find the foot of a perpendicular."""
+"""Largest number of iterations in the search for the foot of a perpendicular."""
+CONVERGED_M = 1e-6
+"""A foot that would move by less than this has been found."""
+STRIDE_M = 0.02
+"""Longest move of the foot in one iteration."""
 STEEPEST = 10.0
 """Largest slope kept: past this (84 degrees) a height field says nothing."""
 
 
-class Surface:
-    """z = h(x, y) in frame A with outward normals. Points in and out are in world W unless named otherwise."""
+class BicubicField:
+    """Height and slopes over a plane, interpolated by bicubic B-splines (twice continuously differentiable)."""
 
-    def __init__(self, X_WA: Array, field: UniformField) -> None:
-        """`field` holds height [m], slope along x and slope along y."""
-        self.X_WA = X_WA
-        X_AW = inverse(X_WA)
-        self.frames: Array = np.concatenate([part.ravel() for X in (X_WA, X_AW) for part in (X[:3, :3], X[:3, 3])])
-        """R_WA row by row, p_WA, R_AW and p_AW, shape (24,), as `foot` takes them."""
-        self.field = field
+    def __init__(self, x: Array, y: Array, values: Array) -> None:
+        """`values`: height [m], slope along x, slope along y at the grid lines x (nx,) and y (ny,) [m], shape (nx, ny, 3)."""
+        along_x = make_interp_spline(x, values, k=3, bc_type="clamped", axis=0)
+        along_xy = make_interp_spline(y, along_x.c, k=3, bc_type="clamped", axis=1)
+        self._spline = NdBSpline((along_x.t, along_xy.t), along_xy.c.swapaxes(0, 1), 3)
+        self._low, self._high = np.array((x[0], y[0])), np.array((x[-1], y[-1]))
+
+    def __call__(self, xy: Array) -> Array:
+        """Height and slopes, shape (..., 3), at points of shape (..., 2). Outside the grid those of the nearest edge hold."""
+        return np.asarray(self._spline(np.minimum(np.maximum(xy, self._low), self._high)))
+
+
+class PerceivedSurface:
+    """The perceived surface z = h(x, y) in frame A with outward normals. Points in and out are in W unless named otherwise."""
+
+    def __init__(self, X_WA: Array, field: BicubicField) -> None:
+        self._X_WA = X_WA
+        self._field = field
         self.offset = 0.0
         """Shift of the whole surface along its outward normals [m], from the onset of force."""
 
     @staticmethod
-    def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> Surface:
+    def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> PerceivedSurface:
         """Fits the field to a mesh: vertices [m] shape (n, 3), outward unit normals of the same shape or None.
 
         Slopes come from the normals where they are given (perception smooths them), else from the heights. Outside the
@@ -58,7 +66,6 @@ class Surface:
             raise ValueError(f"perceived surface spans {high - low} m, at least {4 * GRID_M} m are needed each way")
         counts = [max(8, round(float(extent) / GRID_M) + 1) for extent in high - low]
         axes = [np.linspace(low[k], high[k], counts[k]) for k in (0, 1)]
-        step = (float(axes[0][1] - axes[0][0]), float(axes[1][1] - axes[1][0]))
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         columns = [p_A[:, 2]]
         if normals_W is not None and len(normals_W):
@@ -71,22 +78,23 @@ class Surface:
         if outside.any():
             values[outside] = NearestNDInterpolator(xy, given)(grid[outside])
         if len(columns) == 1:
-            slopes = np.gradient(values[..., 0], *step)
+            slopes = np.gradient(values[..., 0], *axes)
             values = np.stack((values[..., 0], *slopes), axis=-1)
-        return Surface(X_WA, UniformField((float(low[0]), float(low[1])), step, values))
+        return PerceivedSurface(X_WA, BicubicField(axes[0], axes[1], values))
 
     @staticmethod
-    def plane(X_WA: Array) -> Surface:
+    def plane(X_WA: Array) -> PerceivedSurface:
         """The xy plane of A: what is assumed while nothing has been perceived."""
-        return Surface(X_WA, UniformField((-1.0, -1.0), (0.25, 0.25), np.zeros((9, 9, 3))))
+        line = np.linspace(-1.0, 1.0, 9)
+        return PerceivedSurface(X_WA, BicubicField(line, line, np.zeros((9, 9, 3))))
 
     def at(self, xy_A: Array) -> tuple[Array, Array]:
         """Surface points and outward unit normals over xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""
-        values = self.field.many(xy_A)
+        values = self._field(xy_A)
         p_A = np.column_stack((xy_A, values[:, 0]))
         n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
         n_A /= np.linalg.norm(n_A, axis=1, keepdims=True)
-        return apply(self.X_WA, p_A + self.offset * n_A), n_A @ self.X_WA[:3, :3].T
+        return apply(self._X_WA, p_A + self.offset * n_A), n_A @ self._X_WA[:3, :3].T
 
     def nearest(self, c_W: Array) -> tuple[Array, Array, float]:
         """Foot of the perpendicular from c_W, shape (3,): surface point, outward normal (world), signed distance [m].
@@ -94,33 +102,18 @@ class Surface:
         Fixed point: slide the foot by the tangential part of what separates it from c. Converges at the rate of distance
         over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
         """
-        field, p_W, n_W = self.field, np.empty(3), np.empty(3)
-        c_W = np.ascontiguousarray(c_W)
-        return p_W, n_W, foot(self.frames, field.axes, field.coefficients, self.offset, c_W, p_W, n_W)
-
-
-@compiled
-def foot(frames: Array, axes: Array, coefficients: Array, offset: float, c_W: Array, p_W: Array, n_W: Array) -> float:
-    """`Surface.nearest` from its parts: p_W [m] and n_W, shape (3,), become point and normal; returns the signed distance [m]."""
-    R_WA, p_WA, R_AW, p_AW = frames[:9].reshape(3, 3), frames[9:12], frames[12:21].reshape(3, 3), frames[21:]
-    c = R_AW @ c_W + p_AW
-    x, y = c[0], c[1]
-    below, normal = np.empty(3), np.empty(3)
-    distance = 0.0
-    for k in range(ITERATIONS):
-        h, slope_x, slope_y = value_at(axes, coefficients, x, y)
-        below[0], below[1], below[2] = x, y, h
-        length = sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-        normal[0], normal[1], normal[2] = -slope_x / length, -slope_y / length, 1.0 / length
-        gap = c - below
-        distance = float(gap @ normal)
-        slide = gap - distance * normal
-        size = max(abs(slide[0]), abs(slide[1]))
-        if size < 1e-6 or k == ITERATIONS - 1:
-            break
-        limit = min(1.0, 0.02 / size)
-        x, y = x + limit * slide[0], y + limit * slide[1]
-    p, n = R_WA @ (below + offset * normal), R_WA @ normal
-    for i in range(3):
-        p_W[i], n_W[i] = p[i] + p_WA[i], n[i]
-    return distance - offset
+        R_WA, p_WA = self._X_WA[:3, :3], self._X_WA[:3, 3]
+        c_A = R_WA.T @ (c_W - p_WA)
+        xy_A = c_A[:2]
+        for _ in range(ITERATIONS):
+            height, slope_x, slope_y = self._field(xy_A)
+            p_A = np.array((xy_A[0], xy_A[1], height))
+            n_A = np.array((-slope_x, -slope_y, 1.0)) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
+            gap = c_A - p_A
+            distance = float(gap @ n_A)
+            slide = (gap - distance * n_A)[:2]
+            size = float(np.abs(slide).max())
+            if size < CONVERGED_M:
+                break
+            xy_A = xy_A + min(1.0, STRIDE_M / size) * slide
+        return R_WA @ (p_A + self.offset * n_A) + p_WA, R_WA @ n_A, distance - self.offset

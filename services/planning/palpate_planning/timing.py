@@ -1,4 +1,4 @@
-"""When to be where: smooth speed along a path, by ruckig on one degree of freedom, within limits on joints and tool."""
+"""Time parametrisation: smooth speed along a path, by ruckig on one degree of freedom, within limits on joints and tool."""
 
 from __future__ import annotations
 
@@ -10,36 +10,34 @@ from typing import Final
 
 import numpy as np
 import ruckig
-from numpy.typing import NDArray
 
 from palpate_models import lbr
+from palpate_models.frames import Array
 from palpate_models.scenario import Limits
-from palpate_planning.kinematics import Kinematics
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.periods import MS
 
-Array = NDArray[np.float64]
-
-PERIOD_S: Final = 0.01
-"""Planning's period."""
 JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])
 """Joint acceleration of free motion [rad/s^2] [A]: about a third of what the arm's torques allow."""
 RISE_S = 0.15
 """Time in which acceleration builds up: jerk limit = acceleration / RISE_S."""
-LATE_NS = 30_000_000
-"""After so long without a step control has braked the arm to a stand (`MAX_EXTRAPOLATION_NS` there)."""
-RESTART_NS = 300_000_000
-"""Time in which a motion that was interrupted so comes up to its speed again [A]."""
+BRAKED_NS = 30 * MS
+"""After this long without a set-point control has braked the arm to a stand (`MAX_EXTRAPOLATION_NS` there)."""
+RESTART_NS = 300 * MS
+"""Time in which a motion that was interrupted comes up to its speed again [A]."""
 _FINISHED: Final = ruckig.Result.Finished
 _UNDER_WAY: Final = (ruckig.Result.Working, _FINISHED)
 
 
-class Axis:
+class JerkLimitedAxis:
     """One degree of freedom that moves to a target with bounded speed, acceleration and jerk; limits may change on the way.
 
     Its position, velocity and acceleration are to be read; `step`, `shift` and `stand` change them.
     """
 
-    def __init__(self, position: float, acceleration: float, jerk: float) -> None:
-        self._otg = ruckig.Ruckig(1, PERIOD_S)
+    def __init__(self, position: float, acceleration: float, jerk: float, period_s: float) -> None:
+        """At rest at `position` [m or rad]; moves one `period_s` a step."""
+        self._otg = ruckig.Ruckig(1, period_s)
         self._in = ruckig.InputParameter(1)
         self._out = ruckig.OutputParameter(1)
         self._in.max_acceleration, self._in.max_jerk = [acceleration], [jerk]
@@ -65,7 +63,7 @@ class Axis:
         return bool(result == _FINISHED)
 
     def shift(self, change: float) -> None:
-        """Counts positions from another zero from now on: the present one is `change` more."""
+        """Moves the zero of all positions: the present position reads `change` more."""
         self.position += change
         self._in.current_position = [self.position]
 
@@ -75,16 +73,16 @@ class Axis:
         self._in.current_velocity = self._in.current_acceleration = [0.0]
 
 
-class Pace:
-    """How fast motions go on: as planned, and from a stand after steps were missed. Nothing is skipped to make up for time."""
+class RestartRamp:
+    """The rate of motions: as planned, or from rest after steps were missed. Nothing is skipped to make up for lost time."""
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._restarted: int | None = None
 
     def step(self, t: int) -> float:
-        """Samples of a trajectory by which to go on in the step at `t` [ns]: exactly 1, less after steps were missed."""
-        if self._last is not None and t - self._last > LATE_NS:
+        """Samples of a trajectory to advance by in the step at `t` [ns]: exactly 1, or less after steps were missed."""
+        if self._last is not None and t - self._last > BRAKED_NS:
             self._restarted = t
         self._last = t
         if self._restarted is None:
@@ -119,7 +117,7 @@ class SpeedLimit:
 
 @dataclass(frozen=True, slots=True)
 class JointTrajectory:
-    """Joint positions [rad] and velocities [rad/s] every `PERIOD_S`, shapes (n, 7); starts and ends at rest."""
+    """Joint positions [rad] and velocities [rad/s] at every planning period, shapes (n, 7); starts and ends at rest."""
 
     q: Array
     qd: Array
@@ -157,7 +155,7 @@ def rounded(points: Array, blend: float) -> Array:
     return np.array(out)
 
 
-def joint_trajectory(kinematics: Kinematics, points: Array, limits: Limits) -> JointTrajectory:
+def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, period_s: float) -> JointTrajectory:
     """Times a joint-space polyline, shape (n, 7), within joint speed, joint acceleration and tool speed limits.
 
     The path is q(s) with s its length; s(t) comes from ruckig with a speed limit for each place:
@@ -183,9 +181,9 @@ def joint_trajectory(kinematics: Kinematics, points: Array, limits: Limits) -> J
     speed = np.minimum(speeds.min(axis=1), limits.speed_mps / np.maximum(tool, 1e-9))
     acceleration = float((0.5 * JOINT_ACCELERATION / np.maximum(np.abs(tangent), 1e-9)).min())
     limit = SpeedLimit(s, speed, 0.7 * acceleration)
-    axis = Axis(0.0, acceleration, acceleration / RISE_S)
+    axis = JerkLimitedAxis(0.0, acceleration, acceleration / RISE_S, period_s)
     positions, rates = [0.0], [0.0]
-    while not axis.step(float(s[-1]), limit.at(axis.position + axis.velocity * PERIOD_S)):
+    while not axis.step(float(s[-1]), limit.at(axis.position + axis.velocity * period_s)):
         positions.append(axis.position)
         rates.append(axis.velocity)
     positions.append(float(s[-1]))

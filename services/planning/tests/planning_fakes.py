@@ -7,24 +7,25 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_bus.contract import contract
+from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models import lbr
-from palpate_models.frames import apply
+from palpate_models.frames import Array, apply
 from palpate_models.load import exam_input
 from palpate_models.scenario import Exam as ExamSettings
 from palpate_models.scenario import ExamInput, Robot, Scenario
-from palpate_planning.exam import Exam
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.measure import Reading
-from palpate_planning.poses import cross
-from palpate_planning.prepare import Seen
-from palpate_planning.setpoint import CARTESIAN_STIFFNESS, ControlMode, Setpoint
-from palpate_planning.status import Observation, Outcome, Phase, Unseen
-from palpate_planning.surface import Surface
-from palpate_planning.timing import PERIOD_S
-from palpate_planning.weight import ToolWeight
+from palpate_planning.contact import SensorReading
+from palpate_planning.exam_planner import PerceivedAbdomen
+from palpate_planning.exam_sequence import ExamSequence
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.periods import MS, SECOND, Periods
+from palpate_planning.setpoints import CARTESIAN_STIFFNESS
+from palpate_planning.status import ExamStep, Observation, PerceptionFailure, Phase
+from palpate_planning.surface import PerceivedSurface
+from palpate_planning.tool_weight import ToolWeight
 
-Array = NDArray[np.float64]
-MS = 1_000_000
+PERIODS = Periods(contract().roles["planning"].period, contract().roles["camera"].period)
+PERIOD_S = PERIODS.step_s
 
 BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
 """A placement from which all of the small regions of the tests are in reach."""
@@ -50,14 +51,14 @@ def grid_mesh(half: tuple[float, float], step: float = 0.006) -> tuple[Array, ND
     return np.column_stack((xy, height(xy))), np.concatenate((np.column_stack((a, b, c)), np.column_stack((a, c, d))))
 
 
-def seen_dome(settings: ExamInput) -> Seen:
+def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
     """What a perfect perception gives: surface and targets in snake or raster order."""
     X_WA = np.array(settings.X_WA)
     exam = settings.exam
     half = (exam.region_m[0] / 2 + 0.04, exam.region_m[1] / 2 + 0.04)
     vertices, triangles = grid_mesh(half)
     p_W = apply(X_WA, vertices)
-    surface = Surface.from_mesh(p_W, None, X_WA)
+    surface = PerceivedSurface.from_mesh(p_W, None, X_WA)
     nx, ny = (round(size / exam.spacing_m) + 1 for size in exam.region_m)
     xy, lines = [], []
     for j, y in enumerate(np.linspace(-exam.region_m[1] / 2, exam.region_m[1] / 2, ny)):
@@ -66,7 +67,7 @@ def seen_dome(settings: ExamInput) -> Seen:
             xy.append((value, y))
             lines.append(j)
     points, _ = surface.at(np.array(xy))
-    return Seen(points, np.array(lines), p_W, triangles, surface)
+    return PerceivedAbdomen(points, np.array(lines), p_W, triangles, surface)
 
 
 def hertz(newton_at_10mm: float) -> Callable[[float], float]:
@@ -80,8 +81,8 @@ class World:
     def __init__(self, settings: ExamInput, force: Callable[[float], float] | None = None, offset: float = 0.0) -> None:
         """`force` by true depth; the true surface lies `offset` [m] outward of the perceived one."""
         self.settings, self.force = settings, force or hertz(2.4)
-        self.exam = Exam(settings)
-        self.kinematics = Kinematics(settings.robot, settings.limits)
+        self.exam = ExamSequence(settings, PERIODS)
+        self.kinematics = ArmKinematics(settings.robot, settings.limits)
         self.weight = ToolWeight.of(settings.robot)
         self.bias = np.array([0.7, -0.4, 1.1])
         self.q = np.array(lbr.HOME)
@@ -90,7 +91,7 @@ class World:
         self.truth.offset = offset
         self.t = 0
         self.depth = self.pressed = 0.0
-        self.answers: list[Seen | Unseen] = [self.dome]
+        self.answers: list[PerceivedAbdomen | PerceptionFailure] = [self.dome]
         self.stop, self.soft, self.end, self.lost = "", False, "", ()
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
         self.setpoints: list[Setpoint] = []
@@ -107,21 +108,21 @@ class World:
 
     def _obey(self, setpoint: Setpoint) -> None:
         if setpoint.mode is ControlMode.JOINT:
-            if not setpoint.limp:
+            if setpoint.joint_stiffness.any():
                 self.q = self.q + 0.6 * (setpoint.q - self.q)
             return
         for _ in range(2):  # an impedance that settles within a few steps
             X = self.kinematics.pose(self.q)
-            pull = setpoint.F_W + self._touch(X)
-            sag = setpoint.X_WI[:3, :3] @ ((setpoint.X_WI[:3, :3].T @ pull) / CARTESIAN_STIFFNESS[:3])
-            gap = setpoint.X_WI[:3, 3] + sag - X[:3, 3]
-            turn = sum(cross(X[:3, i], setpoint.X_WI[:3, i]) for i in range(3)) / 2
+            pull = setpoint.F_W[:3] + self._touch(X)
+            sag = setpoint.R_WD @ ((setpoint.R_WD.T @ pull) / CARTESIAN_STIFFNESS[:3])
+            gap = setpoint.p_WD + sag - X[:3, 3]
+            turn = sum(np.cross(X[:3, i], setpoint.R_WD[:, i]) for i in range(3)) / 2
             J = self.kinematics.jacobian(self.q)
             posture = setpoint.q - self.q
             task = np.concatenate((gap, turn)) - J @ posture
             self.q = self.q + 0.4 * (J.T @ np.linalg.solve(J @ J.T + 1e-9 * np.eye(6), task) + posture)
 
-    def step(self) -> Outcome:
+    def step(self) -> ExamStep:
         """One planning period."""
         X_WI, R_WS = self.kinematics.poses(self.q)
         contact = R_WS.T @ self._touch(X_WI)
@@ -135,7 +136,7 @@ class World:
         if self._answer_at is not None and self.t >= self._answer_at:
             answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
         final = self.exam.status.phase is Phase.ASSESS
-        reading = Reading(self.q.copy(), wrench, qd)
+        reading = SensorReading(self.q.copy(), wrench, qd)
         outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.soft, self.end, self.lost))
         self.end = ""
         if outcome.trigger:
@@ -145,13 +146,13 @@ class World:
         self.setpoints.append(outcome.setpoint)
         if not self.stop or self.soft:  # else the driver holds
             self._obey(outcome.setpoint)
-        self.t += 10 * MS
+        self.t += PERIODS.step
         return outcome
 
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
         """Steps until the exam has ended (or `until`), at most `seconds` of simulated time."""
         ended = until or (lambda: self.exam.status.end_tick >= 0)
         while not ended():
-            if self.t > seconds * 1e9:
+            if self.t > seconds * SECOND:
                 raise AssertionError(f"not there after {seconds} s: {self.exam.status}")
             self.step()

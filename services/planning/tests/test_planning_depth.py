@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate_planning.depth import FORCE_FRACTION, DepthRegulator, Regulation
-from palpate_planning.setpoint import NORMAL_STIFFNESS
+from palpate_planning.setpoints import NORMAL_STIFFNESS
 
 LIMIT_N = 15.0
 DASHPOT_S = 0.05

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from planning_fakes import World, known
 
+from palpate_bus.setpoint import ControlMode
 from palpate_models import lbr
-from palpate_planning.palpation import Doing
-from palpate_planning.setpoint import ControlMode
+from palpate_planning.palpation import StrokeStage
 from palpate_planning.status import Phase
 
 PHASES = [Phase.HOME, Phase.LOOK, Phase.PLAN, Phase.APPROACH, Phase.INDENT, Phase.SCAN, Phase.RETRACT, Phase.RETURN]
@@ -41,7 +41,7 @@ def test_released_it_goes_on_and_misses_nothing(phase: Phase, soft: bool) -> Non
     world.run()
     assert world.exam.status.phase is Phase.DONE, world.exam.status.message
     assert world.exam.status.targets_skipped == 0
-    centres = np.array([s.X_WI[:3, 3] for s, row in zip(world.setpoints, world.rows, strict=True) if row[1]])
+    centres = np.array([s.p_WD for s, row in zip(world.setpoints, world.rows, strict=True) if row[1]])
     for target in world.dome.positions:
         assert np.linalg.norm(centres - target, axis=1).min() < 0.009
     assert max(row[5] for row in world.rows) < 5.0, "going on presses no harder than before"
@@ -107,7 +107,7 @@ def drawn_sideways(world: World) -> float:
         _, n, distance = world.truth.nearest(p_W)
         setpoint = world.step().setpoint
         if world.settings.robot.indenter_radius_m > distance and setpoint.mode is ControlMode.CARTESIAN:
-            gap = setpoint.X_WI[:3, 3] - p_W
+            gap = setpoint.p_WD - p_W
             worst = max(worst, float(np.linalg.norm(gap - (gap @ n) * n)))
     world.run()
     return worst
@@ -144,9 +144,9 @@ def test_an_arm_that_was_pushed_a_little_aside_lifts_before_it_goes_back(phase: 
 
 def test_an_arm_that_was_pushed_into_the_tissue_between_two_strokes_lifts_before_it_goes_on() -> None:
     world = World(known(region_m=(0.025, 0.025), pattern="raster"))
-    world.run(lambda: getattr(world.exam._palpation, "doing", None) is Doing.TRANSFER)
-    assert world.exam._palpation is not None
-    assert world.exam._palpation.free_goal is None
+    world.run(lambda: getattr(world.exam._course.palpation, "stage", None) is StrokeStage.TRANSFER)
+    assert world.exam._course.palpation is not None
+    assert world.exam._course.palpation.free_goal is None
     world.step()
     world.stop = "force 41 N"
     for _ in range(50):

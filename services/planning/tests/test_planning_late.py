@@ -6,28 +6,28 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, World, known
+from planning_fakes import BASE, PERIOD_S, World, known
 
+from palpate_bus.setpoint import Setpoint
 from palpate_models.scenario import Exam as ExamSettings
 from palpate_models.scenario import Limits
-from palpate_planning.follow import Follower
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.legs import Leg
-from palpate_planning.measure import Contact
-from palpate_planning.palpation import Palpation
+from palpate_planning.contact import ContactMeasurement
+from palpate_planning.free_motion import TrajectoryFollower
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.palpation import Palpation, StrokeStage
 from palpate_planning.path import SurfacePath
-from palpate_planning.setpoint import Setpoint
+from palpate_planning.periods import MS
+from palpate_planning.segments import Segment
 from palpate_planning.status import Phase
-from palpate_planning.timing import JOINT_ACCELERATION, LATE_NS, PERIOD_S, RESTART_NS, JointTrajectory, Pace, joint_trajectory
+from palpate_planning.timing import BRAKED_NS, JOINT_ACCELERATION, RESTART_NS, JointTrajectory, RestartRamp, joint_trajectory
 
-MS = 1_000_000
-KINEMATICS = Kinematics(BASE, Limits())
+KINEMATICS = ArmKinematics(BASE, Limits())
 START = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.0, 0.0])
 GOAL = START + np.array([0.9, -0.2, 0.1, 0.3, 0.0, -0.2, 0.5])
-MOTION = joint_trajectory(KINEMATICS, np.array([START, GOAL]), Limits())
+MOTION = joint_trajectory(KINEMATICS, np.array([START, GOAL]), Limits(), PERIOD_S)
 DOWN, ONE = np.diag([1.0, -1.0, -1.0]), np.zeros(1, dtype=int)
 PLACE = SurfacePath(np.zeros(1), np.zeros((1, 3)), -DOWN[None, 2], DOWN[None], GOAL[None], ONE, ONE)
-ABOVE = Contact(np.eye(4), np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]), -0.02, 0.0, False)
+ABOVE = ContactMeasurement(np.eye(4), np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]), -0.02, 0.0, False)
 
 
 def ticks(late_at: int, late: int, count: int) -> list[int]:
@@ -39,30 +39,35 @@ def ticks(late_at: int, late: int, count: int) -> list[int]:
 
 def followed(times: list[int]) -> list[Setpoint]:
     """Set-points of a follower on `MOTION`."""
-    follower, pace = Follower(KINEMATICS, START), Pace()
+    follower, ramp = TrajectoryFollower(KINEMATICS, START), RestartRamp()
     follower.start(MOTION)
-    return [follower.step(pace.step(t)) for t in times]
+    return [follower.step(t, ramp.step(t)) for t in times]
 
 
 def palpated(times: list[int]) -> list[Setpoint]:
-    """Set-points of a palpation on a leg that is `MOTION`."""
-    leg = Leg(PLACE, contact=False, free=MOTION)
-    palpation, pace = Palpation((leg, leg), ExamSettings(), Limits(), BASE.indenter_radius_m), Pace()
-    return [palpation.step(ABOVE, pace.step(t)).setpoint for t in times[: len(MOTION) - 1]]
+    """Set-points of a palpation on a segment that is `MOTION`."""
+    palpation, ramp = free_palpation(), RestartRamp()
+    return [palpation.step(t, ABOVE, ramp.step(t)).setpoint for t in times[: len(MOTION) - 1]]
 
 
-MOVERS = {"follower": followed, "free leg": palpated}
+def free_palpation() -> Palpation:
+    """A palpation of two segments that both are `MOTION`."""
+    segment = Segment(PLACE, contact=False, free=MOTION)
+    return Palpation((segment, segment), ExamSettings(), Limits(), BASE.indenter_radius_m, PERIOD_S)
 
 
-def test_a_pace_is_one_on_time_and_comes_up_from_none_after_a_gap() -> None:
-    pace = Pace()
-    assert [pace.step(t) for t in ticks(5, LATE_NS, 10)] == [1.0] * 10
-    pace = Pace()
-    rates = [pace.step(t) for t in ticks(5, LATE_NS + 10 * MS, 50)]
-    ramp = RESTART_NS // (10 * MS)
+MOVERS = {"follower": followed, "free segment": palpated}
+
+
+def test_the_rate_is_one_on_time_and_comes_up_from_none_after_a_gap() -> None:
+    ramp = RestartRamp()
+    assert [ramp.step(t) for t in ticks(5, BRAKED_NS, 10)] == [1.0] * 10
+    ramp = RestartRamp()
+    rates = [ramp.step(t) for t in ticks(5, BRAKED_NS + 10 * MS, 50)]
+    rise = RESTART_NS // (10 * MS)
     assert rates[:5] == [1.0] * 5
-    assert rates[5 : 5 + ramp] == pytest.approx(np.arange(ramp) / ramp)
-    assert rates[5 + ramp :] == [1.0] * (45 - ramp)
+    assert rates[5 : 5 + rise] == pytest.approx(np.arange(rise) / rise)
+    assert rates[5 + rise :] == [1.0] * (45 - rise)
 
 
 @pytest.mark.parametrize("mover", MOVERS)
@@ -91,10 +96,10 @@ def test_after_a_gap_a_motion_goes_on_from_a_stand_where_it_was(mover: str, late
 
 
 def test_after_a_gap_the_follower_arrives_at_its_goal_to_the_bit() -> None:
-    follower, pace = Follower(KINEMATICS, START), Pace()
+    follower, ramp = TrajectoryFollower(KINEMATICS, START), RestartRamp()
     follower.start(MOTION)
     for t in ticks(20, 90 * MS, len(MOTION) + 30):
-        last = follower.step(pace.step(t))
+        last = follower.step(t, ramp.step(t))
     assert follower.arrived
     assert np.array_equal(last.q, MOTION.q[-1])
     assert not last.qd.any()
@@ -120,3 +125,13 @@ def test_an_examination_that_is_kept_waiting_starts_its_motion_anew() -> None:
     assert not world.setpoints[-1].qd.any()
     world.run()
     assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+
+
+def test_after_a_pause_in_a_free_motion_the_palpation_goes_on_with_the_next_segment() -> None:
+    palpation = free_palpation()
+    palpation.step(0, ABOVE)
+    palpation.pause()
+    palpation.skip_free_motion()
+    steps = [palpation.step(t, ABOVE) for t in ticks(0, 10 * MS, len(MOTION))]
+    assert steps[-1].stage is StrokeStage.DONE
+    assert np.array_equal(steps[-1].setpoint.q, MOTION.q[-1])

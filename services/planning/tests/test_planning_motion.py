@@ -6,22 +6,22 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, known, seen_dome
+from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
 from palpate_models import lbr
 from palpate_models.scenario import Limits, Robot
-from palpate_planning.kinematics import Kinematics
+from palpate_planning.exam_planner import ExamPlanner
+from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.look import look_postures
-from palpate_planning.motion import NoPathError, plan
+from palpate_planning.motion_planning import NoPathError, plan
 from palpate_planning.poses import centre, least_twist, pose
-from palpate_planning.prepare import Planner
-from palpate_planning.scene import Scene, with_skirt
-from palpate_planning.timing import JOINT_ACCELERATION, PERIOD_S, Axis, SpeedLimit, joint_trajectory, rounded
+from palpate_planning.scene import CollisionScene, with_skirt
+from palpate_planning.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
 
 LIMITS = Limits()
-KINEMATICS = Kinematics(BASE, LIMITS)
+KINEMATICS = ArmKinematics(BASE, LIMITS)
 SEEN = seen_dome(known(region_m=(0.2, 0.2)))
-SCENE = Scene(KINEMATICS, BASE, (SEEN.vertices, SEEN.triangles))
+SCENE = CollisionScene(KINEMATICS, BASE, (SEEN.vertices, SEEN.triangles))
 
 
 def above(x: float, y: float, gap: float) -> np.ndarray:
@@ -86,7 +86,7 @@ def test_home_is_free_and_the_table_is_not() -> None:
 
 def test_only_the_tool_may_touch_and_only_in_the_contact_phase() -> None:
     pressed = above(0.0, 0.0, -0.010)
-    contact = Scene(KINEMATICS, BASE, (SEEN.vertices, SEEN.triangles), tool_may_touch=True)
+    contact = CollisionScene(KINEMATICS, BASE, (SEEN.vertices, SEEN.triangles), tool_may_touch=True)
     assert not SCENE.free(pressed)
     assert contact.free(pressed)
     buried = above(0.0, 0.0, -0.10)
@@ -135,7 +135,7 @@ def test_ends_in_collision_are_named() -> None:
 @pytest.mark.parametrize("points", [(np.array(lbr.HOME), above(0.05, 0.05, 0.03)), AROUND])
 def test_timing_keeps_all_limits(points: tuple[np.ndarray, np.ndarray]) -> None:
     path = plan(SCENE, *points, KINEMATICS.upper, 1)
-    trajectory = joint_trajectory(KINEMATICS, rounded(path, 0.1), LIMITS)
+    trajectory = joint_trajectory(KINEMATICS, rounded(path, 0.1), LIMITS, PERIOD_S)
     assert trajectory.q[0] == pytest.approx(points[0], abs=1e-3)
     assert trajectory.q[-1] == pytest.approx(points[1], abs=1e-9)
     speed = np.abs(np.diff(trajectory.q, axis=0)) / PERIOD_S
@@ -149,7 +149,7 @@ def test_timing_keeps_all_limits(points: tuple[np.ndarray, np.ndarray]) -> None:
 
 
 def test_rounded_and_timed_motion_of_the_planner_is_free() -> None:
-    planner = Planner(known(region_m=(0.2, 0.2)))
+    planner = ExamPlanner(known(region_m=(0.2, 0.2)), PERIOD_S)
     trajectory = planner.motion(*AROUND, SEEN)
     assert all(SCENE.free(q) for q in trajectory.q)
 
@@ -163,7 +163,7 @@ def test_speed_limit_brakes_ahead_of_a_slow_place() -> None:
 
 
 def test_axis_moves_to_its_target_at_rest() -> None:
-    axis = Axis(0.0, 0.5, 5.0)
+    axis = JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S)
     speeds = []
     while not axis.step(0.1, 0.05):
         speeds.append(axis.velocity)
@@ -182,7 +182,7 @@ def test_a_speed_limit_between_its_places_is_numpys_to_the_bit() -> None:
 
 
 def test_an_axis_that_counts_from_elsewhere_moves_on_alike() -> None:
-    axis, shifted = Axis(0.0, 0.5, 5.0), Axis(0.0, 0.5, 5.0)
+    axis, shifted = JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S), JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S)
     for k in range(100):
         if k == 10:
             shifted.shift(0.25)
@@ -192,12 +192,12 @@ def test_an_axis_that_counts_from_elsewhere_moves_on_alike() -> None:
 
 
 def test_an_axis_that_stood_still_starts_from_rest() -> None:
-    axis = Axis(0.0, 0.5, 5.0)
+    axis = JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S)
     for _ in range(20):
         axis.step(0.1, 0.05)
     assert axis.velocity > 0.02
     axis.stand()
-    fresh = Axis(axis.position, 0.5, 5.0)
+    fresh = JerkLimitedAxis(axis.position, 0.5, 5.0, PERIOD_S)
     assert axis.velocity == axis.acceleration == 0.0
     for _ in range(30):
         assert axis.step(0.1, 0.05) == fresh.step(0.1, 0.05)

@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from palpate_bus.setpoint import ControlMode
 from palpate_planning.path import SurfacePath, lay
-from palpate_planning.poses import centre, pose
-from palpate_planning.setpoint import ControlMode
-from palpate_planning.surface import Surface
+from palpate_planning.poses import centre
+from palpate_planning.recovery import Displacement
+from palpate_planning.stroke_motion import stroke_setpoint
+from palpate_planning.surface import PerceivedSurface
 
 DOWN = np.diag((1.0, -1.0, -1.0))
 
@@ -16,33 +19,49 @@ def dome_path(samples: int) -> SurfacePath:
     xy = np.column_stack((np.linspace(-0.05, 0.05, samples), np.full(samples, 0.01))) if samples > 1 else np.zeros((1, 2))
     x, y = np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(-0.1, 0.1, 0.01))
     vertices = np.column_stack((x.ravel(), y.ravel(), -(x.ravel() ** 2) / 0.5 - y.ravel() ** 2))
-    s, p, n, R = lay(Surface.from_mesh(vertices, None, np.eye(4)), xy, DOWN)
+    s, p, n, R = lay(PerceivedSurface.from_mesh(vertices, None, np.eye(4)), xy, DOWN)
     q = np.outer(1.0 + s, np.arange(1.0, 8.0)) ** 2
     visits = np.array([0, samples // 2, samples - 1]) if samples > 1 else np.zeros(1, int)
     return SurfacePath(s, p, n, R, q, np.array([7, 3, 5])[: len(visits)], visits)
 
 
 @pytest.mark.parametrize("samples", [1, 21])
-def test_a_setpoint_is_the_place_at_arms_length_to_the_bit(samples: int) -> None:
+def test_a_setpoint_is_the_path_point_at_a_distance_from_the_surface(samples: int) -> None:
     path = dome_path(samples)
-    rate, arm, sinking, push = 0.03, 0.0173, -0.002, 1.7
+    rate, distance, sinking, push = 0.03, 0.0173, -0.002, 1.7
     for s in np.linspace(-0.01, path.length + 0.01, 50).tolist():
-        place, asked = path.at(s), path.setpoint(s, rate, arm, sinking, push)
-        assert asked.mode is ControlMode.CARTESIAN
-        assert np.array_equal(asked.X_WI, pose(place.R, place.p + place.n * arm))
-        assert asked.X_WI[:3, 3] == pytest.approx(centre(place.p, place.n, arm, 0.0))
-        linear = (place.dp + place.dn * arm) * rate - place.n * sinking
-        assert np.array_equal(asked.V_WI, np.concatenate((linear, place.w * rate)))
-        assert np.array_equal(asked.F_W, -place.n * push)
-        assert np.array_equal(asked.q, place.q) and np.array_equal(asked.qd, place.dq * rate)
+        point = path.at(s)
+        setpoint = stroke_setpoint(7, point, rate, distance, sinking, push)
+        assert setpoint.mode is ControlMode.CARTESIAN
+        assert setpoint.stamp == 7
+        assert setpoint.p_WD == pytest.approx(centre(point.p, point.n, distance, 0.0))
+        assert setpoint.R_WD[:, 2] == pytest.approx(-point.n)
+        assert setpoint.F_W.tolist() == [*(-push * point.n), 0.0, 0.0, 0.0]
+        assert np.array_equal(setpoint.q, point.q)
 
 
-def test_setpoints_share_no_arrays() -> None:
+def test_the_velocities_of_a_setpoint_are_its_rates_of_change() -> None:
+    path, rate, sinking, dt = dome_path(21), 0.03, -0.002, 1e-4
+    for s in np.linspace(0.01, path.length - 0.01, 20).tolist():
+        before, now, after = (
+            stroke_setpoint(0, path.at(s + k * rate * dt), rate, 0.01 - k * sinking * dt, sinking, 0.0) for k in (-1, 0, 1)
+        )
+        assert now.V_WD[:3] == pytest.approx((after.p_WD - before.p_WD) / (2 * dt), abs=1e-5)
+        assert now.V_WD[3:] == pytest.approx(Rotation.from_matrix(after.R_WD @ before.R_WD.T).as_rotvec() / (2 * dt), abs=1e-3)
+        assert now.qd == pytest.approx((after.q - before.q) / (2 * dt), abs=1e-5)
+
+
+def test_a_displaced_setpoint_leaves_the_path_as_it_is() -> None:
     path = dome_path(1)
-    first = path.setpoint(0.0, 0.0, 0.01, 0.0, 0.0)
-    second = path.setpoint(0.0, 0.0, 0.01, 0.0, 0.0)
-    for name in ("X_WI", "V_WI", "F_W", "q", "qd"):
-        assert not np.shares_memory(getattr(first, name), getattr(second, name))
+    point = path.at(0.0)
+    setpoint = stroke_setpoint(0, point, 0.0, 0.01, 0.0, 0.0)
+    gap = np.array((0.0, 0.004, 0.003))
+    displacement = Displacement(gap, 0.01)
+    assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD + gap)
+    while not displacement.shrink():
+        pass
+    assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD)
+    assert np.array_equal(stroke_setpoint(0, path.at(0.0), 0.0, 0.01, 0.0, 0.0).p_WD, setpoint.p_WD)
 
 
 def test_the_target_is_the_one_reached_last() -> None:

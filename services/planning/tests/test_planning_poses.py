@@ -8,8 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from palpate_models.rotations import quaternion
-from palpate_planning.poses import angular_velocity, centre, least_twist, pose
+from palpate_planning.poses import angular_velocity, centre, frame, least_twist, pose
 
 coordinate = st.floats(-1.0, 1.0)
 vectors = st.tuples(coordinate, coordinate, coordinate).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.05)
@@ -66,13 +65,6 @@ def test_near_normals_have_near_orientations(normal: np.ndarray, change: np.ndar
     assert np.abs(a - b).max() < 0.06
 
 
-@given(rotations)
-@settings(deadline=None)
-def test_quaternion_agrees_with_scipy(R: np.ndarray) -> None:
-    assert Rotation.from_quat(quaternion(R.tolist())).as_matrix() == pytest.approx(R, abs=1e-9)
-    assert quaternion(R.tolist())[3] >= 0
-
-
 @given(rotations, vectors)
 @settings(deadline=None)
 def test_angular_velocity_turns_one_into_the_other(R: np.ndarray, w: np.ndarray) -> None:
@@ -85,3 +77,16 @@ def test_pose_is_homogeneous() -> None:
     X = pose(np.eye(3), np.array((1.0, 2.0, 3.0)))
     assert X[3].tolist() == [0, 0, 0, 1]
     assert X[:3, 3].tolist() == [1, 2, 3]
+
+
+@given(rotations, vectors)
+@settings(deadline=None)
+def test_a_frame_has_the_given_z_axis_and_keeps_its_x_axis_near(R: np.ndarray, x_near: np.ndarray) -> None:
+    z = R[:, 2]
+    assume(np.linalg.norm(np.cross(z, x_near)) > 1e-3)
+    found = frame(z, x_near)
+    assert found[:, 2] == pytest.approx(z, abs=1e-12)
+    assert np.abs(found.T @ found - np.eye(3)).max() < 1e-9
+    assert np.linalg.det(found) == pytest.approx(1.0)
+    assert found[:, 1] @ x_near == pytest.approx(0.0, abs=1e-12)
+    assert found[:, 0] @ x_near > 0.0

@@ -7,30 +7,28 @@ from typing import Any
 import numpy as np
 import pytest
 from planning_fakes import BASE, World, known
-from scipy.spatial.transform import Rotation
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import MS, contract
 from palpate_bus.messages import (
     Findings,
     OperatorRequest,
     PalpationTargets,
+    Point,
     RobotStatus,
     SupervisorState,
     SurfaceMesh,
+    Vector3,
+    Wrench,
     codec,
 )
 from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
 from palpate_models.scenario import Exam, Scenario
-from palpate_planning.messages import pose_message
 from palpate_planning.service import PlanningService, create
-from palpate_planning.setpoint import ControlMode, Setpoint
-from palpate_planning.status import Outcome, Phase
+from palpate_planning.status import ExamStep, Phase
 
-Vector3 = codec.message_type("geometry_msgs/msg/Vector3")
-Point = codec.message_type("geometry_msgs/msg/Point")
-Wrench = codec.message_type("geometry_msgs/msg/Wrench")
 OUTPUTS = {topic.name: topic for topic in contract().outputs("planning")}
 
 
@@ -76,7 +74,7 @@ class BusWorld(World):
         self.states: list[Any] = []
         self.events: list[str] = []
 
-    def step(self) -> Outcome:
+    def step(self) -> ExamStep:
         inbox, t = self.inbox, self.t
         inbox.events = {}
         X_WI, R_WS = self.kinematics.poses(self.q)
@@ -104,26 +102,9 @@ class BusWorld(World):
         if "planning/camera_trigger" in out:
             assert out["planning/camera_trigger"].frames == self.settings.camera.frames
             self._answer_at = t + 300_000_000
-        self._obey(setpoint(out["planning/setpoint"]))
+        self._obey(Setpoint.from_message(out["planning/setpoint"]))
         self.t += 10_000_000
         return None  # type: ignore[return-value]
-
-
-def setpoint(m: Any) -> Setpoint:
-    """A set-point message as arrays."""
-    o, p, v, w, f = m.pose.orientation, m.pose.position, m.twist.linear, m.twist.angular, m.wrench.force
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_quat((o.x, o.y, o.z, o.w)).as_matrix()
-    X[:3, 3] = p.x, p.y, p.z
-    return Setpoint(
-        ControlMode(m.mode),
-        X,
-        np.array(m.joint_position),
-        np.array((v.x, v.y, v.z, w.x, w.y, w.z)),
-        np.array((f.x, f.y, f.z)),
-        np.array(m.joint_velocity),
-        limp=m.mode == 1 and not np.any(m.joint_stiffness),
-    )
 
 
 def test_an_examination_over_messages() -> None:
@@ -148,7 +129,7 @@ def test_the_first_step_asks_the_arm_for_nothing() -> None:
     out = sent(service.step(0, HandInbox()))
     assert out["planning/setpoint"].mode == ControlMode.JOINT
     assert not np.any(out["planning/setpoint"].joint_stiffness)
-    assert nanoseconds(out["planning/setpoint"].valid_for) == 250_000_000
+    assert nanoseconds(out["planning/setpoint"].valid_for) == contract().topics["planning/setpoint"].expiry_ms * MS
     assert out["exam/state"].phase == Phase.HOME
     assert out["exam/state"].end_tick == -1
 
@@ -202,11 +183,3 @@ def test_values_that_are_none_are_passed_over() -> None:
         out = sent(service.step(10_000_000, inbox))
         assert np.isfinite(np.array(out["planning/setpoint"].joint_position)).all()
     assert service.finish()["unreadable_statuses"] == 2
-
-
-def test_pose_message_round_trip() -> None:
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_rotvec((0.1, -2.0, 0.7)).as_matrix()
-    message = pose_message(X)
-    o = message.orientation
-    assert Rotation.from_quat((o.x, o.y, o.z, o.w)).as_matrix() == pytest.approx(X[:3, :3], abs=1e-12)

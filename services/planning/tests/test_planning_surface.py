@@ -10,11 +10,11 @@ from planning_fakes import grid_mesh
 
 from palpate_models.frames import apply, matrix
 from palpate_models.scenario import Pose
-from palpate_planning.surface import Surface
+from palpate_planning.surface import PerceivedSurface
 
 X_WA = matrix(Pose(xyz_m=(0.56, 0.05, 0.93), rpy_rad=(0.05, -0.08, 0.3)))
 VERTICES, TRIANGLES = grid_mesh((0.14, 0.14))
-SURFACE = Surface.from_mesh(apply(X_WA, VERTICES), None, X_WA)
+SURFACE = PerceivedSurface.from_mesh(apply(X_WA, VERTICES), None, X_WA)
 inner = st.floats(-0.1, 0.1)
 
 
@@ -46,7 +46,7 @@ def test_nearest_finds_the_foot_of_the_perpendicular(x: float, y: float, height:
 
 def test_given_normals_are_used() -> None:
     exact = np.array([dome(x, y)[1] for x, y in VERTICES[:, :2]])
-    surface = Surface.from_mesh(apply(X_WA, VERTICES), exact, X_WA)
+    surface = PerceivedSurface.from_mesh(apply(X_WA, VERTICES), exact, X_WA)
     _, n = surface.at(np.array([[0.071, -0.043]]))
     assert n[0] == pytest.approx(dome(0.071, -0.043)[1], abs=1e-5)
 
@@ -58,20 +58,20 @@ def test_outside_the_mesh_the_edge_holds() -> None:
 
 
 def test_before_perception_depth_is_counted_from_the_plane_of_a() -> None:
-    _, normal, distance = Surface.plane(X_WA).nearest(apply(X_WA, np.array([[0.02, 0.03, 0.04]]))[0])
+    _, normal, distance = PerceivedSurface.plane(X_WA).nearest(apply(X_WA, np.array([[0.02, 0.03, 0.04]]))[0])
     assert distance == pytest.approx(0.04)
     assert normal == pytest.approx(X_WA[:3, 2])
 
 
 def test_a_mesh_without_extent_is_refused() -> None:
     with pytest.raises(ValueError, match="3 vertices"):
-        Surface.from_mesh(np.zeros((3, 3)), None, X_WA)
+        PerceivedSurface.from_mesh(np.zeros((3, 3)), None, X_WA)
     with pytest.raises(ValueError, match="spans"):
-        Surface.from_mesh(np.zeros((30, 3)), None, X_WA)
+        PerceivedSurface.from_mesh(np.zeros((30, 3)), None, X_WA)
 
 
 def test_a_surface_of_no_numbers_is_refused() -> None:
     nowhere = np.full_like(VERTICES, np.nan)
     for vertices, normals in ((VERTICES, nowhere), (nowhere, None)):
         with pytest.raises(ValueError, match="not finite"):
-            Surface.from_mesh(vertices, normals, X_WA)
+            PerceivedSurface.from_mesh(vertices, normals, X_WA)

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
-from palpate_planning.weight import GRAVITY, ToolWeight
+from palpate_planning.tool_weight import ToolWeight
 
 
 def reading(R_WS: np.ndarray, force_W: np.ndarray, bias: np.ndarray, mass: float, com: np.ndarray) -> np.ndarray:
@@ -33,7 +34,7 @@ def test_contact_force_is_found_at_any_orientation(seed: int) -> None:
     assert tool.bias == pytest.approx(bias[:3], abs=1e-9)
     force = rng.normal(0, 5, 3)
     R = Rotation.random(random_state=rng).as_matrix()
-    assert tool.contact(R, reading(R, force, bias, mass, com)) == pytest.approx(force, abs=1e-9)
+    assert tool.contact(R, reading(R, force, bias, mass, com), np.zeros(3)) == pytest.approx(force, abs=1e-9)
 
 
 def test_acceleration_of_the_tool_is_no_contact() -> None:
@@ -42,7 +43,7 @@ def test_acceleration_of_the_tool_is_no_contact() -> None:
     a = np.array((0.1, -0.2, 0.5))
     seen = reading(R, -0.4 * a, np.zeros(6), 0.4, np.array((0.0, 0.0, 0.06)))
     assert tool.contact(R, seen, a) == pytest.approx(np.zeros(3), abs=1e-12)
-    assert np.linalg.norm(tool.contact(R, seen)) > 0.2
+    assert np.linalg.norm(tool.contact(R, seen, np.zeros(3))) > 0.2
 
 
 def test_taring_averages_noise_out() -> None:

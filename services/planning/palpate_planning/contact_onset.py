@@ -15,13 +15,14 @@ from palpate_planning.depth import EXPONENT
 FORCE_RANGE_N = (0.1, 1.0)
 """Forces that the line is fitted to: above the sensor's noise, below where the tissue's layers matter."""
 SAMPLES_MIN = 8
+"""Samples that the line needs."""
 ONSET_SIGMA_M = 0.0004
 """Standard deviation of d0 by itself: viscosity, stiffness that varies with depth, the exponent [A]."""
 SIGMAS = 3.0
-"""An offset of so many standard deviations counts."""
+"""An offset counts from this many standard deviations on."""
 
 
-class OnsetEstimator:
+class ContactOnset:
     """Collects depth and force of one slow descent."""
 
     def __init__(self, surface_noise: float) -> None:

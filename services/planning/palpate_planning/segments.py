@@ -1,4 +1,4 @@
-"""Strokes as motion of the arm: postures along them, what is out of reach or would collide, ways between them."""
+"""Strokes as segments of arm motion: postures along them, what is out of reach or would collide, ways between them."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from palpate_models.frames import Array
 from palpate_planning.coverage import Stroke, transfer
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.motion import NoPathError
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.motion_planning import NoPathError
 from palpate_planning.path import SurfacePath, lay
 from palpate_planning.poses import centre, least_twist, pose
-from palpate_planning.scene import Scene
-from palpate_planning.surface import Surface
+from palpate_planning.scene import CollisionScene
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import JointTrajectory
-
-Array = NDArray[np.float64]
 
 HOVER_M = 0.02
 """Height of the sphere's deepest point above the surface before, between and after strokes."""
 POSTURE_EVERY = 4
-"""A posture is solved at every so many samples of a stroke."""
+"""Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
 REACH = "out of the arm's reach"
 
 Troubles = list[tuple[int, str]]
@@ -31,7 +29,7 @@ Troubles = list[tuple[int, str]]
 
 
 @dataclass(frozen=True, slots=True)
-class Leg:
+class Segment:
     """A part of the examination."""
 
     path: SurfacePath
@@ -46,7 +44,7 @@ class Leg:
 class Layout:
     """All strokes and ways, and what stands in the way of it."""
 
-    legs: list[Leg] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
     breaks: set[int] = field(default_factory=set)
     """Targets after which a stroke has to end: the way to the next is out of reach or collides."""
     dropped: dict[int, str] = field(default_factory=dict)
@@ -58,14 +56,14 @@ class Layout:
         return bool(self.breaks or self.dropped)
 
 
-class LegPlanner:
+class SegmentPlanner:
     """Lays strokes over one surface with the postures of their targets, shape (n, 7)."""
 
     def __init__(
         self,
-        kinematics: Kinematics,
-        scene: Scene,
-        surface: Surface,
+        kinematics: ArmKinematics,
+        scene: CollisionScene,
+        surface: PerceivedSurface,
         postures: Array,
         radius: float,
         depth: float,
@@ -76,7 +74,7 @@ class LegPlanner:
         self._postures, self._radius, self._depth, self._free_motion = postures, radius, depth, free_motion
         self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Troubles]] = {}
         self._hovers: dict[int, Array | None] = {}
-        self._ways: dict[tuple[int, int], tuple[Leg | None, str]] = {}
+        self._ways: dict[tuple[int, int], tuple[Segment | None, str]] = {}
         self._R_ref = np.eye(3)
 
     def lay(self, pieces: list[Stroke]) -> Layout:
@@ -97,12 +95,12 @@ class LegPlanner:
                 if self.hover(piece, end) is None:
                     layout.dropped[int(piece.targets[end])] = f"the posture above it is {REACH}"
             if k and not layout.troubled:
-                leg, why = self._way(pieces[k - 1], piece)
-                if leg is None:
+                segment, why = self._way(pieces[k - 1], piece)
+                if segment is None:
                     layout.dropped[int(piece.targets[0])] = f"no way to it: {why}"
                 else:
-                    layout.legs.append(leg)
-            layout.legs.append(Leg(path, contact=True))
+                    layout.segments.append(segment)
+            layout.segments.append(Segment(path, contact=True))
         return layout
 
     def hover(self, piece: Stroke, end: int) -> Array | None:
@@ -123,7 +121,7 @@ class LegPlanner:
             self._strokes[key] = self._path(piece, self._depth)
         return self._strokes[key]
 
-    def _way(self, before: Stroke, after: Stroke) -> tuple[Leg | None, str]:
+    def _way(self, before: Stroke, after: Stroke) -> tuple[Segment | None, str]:
         """From above the end of one stroke to above the start of the next: straight, else by a free motion."""
         key = (int(before.targets[-1]), int(after.targets[0]))
         if key not in self._ways:
@@ -131,12 +129,12 @@ class LegPlanner:
             path, troubles = self._path(Stroke(xy, np.array(key), np.array([0, len(xy) - 1])), -HOVER_M)
             start, goal = self.hover(before, -1), self.hover(after, 0)
             if not troubles:
-                self._ways[key] = (Leg(path, contact=False), "")
+                self._ways[key] = (Segment(path, contact=False), "")
             elif start is None or goal is None:
                 self._ways[key] = (None, troubles[0][1])
             else:
                 try:
-                    self._ways[key] = (Leg(path, contact=False, free=self._free_motion(start, goal)), "")
+                    self._ways[key] = (Segment(path, contact=False, free=self._free_motion(start, goal)), "")
                 except NoPathError as error:
                     self._ways[key] = (None, str(error))
         return self._ways[key]

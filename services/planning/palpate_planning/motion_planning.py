@@ -10,15 +10,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base, geometric, util
 
+from palpate_models.frames import Array
 from palpate_models.scenario import Limits
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.scene import STEP_RAD, Scene
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.scene import STEP_RAD, CollisionScene
 from palpate_planning.timing import JointTrajectory, joint_trajectory, rounded
-
-Array = NDArray[np.float64]
 
 ITERATIONS = 6000
 """Iterations of RRT-Connect after which a motion counts as impossible."""
@@ -33,7 +31,7 @@ class NoPathError(RuntimeError):
     """No collision-free motion was found. The message says between which postures and why."""
 
 
-def plan(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
+def plan(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
     """A collision-free path from q0 to q1 within +-bound [rad]: returns way points, shape (n, 7), the ends included.
 
     Raises NoPathError if an end collides or `ITERATIONS` do not suffice.
@@ -46,17 +44,19 @@ def plan(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
     return _shortcut(scene, _rrt_connect(scene, q0, q1, bound, seed))
 
 
-def timed_motion(scene: Scene, kinematics: Kinematics, limits: Limits, q0: Array, q1: Array, seed: int) -> JointTrajectory:
-    """A collision-free motion from q0 to q1, corners rounded, within all limits. Raises NoPathError."""
+def timed_motion(
+    scene: CollisionScene, kinematics: ArmKinematics, limits: Limits, q0: Array, q1: Array, seed: int, period_s: float
+) -> JointTrajectory:
+    """A collision-free motion from q0 to q1, corners rounded, within all limits, sampled every `period_s`. Raises NoPathError."""
     points = plan(scene, q0, q1, kinematics.upper, seed)
     for blend in BLENDS_RAD:
         smooth = rounded(points, blend)
         if len(points) == 2 or scene.path_free(smooth):
-            return joint_trajectory(kinematics, smooth, limits)
+            return joint_trajectory(kinematics, smooth, limits, period_s)
     raise NoPathError(f"corners of the motion to {np.round(q1, 3).tolist()} cannot be rounded without collision")
 
 
-def _rrt_connect(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
+def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
     util.noOutputHandler()  # it would complain that numbers were drawn before; all that draw are built below
     util.RNG.setSeed(seed + 1)  # zero is no seed for OMPL
     space = base.RealVectorStateSpace(7)
@@ -86,7 +86,7 @@ def _rrt_connect(scene: Scene, q0: Array, q1: Array, bound: Array, seed: int) ->
     return np.array([[state[i] for i in range(7)] for state in problem.getSolutionPath().getStates()])
 
 
-def _shortcut(scene: Scene, path: Array) -> Array:
+def _shortcut(scene: CollisionScene, path: Array) -> Array:
     """Greedy shortcuts: from each way point to the farthest that can be reached straight; then with edges halved, again."""
     for halve in (False, True):
         points = [p for a, b in pairwise(path) for p in ((a, (a + b) / 2) if halve else (a,))] + [path[-1]]

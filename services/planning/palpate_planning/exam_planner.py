@@ -1,4 +1,4 @@
-"""From targets to a whole planned examination: who is reachable, the strokes, their postures, the way there."""
+"""From perceived targets to a planned examination: which are reachable, the strokes, their postures, the way there."""
 
 from __future__ import annotations
 
@@ -8,25 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.placement import plan_redundancy, prepare
 from palpate_models.scenario import ExamInput
 from palpate_planning.coverage import strokes
-from palpate_planning.kinematics import Kinematics
-from palpate_planning.legs import REACH, Leg, LegPlanner
-from palpate_planning.motion import NoPathError, timed_motion
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.motion_planning import NoPathError, timed_motion
 from palpate_planning.poses import centre, pose
-from palpate_planning.scene import Scene
-from palpate_planning.surface import Surface
+from palpate_planning.scene import CollisionScene
+from palpate_planning.segments import REACH, Segment, SegmentPlanner
+from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import JointTrajectory
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """What perception gave: targets in coverage order and the surface. World frame."""
+class PerceivedAbdomen:
+    """What perception has found: targets in coverage order and the surface. World frame."""
 
     positions: Array
     """[m], shape (n, 3)."""
@@ -36,7 +35,7 @@ class Seen:
     """Mesh of the surface [m], shape (k, 3)."""
     triangles: Ints
     """Vertex indices, shape (l, 3)."""
-    surface: Surface
+    surface: PerceivedSurface
     noise: float = 0.0
     """Standard deviation of the surface that perception estimates, its motion included [m]."""
 
@@ -47,7 +46,7 @@ class ExamPlan:
 
     approach: JointTrajectory
     """From where the arm was to above the first target."""
-    legs: tuple[Leg, ...]
+    segments: tuple[Segment, ...]
     """Alternating: contact, way, contact, ..."""
     skipped: dict[int, str]
     """Reason by target."""
@@ -55,11 +54,11 @@ class ExamPlan:
     def poses(self, radius: float, depth: float) -> Array:
         """Poses of the indenter at depth along all strokes, about 5 mm apart, shape (n, 4, 4)."""
         out = []
-        for leg in self.legs:
-            if leg.contact:
-                step = max(1, len(leg.path.s) * 5 // max(1, round(leg.path.length * 1e3)))
-                centres = centre(leg.path.p, leg.path.n, radius, depth)
-                out += [pose(leg.path.R[i], centres[i]) for i in range(0, len(centres), step)]
+        for segment in self.segments:
+            if segment.contact:
+                step = max(1, len(segment.path.s) * 5 // max(1, round(segment.path.length * 1e3)))
+                centres = centre(segment.path.p, segment.path.n, radius, depth)
+                out += [pose(segment.path.R[i], centres[i]) for i in range(0, len(centres), step)]
         return np.array(out)
 
     def skipped_in_words(self) -> str:
@@ -68,32 +67,33 @@ class ExamPlan:
         return "; ".join(f"{count} targets skipped: {reason}" for reason, count in sorted(counts.items()))
 
 
-class Planner:
-    """Plans for one robot and exam. Shares no state with the steps: it has kinematics and scenes of its own."""
+class ExamPlanner:
+    """Plans for one robot and examination. Shares no state with the steps: it has kinematics and scenes of its own."""
 
-    def __init__(self, known: ExamInput) -> None:
-        self._known = known
-        self._kinematics = Kinematics(known.robot, known.limits)
+    def __init__(self, known: ExamInput, period_s: float) -> None:
+        """Trajectories are sampled every `period_s`."""
+        self._known, self._period_s = known, period_s
+        self._kinematics = ArmKinematics(known.robot, known.limits)
 
     def prepare(self) -> None:
-        """Makes what needs no surface: an examination is planned in half the time afterwards."""
+        """Prepares what needs no surface; afterwards an examination is planned in half the time."""
         prepare(self._known.robot, self._known.limits.force_working_n)
 
-    def motion(self, q0: Array, q1: Array, seen: Seen | None) -> JointTrajectory:
+    def motion(self, q0: Array, q1: Array, perceived: PerceivedAbdomen | None) -> JointTrajectory:
         """Collision-free timed motion from q0 to q1. Raises NoPathError."""
-        mesh = None if seen is None else (seen.vertices, seen.triangles)
-        return self._motion(Scene(self._kinematics, self._known.robot, mesh), q0, q1)
+        mesh = None if perceived is None else (perceived.vertices, perceived.triangles)
+        return self._motion(CollisionScene(self._kinematics, self._known.robot, mesh), q0, q1)
 
-    def examination(self, seen: Seen, q_now: Array) -> ExamPlan:
+    def examination(self, perceived: PerceivedAbdomen, q_now: Array) -> ExamPlan:
         """The whole examination. Raises NoPathError if no target is left or there is no way to the first."""
-        known, exam, mesh = self._known, self._known.exam, (seen.vertices, seen.triangles)
-        free, contact = (Scene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
-        xy = apply(inverse(np.array(known.X_WA)), seen.positions)[:, :2]
-        postures, skipped = self._reachable(seen, xy, q_now, contact)
-        legs = LegPlanner(
+        known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)
+        free, contact = (CollisionScene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
+        xy = apply(inverse(np.array(known.X_WA)), perceived.positions)[:, :2]
+        postures, skipped = self._reachable(perceived, xy, q_now, contact)
+        segments = SegmentPlanner(
             self._kinematics,
             contact,
-            seen.surface,
+            perceived.surface,
             postures,
             known.robot.indenter_radius_m,
             exam.depth_m,
@@ -102,8 +102,8 @@ class Planner:
         breaks: set[int] = set()
         while True:  # ends: each round takes targets or joints away
             usable = np.array([i not in skipped for i in range(len(xy))], dtype=bool)
-            pieces = strokes(xy, seen.lines, usable, exam.pattern, exam.mode, exam.spacing_m, breaks)
-            layout = legs.lay(pieces)
+            pieces = strokes(xy, perceived.lines, usable, exam.pattern, exam.mode, exam.spacing_m, breaks)
+            layout = segments.lay(pieces)
             if not layout.troubled:
                 break
             breaks |= layout.breaks
@@ -111,16 +111,18 @@ class Planner:
         if not pieces:
             reasons = "; ".join(sorted(set(skipped.values()))) or "there are none"
             raise NoPathError(f"no target is left of {len(xy)}: {reasons}")
-        start = legs.hover(pieces[0], 0)
+        start = segments.hover(pieces[0], 0)
         assert start is not None, "a stroke that cannot be hovered over is trouble"
-        return ExamPlan(self._motion(free, q_now, start), tuple(layout.legs), skipped)
+        return ExamPlan(self._motion(free, q_now, start), tuple(layout.segments), skipped)
 
-    def _motion(self, scene: Scene, q0: Array, q1: Array) -> JointTrajectory:
-        return timed_motion(scene, self._kinematics, self._known.limits, q0, q1, self._known.seed)
+    def _motion(self, scene: CollisionScene, q0: Array, q1: Array) -> JointTrajectory:
+        return timed_motion(scene, self._kinematics, self._known.limits, q0, q1, self._known.seed, self._period_s)
 
-    def _reachable(self, seen: Seen, xy: Array, q_now: Array, scene: Scene) -> tuple[Array, dict[int, str]]:
+    def _reachable(
+        self, perceived: PerceivedAbdomen, xy: Array, q_now: Array, scene: CollisionScene
+    ) -> tuple[Array, dict[int, str]]:
         """A posture for each target, shape (n, 7), and the targets that none reaches, with the reason."""
-        p, n = seen.surface.at(xy)
+        p, n = perceived.surface.at(xy)
         robot, limits = self._known.robot, self._known.limits
         chosen = plan_redundancy(
             robot,

@@ -1,0 +1,72 @@
+"""What the sensors say about the contact: depth and force of the same moment."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from palpate_models.frames import Array
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.surface import PerceivedSurface
+from palpate_planning.tool_weight import ToolWeight
+
+CONTACT_ON_N = 0.15
+"""Normal force that counts as contact: nine standard deviations of the averaged noise."""
+CONTACT_OFF_N = 0.08
+"""Contact ends below this normal force."""
+
+
+class SensorReading(NamedTuple):
+    """Sensor values averaged over one planning period, so that force and depth belong together."""
+
+    q: Array
+    """Joint positions [rad], shape (7,)."""
+    wrench_S: Array
+    """Raw reading of the force/torque sensor, in its axes, force [N] then torque [N m], shape (6,)."""
+    qd: Array
+    """Joint velocities [rad/s], shape (7,)."""
+
+
+class ContactMeasurement(NamedTuple):
+    """Measured contact."""
+
+    X_WI: Array
+    """Pose of the indenter, shape (4, 4)."""
+    R_WS: Array
+    """Orientation of the force/torque sensor, shape (3, 3)."""
+    p_W: Array
+    """Rest surface point under the indenter [m], shape (3,)."""
+    n_W: Array
+    """Outward normal there."""
+    depth: float
+    """Radius less the signed distance of the sphere's centre from the rest surface [m]; negative: gap."""
+    force: float
+    """Normal force [N], positive when the tissue is pressed."""
+    touching: bool
+
+
+class ContactSensing:
+    """Turns sensor readings into contact, against the surface perceived so far."""
+
+    def __init__(
+        self, kinematics: ArmKinematics, weight: ToolWeight, surface: PerceivedSurface, radius: float, period_s: float
+    ) -> None:
+        """`radius` of the sphere [m]; a reading comes every `period_s`."""
+        self.surface = surface
+        self.weight = weight
+        self._kinematics, self._radius, self._period_s = kinematics, radius, period_s
+        self._touching = False
+        self._velocity: Array | None = None
+        """Velocity of the sphere's centre at the reading before [m/s], world axes, shape (3,)."""
+
+    def sense(self, reading: SensorReading) -> ContactMeasurement:
+        """The contact at a reading."""
+        X_WI, R_WS = self._kinematics.poses(reading.q)
+        p_W, n_W, distance = self.surface.nearest(X_WI[:3, 3])
+        velocity = (self._kinematics.jacobian(reading.q) @ reading.qd)[:3]
+        acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
+        self._velocity = velocity
+        force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ n_W)
+        self._touching = force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
+        return ContactMeasurement(X_WI, R_WS, p_W, n_W, self._radius - distance, force, self._touching)

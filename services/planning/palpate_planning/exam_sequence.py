@@ -1,0 +1,258 @@
+"""The sequence of the examination: home, look, plan, approach, indent, scan, retract, return, assess, done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from palpate_bus.setpoint import Setpoint
+from palpate_models import lbr
+from palpate_models.frames import Array
+from palpate_models.scenario import ExamInput
+from palpate_planning.background import WORKER, BackgroundTask
+from palpate_planning.contact import ContactSensing
+from palpate_planning.course import ExamCourse
+from palpate_planning.exam_planner import ExamPlan, ExamPlanner, PerceivedAbdomen
+from palpate_planning.free_motion import FreeMotion, TrajectoryFollower
+from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.look import look_postures
+from palpate_planning.motion_planning import NoPathError
+from palpate_planning.palpation import Palpation, PalpationStep, StrokeStage
+from palpate_planning.periods import MS, SECOND, Periods
+from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
+from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
+from palpate_planning.stops import Stops
+from palpate_planning.surface import PerceivedSurface
+from palpate_planning.timing import RestartRamp
+from palpate_planning.tool_weight import ToolWeight
+
+LOOKS_MAX = 3
+REST = 200 * MS
+"""Time at rest before looking or taring [ns]: the arm's oscillations fade."""
+TARE = 300 * MS
+"""Time of taring [ns]: 30 means over 10 ms of 0.05 N noise leave 3 mN."""
+LOOK_PATIENCE = 3 * SECOND
+"""Time that perception may take beyond the burst [ns]."""
+PLANNING_TIME = 2 * SECOND
+"""Simulated time that planning the examination takes [ns]."""
+ASSESS_PATIENCE = 30 * SECOND
+"""Time that the assessment may take for its final findings [ns]."""
+
+
+class ExamSequence:
+    """Runs one examination. `step` each planning period; `status` says where it stands."""
+
+    def __init__(self, known: ExamInput, periods: Periods, *, lockstep: bool = True) -> None:
+        """`lockstep`: heavy planning takes exactly its simulated time; else at least that, and as long as it takes."""
+        self._known, self._periods, self._lockstep = known, periods, lockstep
+        self._kinematics = ArmKinematics(known.robot, known.limits)
+        self._sense = ContactSensing(
+            self._kinematics,
+            ToolWeight.of(known.robot),
+            PerceivedSurface.plane(np.array(known.X_WA)),
+            known.robot.indenter_radius_m,
+            periods.step_s,
+        )
+        self._planner = ExamPlanner(known, periods.step_s)
+        WORKER.submit(self._planner.prepare)
+        self._looks = look_postures(known)
+        follower = TrajectoryFollower(self._kinematics, np.array(lbr.HOME))
+        self._course = ExamCourse(FreeMotion(follower, self._planner, lockstep=lockstep))
+        self._stops = Stops(self._course, known.limits.release_patience_s)
+        self._restart = RestartRamp()
+        self._phases: dict[Phase, Callable[[Observation], Setpoint | None]] = {
+            Phase.HOME: self._home,
+            Phase.LOOK: self._look,
+            Phase.PLAN: self._plan,
+            Phase.APPROACH: self._approach,
+            Phase.INDENT: self._palpate,
+            Phase.SCAN: self._palpate,
+            Phase.RETRACT: self._palpate,
+            Phase.RETURN: self._return,
+            Phase.ASSESS: self._assess,
+            Phase.DONE: self._rest,
+            Phase.ABORTED: self._rest,
+            Phase.HELD: self._held,
+        }
+        self._started = False
+        self._looked = 0
+        """Number of looks that have failed."""
+        self._asked: int | None = None
+        """When the camera was asked for the burst that perception is to answer [ns]."""
+        self._planning: BackgroundTask[ExamPlan] | None = None
+        self._skipped: dict[int, str] = {}
+        self._trigger = False
+        self._path: Array | None = None
+
+    @property
+    def status(self) -> ExamStatus:
+        """Where the examination stands."""
+        return self._course.status
+
+    @property
+    def surface_offset(self) -> float:
+        """Outward shift of the perceived surface that the onset of force called for [m]."""
+        return 0.0 if self._course.palpation is None else self._course.palpation.surface_offset
+
+    @property
+    def skipped(self) -> dict[int, str]:
+        """Skipped targets with the reason."""
+        return dict(self._skipped)
+
+    def step(self, now: Observation) -> ExamStep:
+        """One planning period. Until the robot has been heard of, the arm is asked for nothing."""
+        course, status = self._course, self.status
+        course.rate = self._restart.step(now.t)
+        if now.reading is None:
+            q = np.array(lbr.HOME)
+            return ExamStep(joint_setpoint(now.t, self._kinematics.pose(q), q, stiffness=NO_STIFFNESS), None)
+        if not self._started:
+            self._started = True
+            course.arm.hold(now.reading.q)
+            course.enter(Phase.HOME, now.t, "going home")
+        status.steady = status.force_limited = False
+        self._trigger, self._path = False, None
+        course.contact = self._sense.sense(now.reading)
+        status.depth_setpoint = course.contact.depth
+        self._stops.watch(now)
+        setpoint = self._phases[status.phase](now) or course.arm.step(now.t, course.rate)
+        return ExamStep(setpoint, course.contact, self._trigger, self._path)
+
+    # --- before contact -----------------------------------------------------------------------------------------------
+
+    def _home(self, now: Observation) -> Setpoint | None:
+        course = self._course
+        try:
+            if course.arm.move_to(now.t, np.array(lbr.HOME), course.perceived) and now.t - course.since >= REST:
+                course.enter(Phase.LOOK, now.t, "moving the arm out of the camera's view")
+        except NoPathError as error:
+            course.abort(now, f"no way home: {error}")
+        return None
+
+    def _look(self, now: Observation) -> Setpoint | None:
+        course, frames = self._course, self._known.camera.frames
+        if not self._looks:
+            course.abort(now, "every look posture collides: check robot.base_xy_m, base_yaw_rad and base_height_m")
+        elif self._asked is None:
+            try:
+                if not course.arm.move_to(now.t, self._looks[self._looked], course.perceived):
+                    course.since = now.t
+                elif now.t - course.since >= REST:
+                    self._trigger, self._asked = True, now.t
+                    self.status.message = f"looking: {frames} frames"
+            except NoPathError as error:
+                self._look_again(now, f"look posture cannot be reached: {error}")
+        elif isinstance(now.perceived, PerceivedAbdomen):
+            course.perceived = now.perceived
+            self._sense.surface = now.perceived.surface
+            self.status.target_count, self.status.view_blocked = len(now.perceived.positions), False
+            course.enter(Phase.PLAN, now.t, f"planning over {self.status.target_count} targets")
+        elif isinstance(now.perceived, PerceptionFailure):
+            self._look_again(now, now.perceived.message)
+        elif now.t - self._asked > frames * self._periods.frame + LOOK_PATIENCE:
+            self._look_again(now, f"no answer from perception {LOOK_PATIENCE / SECOND:.0f} s after the burst")
+        return None
+
+    def _look_again(self, now: Observation, why: str) -> None:
+        self._asked = None
+        self._looked += 1
+        self.status.view_blocked = "blocked" in why
+        self.status.message = why
+        if self._looked >= min(LOOKS_MAX, len(self._looks)):
+            self._course.abort(now, f"gave up after {self._looked} looks: {why}")
+
+    def _plan(self, now: Observation) -> Setpoint | None:
+        course = self._course
+        if self._planning is None:
+            perceived, start = course.perceived, course.arm.q.copy()
+            assert perceived is not None
+            self._planning = BackgroundTask(
+                now.t, PLANNING_TIME, lambda: self._planner.examination(perceived, start), lockstep=self._lockstep
+            )
+        elif self._planning.due(now.t):
+            try:
+                plan = course.plan = self._planning.result()
+            except NoPathError as error:
+                course.abort(now, str(error))
+                return None
+            self._skipped = dict(plan.skipped)
+            self._path = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m)
+            course.arm.start(plan.approach)
+            self.status.targets_skipped = len(self._skipped)
+            course.enter(Phase.APPROACH, now.t, plan.skipped_in_words() or "approaching the first target")
+        return None
+
+    def _approach(self, now: Observation) -> Setpoint | None:
+        course = self._course
+        assert now.reading is not None
+        if not course.arm.arrived:
+            course.since = now.t
+            self._sense.weight.start_tare()
+        elif now.t - course.since >= REST + TARE:
+            assert course.plan is not None and course.perceived is not None
+            course.palpation = Palpation(
+                course.plan.segments,
+                self._known.exam,
+                self._known.limits,
+                self._known.robot.indenter_radius_m,
+                self._periods.step_s,
+                course.perceived.noise,
+            )
+            course.enter(Phase.INDENT, now.t, StrokeStage.DESCEND.value)
+            return self._palpate(now)
+        elif now.t - course.since >= REST:
+            self._sense.weight.tare(course.contact.R_WS, now.reading.wrench_S)
+        return None
+
+    # --- in contact ---------------------------------------------------------------------------------------------------
+
+    def _palpate(self, now: Observation) -> Setpoint | None:
+        course = self._course
+        assert course.palpation is not None
+        step = course.palpation.step(now.t, course.contact, course.rate)
+        self._report(step, course.palpation, now.t)
+        self._sense.surface.offset = course.palpation.surface_offset
+        if step.stage is StrokeStage.DONE:
+            course.go_home(now, course.palpation.failed)
+        return step.setpoint
+
+    def _report(self, step: PalpationStep, palpation: Palpation, t: int) -> None:
+        status = self.status
+        self._skipped |= palpation.skipped
+        status.steady, status.force_limited = step.steady, step.limited
+        status.depth_setpoint, status.target_index = step.depth_setpoint, step.target
+        status.targets_skipped = len(self._skipped)
+        phase, message = PHASE_OF[step.stage], palpation.failed or step.stage.value
+        if phase is not status.phase or message != status.message:
+            self._course.enter(phase, t, message)
+
+    def _held(self, now: Observation) -> Setpoint | None:
+        setpoint = self._stops.step(now)
+        self._asked = None  # a burst that was asked for before the stop is asked for again
+        return self._palpate(now) if self.status.phase in PALPATING else setpoint
+
+    # --- after contact ------------------------------------------------------------------------------------------------
+
+    def _return(self, now: Observation) -> Setpoint | None:
+        course = self._course
+        try:
+            if course.arm.move_to(now.t, np.array(lbr.HOME), course.perceived):
+                if course.failure:
+                    course.abort(now, course.failure)
+                else:
+                    course.enter(Phase.ASSESS, now.t, "waiting for the findings")
+        except NoPathError as error:
+            course.abort(now, f"no way home: {error}")
+        return None
+
+    def _assess(self, now: Observation) -> Setpoint | None:
+        if now.findings_final:
+            skipped = f", {len(self._skipped)} of {self.status.target_count} targets skipped" if self._skipped else ""
+            self._course.enter(Phase.DONE, now.t, f"examination complete{skipped}")
+        elif now.t - self._course.since > ASSESS_PATIENCE:
+            self._course.abort(now, f"no final findings after {ASSESS_PATIENCE / SECOND:.0f} s")
+        return None
+
+    def _rest(self, now: Observation) -> Setpoint | None:
+        return None

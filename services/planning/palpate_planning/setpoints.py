@@ -1,0 +1,80 @@
+"""The two kinds of set-point that planning sends, with the stiffness of each."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from palpate_bus.setpoint import ControlMode, Setpoint
+from palpate_models.frames import Array
+
+
+def _fixed(values: list[float]) -> Array:
+    array = np.array(values)
+    array.setflags(write=False)
+    return array
+
+
+NORMAL_STIFFNESS: Final = 5000.0
+"""K_z [N/m] along the tool: with it depth errs by 0.4 to 1.5 mm even before regulation."""
+CARTESIAN_STIFFNESS: Final = _fixed([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
+"""[N/m, N m/rad] in axes of the indenter: firm along the tool, yielding across it, softest in the spin that does not matter."""
+DAMPING_RATIO: Final = _fixed([0.8] * 6)
+JOINT_STIFFNESS: Final = _fixed([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])
+"""Free motion [N m/rad]."""
+POSTURE_STIFFNESS: Final = _fixed([20.0] * 7)
+"""Null space in contact [N m/rad]; the controller caps its torque at 5 N m."""
+NO_STIFFNESS: Final = _fixed([0.0] * 7)
+"""Asks nothing of the arm [N m/rad]; the set-point only keeps the chain of commands alive."""
+_NO_TWIST: Final = _fixed([0.0] * 6)
+_NO_WRENCH: Final = _fixed([0.0] * 6)
+_JOINTS_AT_REST: Final = _fixed([0.0] * 7)
+
+
+def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTS_AT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
+    """Set-point of free motion at `t` [ns]: joint positions q [rad] and velocities qd [rad/s], shape (7,).
+
+    X_WI, shape (4, 4), tells readers of the message where the indenter is; the controller does not use it.
+    """
+    return Setpoint(
+        stamp=t,
+        mode=ControlMode.JOINT,
+        R_WD=X_WI[:3, :3],
+        p_WD=X_WI[:3, 3],
+        V_WD=_NO_TWIST,
+        F_W=_NO_WRENCH,
+        stiffness=CARTESIAN_STIFFNESS,
+        damping_ratio=DAMPING_RATIO,
+        q=q,
+        qd=qd,
+        joint_stiffness=stiffness,
+    )
+
+
+def cartesian_setpoint(
+    t: int,
+    R_WD: Array,
+    p_WD: Array,
+    q: Array,
+    V_WD: Array = _NO_TWIST,
+    F_W: Array = _NO_WRENCH,
+    qd: Array = _JOINTS_AT_REST,
+) -> Setpoint:
+    """Set-point of contact at `t` [ns]: pose, twist and feed-forward wrench of the indenter, posture q [rad] in the null space.
+
+    Shapes and units as in `Setpoint`.
+    """
+    return Setpoint(
+        stamp=t,
+        mode=ControlMode.CARTESIAN,
+        R_WD=R_WD,
+        p_WD=p_WD,
+        V_WD=V_WD,
+        F_W=F_W,
+        stiffness=CARTESIAN_STIFFNESS,
+        damping_ratio=DAMPING_RATIO,
+        q=q,
+        qd=qd,
+        joint_stiffness=POSTURE_STIFFNESS,
+    )

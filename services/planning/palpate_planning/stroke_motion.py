@@ -1,0 +1,160 @@
+"""The set-points of a stroke: where along the path, how deep below the surface and with what force the indenter is to be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from palpate_bus.setpoint import Setpoint
+from palpate_models.scenario import Exam, Limits
+from palpate_planning.contact import ContactMeasurement
+from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
+from palpate_planning.path import ACCELERATION, PathPoint
+from palpate_planning.segments import HOVER_M, Segment
+from palpate_planning.setpoints import NORMAL_STIFFNESS, cartesian_setpoint, joint_setpoint
+from palpate_planning.timing import JerkLimitedAxis
+
+DEPTH_ACCELERATION = 0.5
+"""[m/s^2]"""
+PLUNGE_MPS = 0.015
+"""Speed of the descent near the surface and below it."""
+TRANSFER_MPS = 0.15
+"""Speed of the ways between strokes."""
+TRANSFER_ACCELERATION = 0.8
+"""[m/s^2]"""
+CREEP_MPS = 1e-3
+"""Least speed along a path: it is to arrive."""
+BRAKING = 0.75
+"""Part of the acceleration with which the motion along a path brakes."""
+
+
+def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sinking: float, push: float) -> Setpoint:
+    """The set-point at `t` [ns] of a sphere that is at a point of a path.
+
+    Args:
+        t: time [ns].
+        point: where the path is now.
+        rate: speed along the path ds/dt [m/s].
+        distance: of the sphere's centre from the surface along the outward normal [m].
+        sinking: rate at which `distance` decreases [m/s].
+        push: feed-forward force into the tissue [N].
+    """
+    p, n, R, q, dp, dn, w, dq = point
+    V_WD, F_W = np.empty(6), np.zeros(6)
+    V_WD[:3] = (dp + dn * distance) * rate - n * sinking
+    V_WD[3:] = w * rate
+    F_W[:3] = -n * push
+    return cartesian_setpoint(t, R, p + n * distance, q, V_WD, F_W, dq * rate)
+
+
+class StrokeMotion:
+    """Moves the commanded indenter along one segment after the other, and up and down, within speed and acceleration."""
+
+    def __init__(self, exam: Exam, limits: Limits, radius: float, period_s: float) -> None:
+        """`radius` of the sphere [m]."""
+        self._exam, self._limits, self._radius, self._period_s = exam, limits, radius, period_s
+        self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
+        self.surface_offset = 0.0
+        """Outward shift of the perceived surface that the onset of force asks for [m]."""
+        self.regulation = Regulation(-HOVER_M, 0.0, -HOVER_M, 0.0, False, 0.0)
+        self.depth = self._depth_axis(-HOVER_M)
+        """Target depth [m], negative above the surface."""
+
+    def _depth_axis(self, depth: float) -> JerkLimitedAxis:
+        self._regulator.reset(depth)
+        return JerkLimitedAxis(depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05, self._period_s)
+
+    def _path_axis(self, position: float) -> JerkLimitedAxis:
+        return JerkLimitedAxis(position, self._acceleration, 10 * self._acceleration, self._period_s)
+
+    # --- where on which segment ---------------------------------------------------------------------------------------
+
+    def start(self, segment: Segment) -> None:
+        """At rest at the start of a segment."""
+        self.segment = segment
+        speed = self._exam.speed_mps if segment.contact else TRANSFER_MPS
+        self._speed_limit = segment.path.speed_limit(speed, self._limits)
+        self._acceleration = ACCELERATION if segment.contact else TRANSFER_ACCELERATION
+        self.along = self._path_axis(0.0)
+        """Path length travelled [m]."""
+        self._sample = 0.0
+
+    def restart(self, contact: ContactMeasurement) -> None:
+        """At rest where the segment was left, at the depth at which the arm is now."""
+        self.depth = self._depth_axis(contact.depth)
+        self.along = self._path_axis(self.along.position)
+
+    def shift_surface(self, onset: float) -> None:
+        """Counts depth from where force set in, at depth `onset` [m]; the commanded position stays where it is."""
+        self.surface_offset -= onset
+        self.depth.shift(-onset)
+        self._regulator.shift(-onset)
+
+    @property
+    def point(self) -> PathPoint:
+        """Where the path is now."""
+        return self.segment.path.at(self.along.position)
+
+    @property
+    def target(self) -> int:
+        """Index of the latest target reached."""
+        return self.segment.path.target(self.along.position + 1e-6)
+
+    @property
+    def centre_height(self) -> float:
+        """Distance of the sphere's centre from the perceived surface at zero depth [m]."""
+        return self._radius + self.surface_offset
+
+    @property
+    def stopping_distance(self) -> float:
+        """Path length needed to come to rest [m]."""
+        return self.along.velocity**2 / (2 * BRAKING * self._acceleration)
+
+    # --- one period of motion -----------------------------------------------------------------------------------------
+
+    def slowdown(self, full: float, none: float, floor: float) -> float:
+        """Part of the speed that the expected force leaves: 1 below `full` of the force limit, none at `none`, yet `floor`."""
+        force = self.regulation.expected_force / self._regulator.force_max
+        return min(max((none - force) / (none - full), floor), 1.0)
+
+    def deepen(self) -> bool:
+        """Sinks towards full depth, the slower the nearer the force is to its limit; returns whether it is there."""
+        return self.depth.step(self._exam.depth_m, PLUNGE_MPS * self.slowdown(0.7, 1.0, 0.01))
+
+    def slide(self) -> bool:
+        """Follows the path in contact, slower where force rises; returns whether it is at its end."""
+        allowed = self._speed_limit.at(self.along.position + self.along.velocity * self._period_s)
+        return self.along.step(self.segment.path.length, max(allowed * self.slowdown(1.0, 1.1, 0.3), CREEP_MPS))
+
+    def travel(self, goal: float) -> bool:
+        """Follows the path above the surface to path length `goal` [m]; returns whether it is there."""
+        return self.along.step(goal, max(self._speed_limit.at(self.along.position), CREEP_MPS))
+
+    def brake(self) -> None:
+        """Comes to rest along the path."""
+        if self.along.velocity > 1e-4:
+            self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, CREEP_MPS))
+
+    def follow_free_motion(self, rate: float) -> bool:
+        """Goes on by `rate` samples of the segment's free motion; returns whether it is at its end."""
+        assert self.segment.free is not None
+        last = len(self.segment.free) - 1.0
+        self._sample = min(self._sample + rate, last)
+        return self._sample >= last
+
+    def regulate(self, contact: ContactMeasurement, *, in_contact: bool) -> None:
+        """Regulates the measured depth towards the target depth; `in_contact` lets errors be integrated."""
+        self.regulation = self._regulator.update(self.depth.position, contact.depth, contact.force, in_contact)
+
+    @property
+    def short_of_depth(self) -> bool:
+        """Whether the target depth has not reached the depth of the examination."""
+        return self.depth.position < self._exam.depth_m - LIMITED_M
+
+    def setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
+        """The set-point at `t` [ns]; a free motion goes on by `rate` samples a period."""
+        if self.segment.free is not None:
+            q, qd = self.segment.free.at(self._sample)
+            return joint_setpoint(t, contact.X_WI, q, rate * qd)
+        regulation = self.regulation
+        distance = self.centre_height - regulation.depth
+        return stroke_setpoint(t, self.point, self.along.velocity, distance, regulation.rate, regulation.force)
