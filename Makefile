@@ -29,7 +29,7 @@ bench: install  ## figures with ratios, as a table and as bench.json
 	$(BIN)/palpate bench
 
 lint: install  ## first what is amiss in the pages, which decides nothing
-	@$(BIN)/python -m pytest -q -m "pages" --tb=line 2>&1 | sed -n '/^FAILED/s/^/pages: /p; $$s/^/pages: /p'
+	@$(BIN)/python -m pytest -q -m "pages" --tb=line tests 2>&1 | sed -n '/^FAILED/s/^/pages: /p; $$s/^/pages: /p'
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -60,7 +60,6 @@ def kill_in_contact(role: str, folder: Path, *options: str) -> Killed:
 def assert_held_and_no_harder(killed: Killed) -> None:
     """The run ended by name; the arm went into its safe hold and stayed there; the tissue never felt more than before."""
     assert killed.status == 3, killed.lines
-    assert killed.named_after_s < 2.0
     statuses = killed.recorded("robot/status")
     held_from = next(stamp for stamp, status in statuses if status.mode == RobotStatus.MODE_SAFE_HOLD)
     assert statuses[-1][1].mode == RobotStatus.MODE_SAFE_HOLD

@@ -12,6 +12,7 @@ import pytest
 from examination import GATE, SHORT, Finished, palpate_run
 from killing import assert_held_and_no_harder, kill_in_contact
 
+pytestmark = pytest.mark.timeout(900)
 LOCALISED_M = 1.7e-3
 DICE = 0.93
 COVERAGE = 0.89
@@ -47,7 +48,8 @@ def test_healthy_has_no_finding(tmp_path: Path) -> None:
 
 def test_a_killed_service_ends_the_run_by_name_and_the_force_does_not_rise(tmp_path: Path) -> None:
     killed = kill_in_contact("control", tmp_path)
-    assert any("control lost at tick" in line for line in killed.lines), killed.lines
+    print(f"named {killed.named_after_s:.1f} s after it was killed")
+    assert killed.named_after_s < 20.0, killed.lines  # two seconds, on a machine that has the time: test_losses.py
     assert_held_and_no_harder(killed)
 
 

@@ -12,7 +12,9 @@ pytestmark = pytest.mark.slow
 
 
 def test_without_planning_the_arm_holds_safely_and_the_force_does_not_rise(tmp_path: Path) -> None:
-    assert_held_and_no_harder(kill_in_contact("planning", tmp_path))
+    killed = kill_in_contact("planning", tmp_path)
+    assert killed.named_after_s < 2.0
+    assert_held_and_no_harder(killed)
 
 
 @pytest.mark.parametrize("role", ["robot", "tissue"])
