@@ -17,7 +17,7 @@ LOCALISED_M = 1.7e-3
 DICE = 0.93
 COVERAGE = 0.89
 HIGHEST_FORCE_N = 11.3
-DEPTH_RMS_M = 0.08e-3
+DEPTH_RMS_M = 0.1e-3
 
 
 def assert_within_bounds(finished: Finished) -> None:

@@ -35,15 +35,15 @@ class Elsewhere:
     def install(self, extra: str = "") -> None:
         self.run("python", "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), f"{self.wheel}{extra}")
 
-    def run(self, program: str, *words: str) -> str:
+    def run(self, program: str, *words: str, status: int = 0) -> str:
         """Runs a program of the environment, which sees nothing of the checkout. Returns what it printed."""
         environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PALPATE"))}
         command = [str(self.folder / "venv/bin" / program), *words]
         done = subprocess.run(
             command, cwd=self.folder, env=environment, capture_output=True, text=True, timeout=1500, check=False
         )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        assert done.returncode == status, done.stdout + done.stderr
+        return done.stdout + done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +56,7 @@ def elsewhere() -> Iterator[Elsewhere]:
 def test_bare_palpate_is_bus_and_contract(elsewhere: Elsewhere) -> None:
     elsewhere.install()
     elsewhere.run("python", "-c", BARE)
+    assert "pip install 'palpate[run]'" in elsewhere.run("palpate", "--help", status=1)
 
 
 def test_with_run_it_examines_an_abdomen(elsewhere: Elsewhere) -> None:
