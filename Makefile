@@ -11,8 +11,8 @@ export PYTHONHASHSEED := 0
 run: install  ## the default examination, as processes on this machine
 	$(BIN)/palpate run $(ARGS)
 
-test: install  ## everything but the slow, Docker and browser tests
-	$(BIN)/python -m pytest -q -m "not slow and not docker and not browser"
+test: install  ## everything but the slow, Docker, browser and page tests; whole examinations (tests/test_gate.py) too
+	$(BIN)/python -m pytest -q -m "not slow and not docker and not browser and not pages"
 
 test-slow: install  ## long cases: seeds, scenarios, faults
 	$(BIN)/python -m pytest -q -m "slow"
@@ -28,7 +28,8 @@ test-browser: install  ## opens the dashboard of live runs in headless Chromium
 bench: install  ## figures with ratios, as a table and as bench.json
 	$(BIN)/palpate bench
 
-lint: install
+lint: install  ## first what is amiss in the pages, which decides nothing
+	@$(BIN)/python -m pytest -q -m "pages" --tb=line tests 2>&1 | sed -n '/^FAILED/s/^/pages: /p; $$s/^/pages: /p'
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -44,6 +45,8 @@ docs: install  ## docs/topics.md, from the contract
 install: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml constraints.txt requirements-dev.txt
+	@test -x $(BIN)/python || $(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
+	{ echo "Palpate needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version 2>&1). Name another: make PYTHON=python3.12"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-dev.txt -e .[all]
 	touch $@

@@ -1,4 +1,7 @@
-"""Prints the libraries that `palpate[EXTRA]` needs, from pyproject.toml alone, so that they have a layer of their own."""
+"""Writes a list of libraries for each extra of pyproject.toml, so that an image installs them in a layer of their own.
+
+bus.txt is what palpate needs without an extra.
+"""
 
 import re
 import sys
@@ -18,4 +21,7 @@ def libraries(extra: str) -> set[str]:
 
 
 if __name__ == "__main__":
-    print("\n".join(sorted({*PROJECT["dependencies"], *libraries(sys.argv[1])})))
+    folder = Path(sys.argv[1])
+    folder.mkdir()
+    for name, lines in {"bus": set(), **{extra: libraries(extra) for extra in PROJECT["optional-dependencies"]}}.items():
+        (folder / f"{name}.txt").write_text("\n".join(sorted({*PROJECT["dependencies"], *lines})) + "\n", encoding="utf-8")

@@ -30,8 +30,12 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # `docker stop`, systemd: what Ctrl-C does
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         signal.signal(signal.SIGHUP, signal.default_int_handler)  # the terminal was closed
-    from palpate.commands import main as run  # noqa: PLC0415
-
+    try:
+        from palpate.commands import main as run  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        if error.name != "typer":
+            raise
+        sys.exit("palpate: bus and contract are installed, the command line is not: pip install 'palpate[run]'")
     run()
 
 

@@ -1,4 +1,4 @@
-"""Makes the helpers of these tests importable, and the one examination by real processes that several of them look at."""
+"""Makes the helpers of these tests importable, and the examinations that several of them look at."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from examination import SHORT, Finished, palpate_run
+from examination import GATE, Finished, palpate_run
 
 LISTENER = Path(__file__).parent / "contract" / "foreign_listener.py"
 
@@ -37,6 +37,21 @@ def distributed(tmp_path_factory: pytest.TempPathFactory, overheard: list[subpro
 
     stranger = threading.Thread(target=listen, daemon=True)
     stranger.start()
-    finished = palpate_run("rlq_guarding", folder, settings=SHORT)
+    finished = palpate_run("rlq_guarding", folder, settings=GATE)
     stranger.join(timeout=180)
     return finished
+
+
+@pytest.fixture(scope="session")
+def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """The same examination in one process."""
+    return palpate_run("rlq_guarding", tmp_path_factory.mktemp("composed"), "--composed", "--no-record", settings=GATE)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """A line for each examination of test_gate.py, with its figures, for the summary of `.ci/run`."""
+    for outcome in ("passed", "failed", "error"):
+        for report in terminalreporter.stats.get(outcome, ()):
+            _, _, name = report.nodeid.partition("test_gate.py::test_")
+            if name and (report.when == "call" or outcome == "error"):
+                terminalreporter.write_line(f"gate: {name.replace('_', ' ')}: {outcome}  {report.capstdout.strip()}".rstrip())

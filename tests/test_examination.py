@@ -1,4 +1,4 @@
-"""A short examination through the command, distributed and composed."""
+"""A short examination through the command, by real processes; what else its user may ask for, and what is refused."""
 
 from __future__ import annotations
 
@@ -7,12 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from examination import SHORT, Finished, palpate_run
-
-
-@pytest.fixture(scope="module")
-def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    return palpate_run("rlq_guarding", tmp_path_factory.mktemp("composed"), "--composed", settings=SHORT)
+from examination import Finished, palpate_run
 
 
 def test_it_completes(distributed: Finished) -> None:
@@ -29,12 +24,6 @@ def test_depth_is_true_and_force_within_its_limit(distributed: Finished) -> None
     assert report["max_force_N"] < 15.0
     assert report["depth_rms_error_m"] < 0.002
     assert report["surface_rms_error_m"] < 0.001
-
-
-def test_both_lockstep_runtimes_give_the_same_run_hash(distributed: Finished, composed: Finished) -> None:
-    assert composed.status == 0, composed.output
-    assert distributed.report["run_hash"] == composed.report["run_hash"]
-    assert distributed.report["findings"] == composed.report["findings"]
 
 
 def test_a_stranger_with_zenoh_and_rosbags_alone_reads_the_live_bus(

@@ -12,6 +12,7 @@ import typer
 
 from palpate.commands import app_for
 
+pytestmark = pytest.mark.pages
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(page for page in ROOT.rglob("*.md") if not {".venv", "out", "node_modules"} & set(page.relative_to(ROOT).parts))
 

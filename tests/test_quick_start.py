@@ -35,6 +35,7 @@ def commands() -> list[list[str]]:
     return [shlex.split(line) for line in lines]
 
 
+@pytest.mark.pages
 def test_the_page_shows_the_files_that_are_tried() -> None:
     shown = re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE, re.DOTALL)
     assert shown == [(EXAMPLES / name).read_text(encoding="utf-8") for name in
@@ -42,6 +43,7 @@ def test_the_page_shows_the_files_that_are_tried() -> None:
     assert len([line for line in shown[-1].splitlines() if line.strip()]) <= 40
 
 
+@pytest.mark.pages
 def test_every_command_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     assert len(commands()) >= 6

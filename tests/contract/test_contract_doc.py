@@ -9,6 +9,7 @@ import pytest
 from palpate_bus.contract import Edge, contract
 from palpate_bus.contract.doc import page
 
+pytestmark = pytest.mark.pages
 ROOT = Path(__file__).resolve().parents[2]
 RULES = contract()
 

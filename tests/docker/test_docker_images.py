@@ -26,22 +26,33 @@ def test_an_image_is_pinned_and_runs_as_no_root() -> None:
             assert "-c constraints.txt" in line, line
 
 
-def extras() -> set[str]:
-    """What the images install, of all compose files."""
+def builds() -> list[tuple[str, str]]:
+    """(EXTRA, BASE) of the images of all compose files."""
     found = set()
     for path in (ROOT / "docker-compose.yml", *sorted((ROOT / "compose").glob("*.yml"))):
         for service in yaml.safe_load(path.read_text(encoding="utf-8"))["services"].values():
-            found |= {service["build"]["args"]["EXTRA"]} if "build" in service else set()
-    return found
+            if "build" in service:
+                words = service["build"]["args"]
+                found.add((words["EXTRA"], words.get("BASE", "models")))
+    return sorted(found)
 
 
-@pytest.mark.parametrize("extra", sorted(extras()))
-def test_what_an_image_installs_can_be_named(extra: str) -> None:
-    words = [sys.executable, str(ROOT / "compose/requirements.py"), extra]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "zenoh" in done.stdout
-    assert "palpate" not in done.stdout
+@pytest.fixture(scope="module")
+def lists(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The libraries of every extra, as the image's build writes them."""
+    folder = tmp_path_factory.mktemp("requirements") / "lists"
+    subprocess.run([sys.executable, str(ROOT / "compose/requirements.py"), str(folder)], cwd=ROOT, check=True, timeout=60)
+    return folder
+
+
+@pytest.mark.parametrize(("extra", "base"), builds())
+def test_an_image_stands_on_a_stage_that_installs_nothing_it_does_not_need(extra: str, base: str, lists: Path) -> None:
+    assert f"\nFROM models AS {base}\n" in DOCKERFILE or base in ("bus", "models")
+    needed = set((lists / f"{extra}.txt").read_text(encoding="utf-8").split())
+    stage = {"pinocchio": "control", "opengl": "models"}.get(base, base)
+    assert set((lists / f"{stage}.txt").read_text(encoding="utf-8").split()) <= needed
+    assert not any(line.startswith("palpate") for line in needed)
+    assert any(line.startswith("eclipse-zenoh") for line in needed)
 
 
 def test_every_role_has_a_service_an_image_and_shared_memory_by_override() -> None:

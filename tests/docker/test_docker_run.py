@@ -16,7 +16,7 @@ from examination import SHORT, Finished, palpate_run
 ROOT = Path(__file__).parents[2]
 PROJECT = "palpate-test"
 USER = str(os.getuid() or 1000)
-SHARED_MEMORY = ("-f", "docker-compose.yml", "-f", "compose.ipc.yml")
+SHARED_MEMORY = ("-f", "docker-compose.yml", "-f", "compose/ipc.yml")
 LINK = """
 from palpate_bus.wire.zenoh_config import session
 with session() as opened:
