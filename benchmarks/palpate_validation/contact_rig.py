@@ -19,7 +19,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
-from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
+from palpate_bus.setpoint import TOPIC
 from palpate_control.service import create as create_control
 from palpate_models import lbr
 from palpate_models.frames import Array, matrix

@@ -93,7 +93,7 @@ class ImpedanceController:
         self._friction = (model.viscous_friction, model.coulomb_friction, model.velocity_limit)
         self._designed_for: Setpoint | None = None
         self._design_age = 0
-        self._cartesian_gains = CartesianGains(*np.zeros((2, 6)), *np.zeros((2, DOF)), np.zeros((DOF, 6)))
+        self._cartesian_gains = CartesianGains(np.zeros(6), np.zeros(6), np.zeros(DOF), np.zeros(DOF), np.zeros((DOF, 6)))
         self._joint_gains = JointGains(*np.zeros((2, DOF, DOF)))
 
     def reset(self) -> None:
