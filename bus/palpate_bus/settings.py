@@ -1,0 +1,261 @@
+"""The settings of a process: everything that a user, `palpate run` or docker-compose.yml may say about how it runs.
+
+    settings = Settings.read()                                  from this process's environment
+    child = settings.replaced(runtime="wallclock", record=True)
+    subprocess.Popen(command, env={**os.environ, **child.to_env()})
+
+Nothing else in the project reads a PALPATE_ variable. What is examined, and how, is no setting: it is in the scenario.
+`python -m palpate_bus.settings --doc` writes docs/settings.md from this file.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+PREFIX = "PALPATE_"
+PAGE = Path("docs/settings.md")
+DOMAIN_MAX = 232
+"""The highest ROS domain with DDS's default port range; zenoh itself knows no limit."""
+
+COMPOSE_VARIABLES = {
+    "PALPATE_SCENARIO_NAME": ("rlq_guarding", "Scenario that the containers examine: a name or a file."),
+    "PALPATE_SETTINGS": ("", "Changes to the scenario, `a.b=c`, separated by spaces."),
+    "PALPATE_RESULTS": ("./out", "Folder of this machine into which the containers write."),
+    "PALPATE_UID": ("1000", "User id under which the containers write."),
+    "PALPATE_GID": ("1000", "Group id under which the containers write."),
+    "PALPATE_RECORDING": ("", "Folder with a recording, for compose/camera-replay.yml."),
+}
+"""What only docker-compose.yml reads: default and meaning."""
+
+
+class BusConfigError(ValueError):
+    """A setting that cannot work, or a bus that cannot be joined. Names the variable or field, its value and what is allowed."""
+
+
+class Settings(BaseSettings):
+    """How a process runs and joins the bus. Each field is a variable: `listen` is PALPATE_LISTEN, `domain` is ROS_DOMAIN_ID.
+
+    An empty variable is one that is not set.
+    """
+
+    model_config = SettingsConfigDict(
+        env_prefix=PREFIX, env_ignore_empty=True, extra="ignore", frozen=True, populate_by_name=True, validate_default=False
+    )
+
+    listen: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(), description="Endpoints to listen on, separated by commas, such as `tcp/127.0.0.1:7501`."
+    )
+    connect: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(),
+        description="Endpoints of peers, separated by commas. A peer that is not there yet is tried again until it is.",
+    )
+    router: str | None = Field(
+        default=None,
+        description="Endpoint of a router, such as `tcp/host:7447`. Peers find each other through it, then talk directly.",
+    )
+    mode: Literal["peer", "client", "router"] = Field(
+        default="peer",
+        description="A `client` sends everything through the router: in the secure mode, or behind address translation.",
+    )
+    lowlatency: bool = Field(
+        default=False,
+        description="Offer zenoh's low-latency transport. `palpate run` decides this; it has no effect by the wall clock.",
+    )
+    shared_memory: bool = Field(
+        default=True, description="Send messages over 3 KiB to processes of the same host by shared memory."
+    )
+    tls: Path | None = Field(
+        default=None,
+        description="Folder with `ca.pem`, `cert.pem` and `key.pem` (`palpate keys init`). Endpoints: `tls/host:port`.",
+    )
+    zenoh_config: Path | None = Field(
+        default=None,
+        description="A zenoh configuration file (JSON5) that is used as it is. The settings above then have no effect.",
+    )
+    domain: int = Field(default=0, ge=0, le=DOMAIN_MAX, validation_alias="ROS_DOMAIN_ID", description="ROS domain.")
+    runtime: Literal["lockstep", "wallclock"] = Field(
+        default="lockstep", description="Whether services step in lockstep or by the wall clock."
+    )
+    scenario: Path | None = Field(default=None, description="The scenario file of a service, as `palpate prepare` writes it.")
+    out: Path | None = Field(default=None, description="The run's results folder, for services that write files.")
+    record: bool = Field(default=False, description="Whether the run has a recorder, to which services pass on what they send.")
+    record_file_mb: int | None = Field(default=None, ge=1, description="Size [MB] at which the recorder begins a new file.")
+    viewer: str | None = Field(
+        default=None, description="How the dashboard shows a run live: `serve`, `serve:PORT`, `connect` or `connect:URL`."
+    )
+    periods: Annotated[dict[str, int], NoDecode] = Field(
+        default={}, description="Other periods of roles [ms] for an experiment, such as `control=5`, separated by commas."
+    )
+    runs: Path | None = Field(
+        default=None,
+        description="Folder where runs are announced; by default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`.",
+    )
+    compose: Annotated[tuple[Path, ...], NoDecode] = Field(
+        default=(), description="Compose file that `palpate run` reads, and overrides after it, separated by colons."
+    )
+    fmu: Path | None = Field(default=None, description="The FMU that plays the role of this service.")
+    fmu_map: Path | None = Field(default=None, description="The file that ties the FMU's variables to topics.")
+    log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = Field(default="INFO", description="What a service logs.")
+
+    @field_validator("listen", "connect", mode="before")
+    @classmethod
+    def _endpoints(cls, value: Any) -> Any:
+        return _split(value, ",")
+
+    @field_validator("compose", mode="before")
+    @classmethod
+    def _files(cls, value: Any) -> Any:
+        return _split(value, os.pathsep)
+
+    @field_validator("periods", mode="before")
+    @classmethod
+    def _periods(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        pairs = [[word.strip() for word in entry.split("=")] for entry in value.split(",")]
+        for pair in pairs:
+            if len(pair) != 2 or not pair[0] or not pair[1].isdigit() or int(pair[1]) < 1:
+                raise ValueError(f"{'='.join(pair)!r} is not ROLE=MILLISECONDS")
+        return {role: int(period) for role, period in pairs}
+
+    @classmethod
+    def read(cls, environ: Mapping[str, str] | None = None) -> Self:
+        """The settings of this process, or those that another environment asks for.
+
+        Raises BusConfigError that names each wrong variable, its value and what is allowed.
+        """
+        if environ is None:
+            return cls._checked(cls)
+        values = {name: environ[variable(name)] for name in cls.model_fields if environ.get(variable(name))}
+        return cls._checked(lambda: cls(**(cls._defaults() | values)))
+
+    def replaced(self, **changes: Any) -> Self:
+        """These settings with some fields changed. Raises BusConfigError."""
+        if unknown := changes.keys() - type(self).model_fields.keys():
+            raise BusConfigError(f"there is no setting {', '.join(sorted(unknown))}")
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return self._checked(lambda: type(self)(**(values | changes)))
+
+    def required(self, name: str, why: str) -> Any:
+        """The value of a setting that this process cannot do without. Raises BusConfigError that says `why`."""
+        value = getattr(self, name)
+        if value is None:
+            raise BusConfigError(f"{variable(name)} is not set; {why}")
+        return value
+
+    def to_env(self) -> dict[str, str]:
+        """The variables that give another process these settings. What is not set is empty, to undo an inherited one."""
+        return {variable(name): _text(getattr(self, name)) for name in type(self).model_fields}
+
+    @classmethod
+    def _defaults(cls) -> dict[str, Any]:
+        return {name: field.get_default() for name, field in cls.model_fields.items()}
+
+    @classmethod
+    def _checked(cls, make: Callable[[], Self]) -> Self:
+        try:
+            return make()
+        except ValidationError as error:
+            raise BusConfigError("; ".join(_complaint(cls, one) for one in error.errors())) from None
+
+
+def variable(name: str) -> str:
+    """The environment variable of a field of `Settings`."""
+    alias = Settings.model_fields[name].validation_alias
+    return alias if isinstance(alias, str) else PREFIX + name.upper()
+
+
+def _split(value: Any, separator: str) -> Any:
+    return tuple(part.strip() for part in value.split(separator) if part.strip()) if isinstance(value, str) else value
+
+
+def _text(value: Any) -> str:
+    """A value as it is written in a variable."""
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(int(value))
+        case dict():
+            return ",".join(f"{role}={period}" for role, period in value.items())
+        case tuple():
+            return (os.pathsep if value and isinstance(value[0], Path) else ",").join(map(str, value))
+        case _:
+            return str(value)
+
+
+def _complaint(settings: type[Settings], error: Any) -> str:
+    """One finding of pydantic, with the variable, its value and what is allowed."""
+    place = str(error["loc"][0])
+    name = next((name for name in settings.model_fields if place in (name, variable(name))), place)
+    problem = error["msg"].removeprefix("Value error, ") + "; " if error["type"] == "value_error" else ""
+    return f"{variable(name)} is {error['input']!r}: {problem}allowed: {allowed(name)}"
+
+
+def allowed(name: str) -> str:
+    """What a setting may be, in words."""
+    field = Settings.model_fields[name]
+    kinds = [field.annotation]
+    if isinstance(field.annotation, types.UnionType):
+        kinds = [kind for kind in typing.get_args(field.annotation) if kind is not type(None)]
+    if typing.get_origin(kinds[0]) is Literal:
+        return ", ".join(typing.get_args(kinds[0]))
+    if kinds[0] is bool:
+        return "0, 1"
+    if kinds[0] is int:
+        bounds = {bound: getattr(rule, bound) for rule in field.metadata for bound in ("ge", "le") if hasattr(rule, bound)}
+        return f"{bounds['ge']} to {bounds['le']}" if "le" in bounds else f"a whole number from {bounds['ge']}"
+    if typing.get_origin(kinds[0]) is dict:
+        return "ROLE=MILLISECONDS, ..."
+    if typing.get_origin(kinds[0]) is tuple:
+        return "files" if Path in typing.get_args(kinds[0]) else "endpoints"
+    return "a path" if kinds[0] is Path else "text"
+
+
+def page() -> str:
+    """docs/settings.md."""
+    rows = [
+        (variable(name), allowed(name), _text(field.get_default()), field.description or "")
+        for name, field in Settings.model_fields.items()
+    ]
+    rows += [(name, "docker compose only", default, doc) for name, (default, doc) in COMPOSE_VARIABLES.items()]
+    lines = [
+        "# Settings",
+        "",
+        "Every environment variable that the project reads, made from [`Settings`](../bus/palpate_bus/settings.py) by",
+        "`python -m palpate_bus.settings --doc`. `palpate run` and docker-compose.yml set what a service needs; a user",
+        "seldom sets any. A wrong value is refused with the variable, the value and what is allowed. An empty variable counts as not",
+        "set. What is examined, and how, is in the scenario.",
+        "",
+        "| variable | allowed | default | meaning |",
+        "|---|---|---|---|",
+        *(f"| `{name}` | {kind} | {f'`{default}`' if default else ''} | {doc} |" for name, kind, default, doc in rows),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Prints the settings of this environment, or writes the page into the working directory's docs/; returns the exit status."""
+    if "--doc" in arguments:
+        PAGE.write_text(page(), encoding="utf-8")
+        return 0
+    try:
+        for name, value in Settings.read().to_env().items():
+            print(f"{name}={value}")
+    except BusConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
