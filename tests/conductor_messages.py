@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from palpate.run.result import RunResult
 from palpate_bus.messages import (
     ExamState,
     Finding,
@@ -20,6 +19,7 @@ from palpate_bus.messages import (
 from palpate_bus.messages.codec import message_type
 from palpate_bus.messages.stamps import header
 from palpate_conductor.collector import Collected
+from palpate_conductor.result import RunResult
 
 _Point: Any = message_type("geometry_msgs/msg/Point")
 _Vector3: Any = message_type("geometry_msgs/msg/Vector3")

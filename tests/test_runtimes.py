@@ -29,7 +29,8 @@ from palpate_bus.wire.transport import Subscription
 from palpate_bus.wire.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.outcome import Outcome, Patience, RunFailed
+from palpate_conductor.outcome import Patience, RunFailed, RunOutcome
+from palpate_conductor.timing import Timing
 from palpate_dashboard.replay import draw
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live
@@ -56,7 +57,7 @@ def run_toys(
     environment: Mapping[str, str] | None = None,
     patience: Patience | None = None,
     wallclock: bool = False,
-) -> Outcome:
+) -> RunOutcome:
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
         bus = mesh(("conductor", *ROLES), Path(folder), lowlatency=("robot", "control", "tissue"))
         session = open_session(bus["conductor"])
@@ -72,7 +73,7 @@ def run_toys(
             )
             for role in ROLES
         }
-        conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, wallclock=wallclock)
+        conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, Timing(wallclock=wallclock))
         running = Running(processes, session, conductor)
 
         def died() -> dict[str, str]:

@@ -1,13 +1,14 @@
-"""The main of every service process.
+"""The main of every service process: `python -m palpate_<role> [NAME_OR_FILE]`.
 
     from palpate_bus.run import main
-    from palpate_control.service import create
+    from palpate_models.load import load_scenario
 
     if __name__ == "__main__":
-        main("control", create)
+        main("control", load_scenario)
 
-Environment: PALPATE_SCENARIO (resolved scenario file), PALPATE_RUNTIME (lockstep or wallclock), PALPATE_OUT (results folder),
-ROS_DOMAIN_ID, and what `zenoh_config` reads.
+The word names an implementation or a file of one's own (see `implementations`); without it the scenario's `services.control` says
+which. Environment: PALPATE_SCENARIO (resolved scenario file), PALPATE_RUNTIME (lockstep or wallclock), PALPATE_OUT (results
+folder), ROS_DOMAIN_ID, and what `zenoh_config` reads.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ import logging
 import os
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
 from palpate_bus.contract import MS, Contract, Role, contract
+from palpate_bus.implementations import ChoiceError, create
 from palpate_bus.runtime.distributed import LockstepNode, RunAborted
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObserverNode
@@ -29,7 +31,8 @@ from palpate_bus.runtime.priority import in_the_background
 from palpate_bus.runtime.recording import RawRecorder, RecorderNode
 from palpate_bus.runtime.wallclock import WallClockNode
 from palpate_bus.service import Service
-from palpate_bus.wire.zenoh_config import BusConfigError, close_session, domain_from_env, open_session
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire.zenoh_config import close_session, domain_from_env, open_session
 
 EXIT_FAILED = 3
 RUNTIMES: dict[str, type[LockstepNode] | type[WallClockNode]] = {"lockstep": LockstepNode, "wallclock": WallClockNode}
@@ -65,10 +68,18 @@ def _scenario() -> str:
         raise BusConfigError("PALPATE_SCENARIO is not set; want a scenario file, as `palpate prepare` writes it") from None
 
 
-def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]) -> None:
+class NamesServices(Protocol):
+    """What this module knows of a scenario."""
+
+    @property
+    def services(self) -> Any:
+        """The chosen implementation of each role, as attributes."""
+
+
+def main(role: str, load: Callable[[str], NamesServices]) -> None:
     """Runs the service of `role` to its end and leaves with status 0, or 3 when the run failed or was aborted.
 
-    `load` reads the scenario file named by PALPATE_SCENARIO; `create` makes the service from it.
+    `load` reads the scenario file named by PALPATE_SCENARIO.
     """
     logging.basicConfig(
         level=os.environ.get("PALPATE_LOG", "INFO"),
@@ -80,7 +91,9 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
     try:
         rules = contract()
         domain = domain_from_env()
-        service = create(load(_scenario()))
+        scenario = load(_scenario())
+        choice = sys.argv[1] if len(sys.argv) > 1 else getattr(scenario.services, role)
+        service = create(role, choice, scenario)
         if stands_back(rules.roles[role], runtime()):
             in_the_background()
         session = open_session()
@@ -94,7 +107,7 @@ def main(role: str, create: Callable[[Any], Service], load: Callable[[str], Any]
         status = EXIT_FAILED
     except KeyboardInterrupt:
         status = EXIT_FAILED
-    except BusConfigError as error:
+    except (BusConfigError, ChoiceError) as error:
         logging.getLogger(role).error("%s", error)
         status = EXIT_FAILED
     except Exception:

@@ -16,12 +16,12 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
-from importlib.metadata import entry_points
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, thread_time
 
 from palpate.fuzz.bus_targets import Target, targets
+from palpate.fuzz.scenario_targets import targets as scenario_targets
 
 SLOW_S = 1.0
 """An input that takes more processor time is a find too: it would hold up a service."""
@@ -125,11 +125,8 @@ def campaign(
 
 
 def all_targets() -> list[Target]:
-    """The bus's targets and those of the other installed packages."""
-    found = targets()
-    for point in sorted(entry_points(group="palpate.fuzz"), key=lambda point: point.name):
-        found += point.load()()
-    return found
+    """The bus's targets and those of the scenario."""
+    return [*targets(), *scenario_targets()]
 
 
 def guided(target: Target, inputs: int, seed: int) -> Find | None:

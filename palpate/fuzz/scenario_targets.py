@@ -1,25 +1,14 @@
-"""The scenario reader under fuzzing, for `palpate fuzz` (entry-point group `palpate.fuzz`)."""
+"""The scenario reader under fuzzing, for `palpate fuzz`."""
 
 from __future__ import annotations
 
 import random
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
+from palpate.fuzz.bus_targets import Target
 from palpate_models.load import ScenarioError, dump_scenario, load_scenario, scenario_names
-
-
-@dataclass(frozen=True)
-class Target:
-    """What `palpate.fuzz.bus_targets.Target` is; the models know no bus."""
-
-    name: str
-    check: Callable[[bytes], None]
-    seeds: Callable[[random.Random], Sequence[bytes]]
-
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="palpate-fuzz-")
 

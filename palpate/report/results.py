@@ -26,7 +26,7 @@ from palpate.report.evidence import (
 from palpate.report.figures import draw_map
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
-from palpate.run.result import RunResult
+from palpate_conductor.result import RunResult
 from palpate_models.frames import apply, inverse
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import Scenario

@@ -15,7 +15,8 @@ from palpate_bus.security.access import ROUTER
 from palpate_bus.security.denials import Denial
 from palpate_bus.security.guard import Guard
 from palpate_bus.security.keys import init, read
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire.zenoh_config import BusOptions
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import socket
 import time
 from pathlib import Path
 
-from palpate.live.doctor import Finding, Level, turned_away
+from palpate.live.doctor import Remark, Severity, turned_away
 from palpate_bus.contract import contract
 from palpate_bus.security.access import ROUTER, VIEWER
 from palpate_bus.security.guard import Guard
@@ -25,10 +25,10 @@ def test_a_torque_by_the_cameras_certificate_shows(tmp_path: Path) -> None:
     with Guard(keys / ROUTER, endpoint, lambda _: None):
         options = {name: BusOptions(mode="client", router=endpoint, tls=keys / name) for name in ("camera", VIEWER)}
         with session(options["camera"]) as camera, session(options[VIEWER]) as viewer:
-            assert turned_away(viewer) == [Finding("access", Level.OK, "the router turned nobody away")]
-            found: list[Finding] = []
+            assert turned_away(viewer) == [Remark("access", Severity.OK, "the router turned nobody away")]
+            found: list[Remark] = []
             end = time.monotonic() + 20
-            while time.monotonic() < end and not any(finding.level is Level.BAD for finding in found):
+            while time.monotonic() < end and not any(finding.level is Severity.BAD for finding in found):
                 camera.put(torque, b"x")
                 found = turned_away(viewer)
     (finding,) = found

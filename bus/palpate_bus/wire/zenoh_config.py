@@ -55,6 +55,8 @@ from typing import Any
 
 import zenoh
 
+from palpate_bus.settings import BusConfigError as BusConfigError  # noqa: PLC0414
+
 UNIX_PATH_MAX = 107
 """Longest path of a unix socket [bytes] on Linux (sun_path less its NUL)."""
 
@@ -71,10 +73,6 @@ WALL_CLOCK_DROP_WAIT_US = 1_000
 
 DOMAIN_MAX = 232
 """Of ROS 2 with the default port range of DDS; zenoh itself knows no limit."""
-
-
-class BusConfigError(ValueError):
-    """A bus configuration that cannot work. Names the variable or field, its value and what is allowed."""
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from palpate_bus.messages import DiagnosticStatus, KeyValue
 from palpate_bus.messages.stamps import NS
 from palpate_bus.monitor.diagnostics import RECENT_S
 from palpate_bus.monitor.health import Seen
-from palpate_conductor.watchdog import Progress
+from palpate_conductor.watchdog import RoleProgress
 
 
 def service_statuses(
-    progress: Mapping[str, Progress], lost: Container[str], silent_s: float, violations: Callable[[str], Sequence[Seen]]
+    progress: Mapping[str, RoleProgress], lost: Container[str], silent_s: float, violations: Callable[[str], Sequence[Seen]]
 ) -> list[Any]:
     """A status a service: ERROR when it is lost or violates the contract, WARN when it says nothing for `silent_s` [s].
 
@@ -36,7 +36,7 @@ def service_statuses(
     return statuses
 
 
-def _judged(at: Progress, lost: bool, silent: float, silent_s: float, found: Sequence[Seen], now: float) -> tuple[int, str]:
+def _judged(at: RoleProgress, lost: bool, silent: float, silent_s: float, found: Sequence[Seen], now: float) -> tuple[int, str]:
     if lost:
         return DiagnosticStatus.ERROR, "lost"
     if found and now - found[-1].last <= RECENT_S:

@@ -19,7 +19,7 @@ from palpate_models.frames import matrix
 from palpate_models.load import load_scenario, redacted
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.mapping import MapError
-from palpate_tissue.backends.fmu.service import chosen_role, create
+from palpate_tissue.backends.fmu.service import create
 
 SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.amplitude_m=0.003", "phantom.pose.true.rpy_rad=[0.05, -0.1, 0.3]")
 
@@ -76,7 +76,7 @@ def test_it_sends_what_the_native_tissue_sends(
     if version == 2:  # by file; FMI 3.0 is built on the fly
         monkeypatch.setenv("PALPATE_FMU", str(build_scenario_fmu(scenario, tmp_path / "a.fmu", 2, [native()])))
     hosted = create(scenario)
-    assert hosted.role == chosen_role() == "tissue"
+    assert hosted.role == "tissue"
     begin, expected = hosted.start(), native_tissue.start()
     assert begin.keys() == expected.keys()
     assert_alike("truth/phantom", begin["truth/phantom"], expected["truth/phantom"])
@@ -100,7 +100,6 @@ def test_another_role_needs_a_file(scenario: Scenario, tmp_path: Path, monkeypat
     path = tmp_path / "map.yaml"
     path.write_text("role: assessment\noutputs: {}\n")
     monkeypatch.setenv("PALPATE_FMU_MAP", str(path))
-    assert chosen_role() == "assessment"
     with pytest.raises(MapError, match="which FMU plays the role assessment"):
         create(redacted(scenario))
 

@@ -74,6 +74,6 @@ def create(scenario: Scenario) -> ReplayedCamera:
     path = scenario.camera.recording
     if path is None:
         raise RecordingError(
-            "camera.implementation: replay needs camera.recording: a run's folder, a rosbag2 folder or an .mcap file"
+            "services.camera: replay needs camera.recording: a run's folder, a rosbag2 folder or an .mcap file"
         )
     return ReplayedCamera(open_recording(Path(path)))

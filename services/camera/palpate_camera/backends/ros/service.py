@@ -185,6 +185,6 @@ def _intrinsics(t: int, info: Any, *, rectified: bool) -> Any:
 def create(scenario: Scenario) -> RosCameraService:
     """The bridge; of the scenario it needs nothing. Raises CameraError."""
     if runtime() != "wallclock":
-        raise CameraError("camera.implementation = ros takes a real camera, which does not wait: run with --wallclock")
+        raise CameraError("services.camera = ros takes a real camera, which does not wait: run with --wallclock")
     frame, world = os.environ.get("PALPATE_CAMERA_FRAME") or FRAME, os.environ.get("PALPATE_CAMERA_WORLD") or "world"
     return RosCameraService(ZenohCamera(), frame.strip("/"), world.strip("/"))

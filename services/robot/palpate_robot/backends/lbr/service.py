@@ -229,7 +229,7 @@ def create(scenario: Scenario) -> LbrService:
     """The driver of a scenario, of which it may know the exam input; joins the ROS side as the environment says."""
     if runtime() != "wallclock":
         raise SettingsError(
-            "robot.implementation = lbr drives hardware, which does not wait for simulated time: run with --wallclock"
+            "services.robot = lbr drives hardware, which does not wait for simulated time: run with --wallclock"
         )
     exam, settings = exam_input(scenario), Settings.from_env()
     inner = InnerLoop(load_control(scenario)) if settings.level == "setpoint" else None

@@ -110,12 +110,6 @@ def host(role: str, *arguments: Any, **options: Any) -> FmuService:
     return service
 
 
-def chosen_role() -> str:
-    """The role of this process: that of the map that PALPATE_FMU_MAP names, or tissue."""
-    path = os.environ.get("PALPATE_FMU_MAP")
-    return load_map(Path(path)).role if path else "tissue"
-
-
 def packaged_map(name: str) -> FmuMap:
     """A map that comes with this package."""
     with resources.as_file(resources.files("palpate_tissue.backends.fmu").joinpath("maps", f"{name}.yaml")) as path:
@@ -123,11 +117,11 @@ def packaged_map(name: str) -> FmuMap:
 
 
 def create(scenario: Scenario) -> FmuService:
-    """The FMU that PALPATE_FMU names, tied by the map that PALPATE_FMU_MAP names.
+    """The FMU that PALPATE_FMU or the scenario's `tissue.fmu` names, tied by the map that PALPATE_FMU_MAP names.
 
     By default the abdomen of the scenario, built here, in the role of the tissue.
     """
-    file, path = os.environ.get("PALPATE_FMU"), os.environ.get("PALPATE_FMU_MAP")
+    file, path = os.environ.get("PALPATE_FMU") or scenario.tissue.fmu, os.environ.get("PALPATE_FMU_MAP")
     table = load_map(Path(path)) if path else None
     if file is None or file == "":
         if table is not None and table.role != "tissue":
