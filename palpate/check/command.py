@@ -13,8 +13,8 @@ from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
 from palpate.check.suites import SUITES, check
 from palpate.command_line import refuse
+from palpate.live.connection import Connect
 from palpate.live.console import EXIT_TROUBLE, command, console, print_json, table
-from palpate.live.joining import Connect
 from palpate_bus import implementations
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.joining import NoBus

@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from palpate.live import graph
-from palpate.live.joining import Joined
+from palpate.live.connection import Joined
 from palpate_bus.contract import Contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.live import LiveMonitor

@@ -65,6 +65,8 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase
     workers = [row.name for row in rules.roles.values() if not row.observer and row.name != "conductor"]
     if role not in workers:
         raise ChoiceError(f"--service {choice}: no service {role!r}; services are {', '.join(workers)}")
+    if name:
+        implementations.check(role, name)
     recording = open_recording(path)
     text = scenario.read_text(encoding="utf-8") if scenario else recording.scenario or _beside(path, role)
     topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from palpate.report import archive, scoring
 from palpate.report.evidence import (
-    Contact,
+    ContactRecord,
     Samples,
     centroids_of,
     map_of,
@@ -277,7 +277,7 @@ def _lesion(lesion: scoring.TrueLesion) -> LesionRow:
     )
 
 
-def _depth(contact: Contact | None, truth: scoring.Truth | None) -> DepthRow:
+def _depth(contact: ContactRecord | None, truth: scoring.Truth | None) -> DepthRow:
     if contact is None or truth is None or not len(contact.true):
         return DepthRow(**dict.fromkeys(DepthRow.model_fields))
     lesion = scoring.lesion_at(truth, contact.position)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
-from palpate.run.places import Absent, Place, write_places
+from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, override_files, read_processes
 from palpate.run.roles import OBSERVERS, choice, workers, write_scenario_files
 from palpate.run.secure import SecureBus
@@ -57,7 +57,7 @@ def run_distributed(
             local.start(process)
         others = (*absent.roles, *(ROLES if timing.handover_s else ()))
         places = {
-            role: Place(process.command, local.environment(process), role in absent.roles)
+            role: ServicePlace(process.command, local.environment(process), role in absent.roles)
             for role, process in processes.items()
             if role in others
         }

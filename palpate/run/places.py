@@ -39,7 +39,7 @@ class PlaceError(ValueError):
     """A place that cannot be left out, joined or taken. Says why, and what can be done."""
 
 
-class Place(NamedTuple):
+class ServicePlace(NamedTuple):
     """A process that somebody else may start."""
 
     command: tuple[str, ...]
@@ -72,7 +72,7 @@ class Absent:
             if role not in roles:
                 raise PlaceError(f"--without {role}: this run has no {role}, but {', '.join(roles)}")
 
-    def call(self, out: Path, places: Mapping[str, Place]) -> None:
+    def call(self, out: Path, places: Mapping[str, ServicePlace]) -> None:
         """Says who is awaited."""
         for role in self.roles:
             given = places[role].environment
@@ -90,20 +90,20 @@ class Absent:
         return f"{failure.rstrip()} {'; '.join(words for role, words in self._sentences.items() if role in failure)}"
 
 
-def write_places(out: Path, places: Mapping[str, Place]) -> None:
+def write_places(out: Path, places: Mapping[str, ServicePlace]) -> None:
     """Writes places.json into a results folder."""
     rows = {role: place._asdict() for role, place in places.items()}
     (out / FILE).write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
 
 
-def read_places(run: runs.Run) -> dict[str, Place]:
+def read_places(run: runs.Run) -> dict[str, ServicePlace]:
     """The places of a run; none when it started all its services itself and keeps no place."""
     file = Path(run.out) / FILE
     rows = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    return {role: Place(tuple(row["command"]), row["environment"], row["awaited"]) for role, row in rows.items()}
+    return {role: ServicePlace(tuple(row["command"]), row["environment"], row["awaited"]) for role, row in rows.items()}
 
 
-def place_to_join(role: str, run: runs.Run) -> Place:
+def place_to_join(role: str, run: runs.Run) -> ServicePlace:
     """The place of a role that `run` was told to leave out. Raises PlaceError when it was not."""
     awaited = {name: place for name, place in read_places(run).items() if place.awaited}
     if not awaited:
@@ -113,7 +113,7 @@ def place_to_join(role: str, run: runs.Run) -> Place:
     return awaited[role]
 
 
-def place_to_take(role: str, run: runs.Run) -> Place:
+def place_to_take(role: str, run: runs.Run) -> ServicePlace:
     """The place of a service of `run` that may change hands. Raises PlaceError when it may not."""
     if role not in ROLES:
         raise PlaceError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
@@ -128,7 +128,7 @@ def place_to_take(role: str, run: runs.Run) -> Place:
     return kept[role]._replace(environment=environment)
 
 
-def command_for(role: str, place: Place, service: str | None) -> tuple[str, ...]:
+def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[str, ...]:
     """The words that start the process: those of the run, or those of the chosen implementation. Raises ChoiceError."""
     if service is None:
         return place.command
@@ -170,7 +170,7 @@ def takeover(
     _enter(place_to_take, role, service, run)
 
 
-def _enter(find: Callable[[str, runs.Run], Place], role: str, service: str | None, run: str | None) -> NoReturn:
+def _enter(find: Callable[[str, runs.Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
     try:
         place = find(role, live_run(run))
         command = command_for(role, place, service)

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from palpate.run.places import Absent, Place, PlaceError, command_for, place_to_join, place_to_take, write_places
+from palpate.run.places import Absent, PlaceError, ServicePlace, command_for, place_to_join, place_to_take, write_places
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.announcement import Run
 
 ENVIRONMENT = {"PALPATE_LISTEN": "unixsock-stream//tmp/x/control.sock", "PALPATE_SCENARIO": "/out/exam.yaml"}
 COMMAND = ("python", "-m", "palpate_control")
-PLACE = Place(COMMAND, ENVIRONMENT, True)
+PLACE = ServicePlace(COMMAND, ENVIRONMENT, True)
 
 
 def absent(folder: Path) -> tuple[Absent, list[str]]:

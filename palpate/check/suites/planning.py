@@ -19,7 +19,7 @@ WEIGHT_N = 6.0
 AWAIT_S = 20.0
 
 
-class Follower:
+class PerfectFollower:
     """An arm that is where the last joint set-point wants it; it starts at the ready posture."""
 
     def __init__(self, rig: Rig) -> None:
@@ -45,7 +45,7 @@ class Follower:
 def suite(rig: Rig, report: ConformanceReport) -> None:
     """Set-points, the way to the first picture, stop."""
     report.section("set-points")
-    arm = Follower(rig)
+    arm = PerfectFollower(rig)
     rig.run(0.5, arm.feed())
     heard = rig.log[SETPOINT]
     if not report.expect("set-points come", bool(heard), "100 Hz", len(heard)):

@@ -20,7 +20,7 @@ DEPTH = 0.008
 CLEARANCE = 0.01
 
 
-class Tool:
+class PressingTool:
     """An indenter that is led along straight legs; poses in world."""
 
     def __init__(self, p: Array, radius: float) -> None:
@@ -68,7 +68,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     radius = rig.settings.scenario.robot.indenter_radius_m
     report.section("contact")
     touch = p_W + n_W * radius
-    tool = Tool(touch + n_W * CLEARANCE, radius)
+    tool = PressingTool(touch + n_W * CLEARANCE, radius)
     above = tool.rest(rig, 0.2)
     _check_free(above, report, "no force out of contact")
     legs: list[tuple[list[HeardMessage], Array]] = []
