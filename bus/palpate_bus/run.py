@@ -81,6 +81,17 @@ def main(role: str, load: Callable[[str], NamesServices]) -> None:
 
     `load` reads the scenario file named by PALPATE_SCENARIO.
     """
+
+    def chosen() -> Service:
+        scenario = load(_scenario())
+        choice = sys.argv[1] if len(sys.argv) > 1 else getattr(scenario.services, role)
+        return create(role, choice, scenario)
+
+    run_service(role, chosen)
+
+
+def run_service(role: str, make: Callable[[], Service]) -> None:
+    """As `main`, for the service that `make` returns."""
     logging.basicConfig(
         level=os.environ.get("PALPATE_LOG", "INFO"),
         format=f"%(asctime)s {role} %(levelname)s %(message)s",
@@ -91,9 +102,7 @@ def main(role: str, load: Callable[[str], NamesServices]) -> None:
     try:
         rules = contract()
         domain = domain_from_env()
-        scenario = load(_scenario())
-        choice = sys.argv[1] if len(sys.argv) > 1 else getattr(scenario.services, role)
-        service = create(role, choice, scenario)
+        service = make()
         if stands_back(rules.roles[role], runtime()):
             in_the_background()
         session = open_session()

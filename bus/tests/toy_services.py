@@ -37,7 +37,7 @@ from palpate_bus.messages import (
     WrenchStamped,
 )
 from palpate_bus.messages.stamps import NS, duration_message, header
-from palpate_bus.run import main
+from palpate_bus.run import run_service
 from palpate_bus.service import Inbox, Outbox, Service
 
 MS = 1_000_000
@@ -194,4 +194,4 @@ EVERY = (Robot, Control, Tissue, Planning, Assessment, Camera, Perception, Super
 TOYS: dict[str, type[Service]] = {toy.role: toy for toy in EVERY}
 
 if __name__ == "__main__":
-    main(sys.argv[1], lambda _: TOYS[sys.argv[1]](), lambda _: None)
+    run_service(sys.argv[1], TOYS[sys.argv[1]])
