@@ -2,8 +2,9 @@
 
 import sys
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import find_spec
+
+from palpate_bus.implementations import create
 
 COMPILED = ("robot", "robot-mujoco", "tissue", "control", "planning", "supervisor")
 """Extras whose service is made in simulated time and compiles something; the elastic tissue would leave 80 MB of its matrices."""
@@ -13,7 +14,6 @@ if __name__ == "__main__":
     if find_spec("matplotlib"):
         import_module("matplotlib.font_manager")
     if extra in COMPILED:
-        points = {
-            point.name: point for group in ("palpate.services", "palpate.implementations") for point in entry_points(group=group)
-        }
-        points[extra.replace("-", ".")].load()(import_module("palpate_models.load").load_scenario("rlq_guarding"))
+        scenario = import_module("palpate_models.load").load_scenario("rlq_guarding")
+        role, _, name = extra.partition("-")
+        create(role, name or getattr(scenario.services, role), scenario)

@@ -1,26 +1,16 @@
-"""Entry point of the `palpate` command.
+"""Entry point of the `palpate` command: fixes the environment that makes results repeatable, then runs the command.
 
-Results must not depend on how many threads a BLAS uses, nor on the kernels that it chooses for a processor, nor on Python's hash
-seed, and these are read when the interpreter and the libraries start. So where they are not fixed yet, this fixes them and starts
-anew before anything heavy is imported.
+Where the environment does not have the values of `FIXED` yet, the interpreter is started again with them, before anything heavy
+is imported.
 """
 
 from __future__ import annotations
 
 import os
-import platform
 import signal
 import sys
 
-KERNELS = {"x86_64": "Haswell"}
-"""OpenBLAS kernels by machine: those of AVX2. With its own choice a surface fit differed in the last bit between processors."""
-FIXED = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "PYTHONHASHSEED": "0",
-    **({"OPENBLAS_CORETYPE": KERNELS[platform.machine()]} if platform.machine() in KERNELS else {}),
-}
-"""The same is in docker-compose.yml."""
+from palpate.environment import FIXED
 
 
 def main() -> None:

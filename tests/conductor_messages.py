@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from palpate.run.result import RunResult
 from palpate_bus.messages import (
     ExamState,
     Finding,
@@ -23,6 +22,7 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.stamps import header
 from palpate_conductor.collector import Collected
+from palpate_conductor.result import RunResult
 
 LESION, FOUND, RADIUS = (-0.05, -0.05), (-0.046, -0.05), 0.03
 P_WA = (0.56, 0.0, 0.93)

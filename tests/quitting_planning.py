@@ -6,9 +6,8 @@ import dataclasses
 from typing import Any
 
 from palpate_bus.messages import ExamState
-from palpate_bus.run import main
 from palpate_bus.service import Inbox, Outbox
-from palpate_models.load import exam_input, load_scenario
+from palpate_models.load import exam_input
 from palpate_models.scenario import Scenario
 from palpate_planning.service import PlanningService
 
@@ -32,7 +31,3 @@ class Quitting(PlanningService):
 def create(scenario: Scenario) -> Quitting:
     """The service of a scenario."""
     return Quitting(exam_input(scenario))
-
-
-if __name__ == "__main__":
-    main("planning", create, load_scenario)

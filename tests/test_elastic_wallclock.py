@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from examination import SHORT, palpate_run
 
-ELASTIC = (*SHORT, "tissue.implementation=elastic")
+ELASTIC = (*SHORT, "services.tissue=elastic")
 
 
 @pytest.mark.slow

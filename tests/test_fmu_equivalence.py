@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from examination import palpate_run
 
-from palpate.__main__ import FIXED
+from palpate.environment import FIXED
 from palpate.run.composed import load_services
-from palpate.run.distributed import WORKERS
 from palpate.run.processes import compose_file
+from palpate.run.roles import WORKERS
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages.codec import decode
 from palpate_bus.messages.stamps import NS
@@ -198,9 +198,10 @@ def test_one_line_of_the_compose_file_puts_it_on_the_bus(tmp_path: Path, monkeyp
     fixed = {**os.environ, **FIXED}
     composed = subprocess.run([sys.executable, __file__], env=fixed, capture_output=True, text=True, timeout=900, check=True)
     text = compose_file().read_text(encoding="utf-8")
-    assert text.count("palpate_tissue") == 1
+    line = "command: [python, -m, palpate_tissue]"
+    assert text.count(line) == 1
     swapped = tmp_path / "docker-compose.yml"
-    swapped.write_text(text.replace("palpate_tissue", "palpate_tissue.backends.fmu"), encoding="utf-8")
+    swapped.write_text(text.replace(line, "command: [python, -m, palpate_tissue, fmu]"), encoding="utf-8")
     monkeypatch.setenv("PALPATE_COMPOSE", str(swapped))
     finished = palpate_run("rlq_guarding", tmp_path / "out", "--no-record", "--seed", "3", settings=SETTINGS)
     assert finished.status == 0, finished.output

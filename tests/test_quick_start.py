@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from examination import palpate_run
 
-from palpate.run.own import own_services
+from palpate.run.roles import checked, settings_of
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.conformance import violations
 from palpate_bus.messages import JointState, codec
@@ -49,9 +49,9 @@ def test_every_command_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(commands()) >= 6
     for words in commands():
         settings = [value for flag, value in pairwise(words) if flag == "--set"]
-        own_services([value for flag, value in pairwise(words) if flag == "--service"])
+        settings += settings_of([value for flag, value in pairwise(words) if flag == "--service"])
         name = words[0] if words and not words[0].startswith("--") else "rlq_guarding"
-        load_scenario(name, settings)
+        checked(load_scenario(name, settings))
 
 
 def test_the_mesh_is_an_abdomen(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from examination import SHORT
 
 from palpate.run.composed import load_services
-from palpate.run.distributed import WORKERS
+from palpate.run.roles import WORKERS
 from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.runtime.composed import Composed

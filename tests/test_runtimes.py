@@ -29,7 +29,8 @@ from palpate_bus.wire.transport import Subscription
 from palpate_bus.wire.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.outcome import Outcome, Patience, RunFailed
+from palpate_conductor.outcome import Patience, RunFailed, RunOutcome
+from palpate_conductor.timing import Timing
 from palpate_dashboard.replay import draw
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live
@@ -57,7 +58,7 @@ def run_toys(
     patience: Patience | None = None,
     wallclock: bool = False,
     faults: Mapping[str, tuple[str, ...]] | None = None,
-) -> Outcome:
+) -> RunOutcome:
     """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second)."""
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
         bus = mesh(("conductor", *ROLES), Path(folder), lowlatency=("robot", "control", "tissue"))
@@ -76,7 +77,7 @@ def run_toys(
             )
             for role in ROLES
         }
-        conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, wallclock=wallclock)
+        conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, Timing(wallclock=wallclock))
         running = Running(processes, session, conductor)
 
         def died() -> dict[str, str]:

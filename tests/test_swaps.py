@@ -22,7 +22,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 
 def test_another_plant_finds_the_same(reference: Finished, tmp_path: Path) -> None:
-    settings = (*SHORT, "robot.implementation=mujoco")
+    settings = (*SHORT, "services.robot=mujoco")
     finished = palpate_run("rlq_guarding", tmp_path, "--composed", "--no-record", settings=settings)
     assert finished.status == 0, finished.output
     assert finished.report["run_hash"] != reference.report["run_hash"], "it is another plant"
@@ -33,7 +33,7 @@ def test_another_plant_finds_the_same(reference: Finished, tmp_path: Path) -> No
 
 
 def test_a_replayed_camera_gives_the_recorded_run_to_the_last_bit(reference: Finished, tmp_path: Path) -> None:
-    settings = (*SHORT, "camera.implementation=replay", f"camera.recording={reference.folder}")
+    settings = (*SHORT, "services.camera=replay", f"camera.recording={reference.folder}")
     finished = palpate_run("rlq_guarding", tmp_path, "--composed", "--no-record", settings=settings)
     assert finished.status == 0, finished.output
     assert finished.report["run_hash"] == reference.report["run_hash"]
@@ -41,7 +41,7 @@ def test_a_replayed_camera_gives_the_recorded_run_to_the_last_bit(reference: Fin
 
 def test_a_replayed_camera_of_another_patient_shows_another_surface(reference: Finished, tmp_path: Path) -> None:
     """So the pixels are used: with the recorded patient at another place, the exam goes where that one was."""
-    settings = (*SHORT, "camera.implementation=replay", f"camera.recording={reference.folder}", "seed=1")
+    settings = (*SHORT, "services.camera=replay", f"camera.recording={reference.folder}", "seed=1")
     finished = palpate_run("rlq_guarding", tmp_path, "--composed", "--no-record", settings=settings)
     assert finished.status == 0, finished.output
     digests, recorded = finished.report["digests"], reference.report["digests"]

@@ -10,7 +10,7 @@ import json
 import platform
 import tempfile
 from collections.abc import Callable, Sequence
-from importlib.metadata import EntryPoint, entry_points
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ from rich.table import Table
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
 from palpate.run.composed import run_composed
-from palpate.run.distributed import OBSERVERS, run_distributed
-from palpate.run.result import RunResult
+from palpate.run.distributed import run_distributed
+from palpate.run.roles import OBSERVERS
 from palpate_benchmarks.case_display import CaseDisplay
+from palpate_conductor.result import RunResult
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
 
@@ -39,9 +40,18 @@ def _figures(result: RunResult) -> dict[str, Any]:
     }
 
 
-def _load(point: EntryPoint) -> Callable[[], dict[str, float]]:
-    loaded: Callable[[], dict[str, float]] = point.load()
-    return loaded
+PARTS = {
+    "barrier": "palpate_benchmarks.barrier",
+    "codec": "palpate_benchmarks.codec",
+    "control": "palpate_benchmarks.control",
+    "fmu": "palpate_benchmarks.fmu",
+    "monitor": "palpate_benchmarks.monitor",
+    "robot": "palpate_benchmarks.robot",
+    "tissue": "palpate_benchmarks.tissue",
+    "tissue, elastic": "palpate_benchmarks.elastic",
+    "wire": "palpate_benchmarks.wire",
+}
+"""The modules that measure the parts; each has a function `measure()`."""
 
 
 GROUPS = ("parts", "runs")
@@ -54,19 +64,19 @@ Save = Callable[[dict[str, Any]], None]
 def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], save: Save) -> dict[str, Any]:
     """The figures of some of `GROUPS`, by name. `save` gets what there is after each: an interrupted call leaves its part."""
     figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
-    points = sorted(entry_points(group="palpate.benchmarks"), key=lambda point: point.name) if "parts" in groups else []
+    parts = PARTS if "parts" in groups else {}
     cases: dict[str, Callable[[Path], RunResult]] = {
         "composed": lambda out: run_composed(scenario, out, lambda _: None, ()),
         "distributed": lambda out: run_distributed(scenario, out, lambda _: None, ()),
         "distributed, recorder and viewer": lambda out: run_distributed(scenario, out, lambda _: None, OBSERVERS),
     }
     names = list(cases) if "runs" in groups else []
-    total = len(points) + len(names)
-    for done, point in enumerate(points):
-        display.tell(done, total, f"{point.name}: cost of a step")
-        figures["parts"][point.name] = _load(point)()
+    total = len(parts) + len(names)
+    for done, (part, module) in enumerate(parts.items()):
+        display.tell(done, total, f"{part}: cost of a step")
+        figures["parts"][part] = import_module(module).measure()
         save(figures)
-    for done, name in enumerate(names, len(points)):
+    for done, name in enumerate(names, len(parts)):
         display.tell(done, total, f"{scenario.name}, {name}")
         with tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
             result = cases[name](Path(folder))

@@ -16,16 +16,19 @@ from time import monotonic
 from typing import Any, Final
 
 from palpate.report.evidence import peak_force
-from palpate.run.distributed import WORKERS, conduct, write_scenario_files
 from palpate.run.forks import Forks
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
-from palpate.run.result import Progress, RunResult
+from palpate.run.roles import WORKERS, choice, write_scenario_files
 from palpate_benchmarks.faulty import CHANGES, InjectedFault, command
 from palpate_bus.contract import Topic, contract
+from palpate_bus.implementations import module
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.wire.zenoh_config import close_session, open_session
+from palpate_conductor.conduct import conduct
 from palpate_conductor.outcome import Patience, RunFailed
+from palpate_conductor.result import RunProgress, RunResult
+from palpate_conductor.timing import Timing
 from palpate_models.load import load_scenario
 
 SETTINGS: Final = (
@@ -140,7 +143,7 @@ class _Watch:
     seen_scan: int | None = None
     signs: list[str] = field(default_factory=list)
 
-    def tell(self, progress: Progress) -> None:
+    def tell(self, progress: RunProgress) -> None:
         """Called every 20 ms of wall time (`palpate_conductor.conductor.POLL_S`)."""
         if self.finding.injected_s is None:
             self._strike(progress)
@@ -167,7 +170,7 @@ class _Watch:
         scanned = exam.phase == ExamState.PHASE_RETURN and not self.signs
         return WENT_ON if scanned and self.target != ASSESSES else None
 
-    def _strike(self, progress: Progress) -> None:
+    def _strike(self, progress: RunProgress) -> None:
         exam = progress.collected.exam
         if exam is None:
             return
@@ -186,7 +189,7 @@ class _Watch:
         self.local.running[self.target].send_signal(number)
 
 
-def _signs(progress: Progress) -> list[str]:
+def _signs(progress: RunProgress) -> list[str]:
     """Everything that says that something is wrong."""
     found = list(progress.trouble)
     collected = progress.collected
@@ -202,7 +205,8 @@ def _signs(progress: Progress) -> list[str]:
 
 def forks() -> Forks:
     """What starts the processes of many cases."""
-    return Forks(process.command[2] for process in read_processes(compose_file(), WORKERS).values())
+    scenario = load_scenario("rlq_guarding", SETTINGS)
+    return Forks(module(role, choice(scenario, role)) for role in WORKERS)
 
 
 def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> FaultFinding:
@@ -215,17 +219,17 @@ def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> Fault
     fault = _fault(case)
     if fault is not None:
         processes[target] = replace(processes[target], command=command(target, fault))
-    extra = {"PALPATE_RUNTIME": "wallclock" if case.wallclock else "lockstep", "PALPATE_RECORD": "0"}
+    timing = Timing(wallclock=case.wallclock)
     finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
     begin = monotonic()
-    local = LocalProcesses(WORKERS, out, files, extra, forks=forks)
+    local = LocalProcesses(WORKERS, out, files, timing, forks=forks)
     try:
         session = open_session(local.bus["conductor"])
         try:
             for role in WORKERS:
                 local.start(processes[role])
             watch = _Watch(case, local, target, finding)
-            result = conduct(session, WORKERS, watch.tell, local.ended, None, case.wallclock, PATIENCE)
+            result = conduct(session, WORKERS, watch.tell, local.ended, timing, PATIENCE)
             if result.interrupted:
                 raise KeyboardInterrupt
             _conclude(finding, watch, result)
@@ -253,7 +257,7 @@ def _fault(case: FaultCase) -> InjectedFault | None:
 def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
     """How it ended, and what the forces were."""
     collected = result.collected
-    last = Progress(0, 0.0, collected, ())
+    last = RunProgress(0, 0.0, collected, ())
     if finding.injected_s is not None:
         watch.signs += [sign for sign in _signs(last) if sign not in watch.signs]
         failed = result.failure is not None and result.failure not in UNHARMED

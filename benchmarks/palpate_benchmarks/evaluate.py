@@ -24,7 +24,7 @@ DEFAULT_CASES = ("rlq_guarding", "healthy", "two_lesions", ELSEWHERE)
 
 
 @dataclass(frozen=True)
-class Case:
+class Evaluation:
     """One examination."""
 
     name: str
@@ -43,7 +43,7 @@ class Case:
         return ["healthy", "--set", f"phantom.lesions=[{lesion}]", "--set", f"name={ELSEWHERE}"]
 
 
-def run_case(case: Case) -> dict[str, Any]:
+def run_case(case: Evaluation) -> dict[str, Any]:
     """Its report; of a run that did not complete its scenario, seed and `failure` alone."""
     with tempfile.TemporaryDirectory(prefix="palpate-evaluate-") as folder:
         options = ["--composed", "--no-record", "--quiet", "--seed", str(case.seed), "--out", folder]
@@ -64,7 +64,7 @@ def evaluate(
 
     A case that did not complete has a report with `failure`, `scenario` and `seed` alone: none is left out of the count.
     """
-    cases = [Case(name, seed) for name in names for seed in seeds]
+    cases = [Evaluation(name, seed) for name in names for seed in seeds]
     tell(0, len(cases), "")
     with ThreadPoolExecutor(workers) as pool:
         running = {pool.submit(run_case, case): case for case in cases}

@@ -23,7 +23,6 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from importlib.metadata import entry_points
 from time import sleep
 from typing import Any, Final
 
@@ -33,7 +32,7 @@ import zenoh
 from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
-from palpate_bus.run import main
+from palpate_bus.run import chosen, run_service
 from palpate_bus.wire.transport import HELLO, Sender, Transport
 from palpate_models.load import load_scenario
 
@@ -186,8 +185,7 @@ def serve(arguments: Sequence[str]) -> None:
     """Runs a service with a fault; see the module's description."""
     role, topic, kind, count = arguments
     fault = InjectedFault(topic, kind, int(count))
-    (service,) = entry_points(group="palpate.services", name=role)
-    main(role, service.load(), load_scenario, lambda session: FaultyTransport(session, fault))
+    run_service(role, lambda: chosen(role, load_scenario), lambda session: FaultyTransport(session, fault))
 
 
 if __name__ == "__main__":

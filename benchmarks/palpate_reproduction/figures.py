@@ -17,7 +17,7 @@ from PIL import Image
 from palpate.report.archive import Evidence
 from palpate.report.evidence import truth_of
 from palpate.report.figures import FORCE_COLOURS, INK, QUIET, STIFFNESS_COLOURS, Drawing, colour_bar, panel_title
-from palpate_reproduction.render import View, picture
+from palpate_reproduction.render import Viewpoint, picture
 from palpate_reproduction.scene import Moment, Stage
 from palpate_validation import drop
 from palpate_validation.check import Section
@@ -25,8 +25,8 @@ from palpate_validation.check import Section
 DPI: Final = 100
 COLOURS: Final = 192
 """Of the palette that large pictures are reduced to, to keep them small."""
-ROOM: Final = View((1.60, -1.50, 1.95), (0.36, 0.02, 1.22), 40.0)
-CLOSE: Final = View((1.10, -0.62, 1.32), (0.54, -0.02, 0.96), 30.0)
+ROOM: Final = Viewpoint((1.60, -1.50, 1.95), (0.36, 0.02, 1.22), 40.0)
+CLOSE: Final = Viewpoint((1.10, -0.62, 1.32), (0.54, -0.02, 0.96), 30.0)
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -45,7 +45,7 @@ def limits(report: Report, deformation_mm: float, peak_ratio: float) -> list[Lim
         Limit(
             "the rigid part is the body scaled down: protruding parts displace the bone",
             "nothing is scaled: each vertex rests on a foundation along its own normal; or an elastic layer over a rigid back",
-            "`phantom.kind=mesh` takes any mesh (quick start); `tissue.implementation=elastic`",
+            "`phantom.kind=mesh` takes any mesh (quick start); `services.tissue=elastic`",
         ),
         Limit(
             "deformation is not shown",

@@ -26,7 +26,7 @@ class Body(NamedTuple):
     colors: NDArray[np.float32]
 
 
-class View(NamedTuple):
+class Viewpoint(NamedTuple):
     """Where the eye is [m], what it looks at, its vertical angle of view [deg]; world's z is up."""
 
     eye: tuple[float, float, float]
@@ -34,7 +34,7 @@ class View(NamedTuple):
     angle_deg: float = 40.0
 
 
-def picture(bodies: Sequence[Body], view: View, width: int, height: int, smooth: int = 2) -> NDArray[np.uint8]:
+def picture(bodies: Sequence[Body], view: Viewpoint, width: int, height: int, smooth: int = 2) -> NDArray[np.uint8]:
     """The scene as seen, shape (height, width, 3), averaged over smooth x smooth rays a pixel."""
     scene = o3d.t.geometry.RaycastingScene()
     for body in bodies:
@@ -63,7 +63,7 @@ def _tensor(array: NDArray[Any]) -> Any:
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
 
 
-def _rays(view: View, width: int, height: int) -> NDArray[np.float32]:
+def _rays(view: Viewpoint, width: int, height: int) -> NDArray[np.float32]:
     """Origins and unit directions, shape (height, width, 6)."""
     eye, target = np.array(view.eye), np.array(view.target)
     forward = (target - eye) / np.linalg.norm(target - eye)

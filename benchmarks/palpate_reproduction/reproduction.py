@@ -20,7 +20,7 @@ from palpate_dashboard.replay import recording_of
 from palpate_models.load import load_scenario
 from palpate_reproduction import figures
 from palpate_reproduction.limits import limits
-from palpate_reproduction.runs import GRAPH, SCENARIO, SNAKE, Case, RunError
+from palpate_reproduction.runs import GRAPH, SCENARIO, SNAKE, ReproductionCase, RunError
 from palpate_reproduction.scene import Moment, Stage, deformation_mm, moments
 
 WATCHING = ("conductor", "dashboard", "recorder")
@@ -41,7 +41,7 @@ class Way:
     dice: str
 
 
-def way(case: Case, folder: Path) -> tuple[Way, Evidence]:
+def way(case: ReproductionCase, folder: Path) -> tuple[Way, Evidence]:
     """What a finished run says of its way to cover."""
     report, evidence = read_report(folder), read_evidence(folder)
     held = np.flatnonzero(evidence.in_contact)
@@ -84,7 +84,12 @@ def chosen_moments(evidence: Evidence) -> list[tuple[str, float, bool]]:
 
 
 def write(
-    runs: Path, cases: Sequence[Case], page: Path, images: Path, settings: tuple[str, ...], tell: Callable[[str], None]
+    runs: Path,
+    cases: Sequence[ReproductionCase],
+    page: Path,
+    images: Path,
+    settings: tuple[str, ...],
+    tell: Callable[[str], None],
 ) -> dict[str, Any]:
     """Draws everything from the runs in `runs` and writes `page`; returns the figures it quotes.
 

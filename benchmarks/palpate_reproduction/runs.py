@@ -25,7 +25,7 @@ STOP_S: Final = 30.0
 
 
 @dataclass(frozen=True)
-class Case:
+class ReproductionCase:
     """One way to cover the region."""
 
     pattern: str
@@ -37,18 +37,18 @@ class Case:
         return f"{self.pattern}_{self.mode}"
 
 
-SNAKE = Case("snake", "continuous")
+SNAKE = ReproductionCase("snake", "continuous")
 """What the paper does, and our default."""
-POINTS: Final = Case("raster", "point")
+POINTS: Final = ReproductionCase("raster", "point")
 """What the paper compares it with."""
-CASES: Final = (SNAKE, Case("raster", "continuous"), Case("snake", "point"), POINTS)
+CASES: Final = (SNAKE, ReproductionCase("raster", "continuous"), ReproductionCase("snake", "point"), POINTS)
 
 
 class RunError(RuntimeError):
     """An examination that did not complete. Names its folder and what it said."""
 
 
-def perform(case: Case, folder: Path, settings: tuple[str, ...]) -> None:
+def perform(case: ReproductionCase, folder: Path, settings: tuple[str, ...]) -> None:
     """Examines in one process into `folder`; the paper's case is recorded. Raises RunError."""
     words = ["--composed", "--quiet"] + ([] if case == SNAKE else ["--no-record"])
     for setting in (f"exam.pattern={case.pattern}", f"exam.mode={case.mode}", *settings):

@@ -1,12 +1,13 @@
-"""The main of every service process.
+"""The main of every service process: `python -m palpate_<role> [NAME_OR_FILE]`.
 
     from palpate_bus.run import main
-    from palpate_control.service import create
+    from palpate_models.load import load_scenario
 
     if __name__ == "__main__":
-        main("control", create)
+        main("control", load_scenario)
 
-What it is told about the run comes from `Settings`, which reads the environment.
+The word names an implementation or a file of one's own (see `implementations`); without it the scenario's `services.control` says
+which. What the process is told about the run comes from `Settings`, which reads the environment.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ import gc
 import logging
 import os
 import sys
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import zenoh
 
 from palpate_bus.contract import MS, Contract, Role, contract
+from palpate_bus.implementations import ChoiceError, create
 from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.distributed import LockstepNode
 from palpate_bus.runtime.member import Member
@@ -56,16 +58,30 @@ def stands_back(role: Role, runtime_name: str) -> bool:
     return role.observer or (runtime_name == "lockstep" and role.period > MS)
 
 
-def main(
-    role: str,
-    create: Callable[[Any], Service],
-    load: Callable[[str], Any],
-    transport: Callable[[zenoh.Session], Transport] = Transport,
-) -> None:
+class NamesServices(Protocol):
+    """What this module knows of a scenario."""
+
+    @property
+    def services(self) -> Any:
+        """The chosen implementation of each role, as attributes."""
+
+
+def main(role: str, load: Callable[[str], NamesServices]) -> None:
     """Runs the service of `role` to its end and leaves with status 0, or 3 when the run failed or was aborted.
 
-    `load` reads the scenario file that the settings name; `create` makes the service from it. `transport` carries its messages.
+    `load` reads the scenario file that the settings name.
     """
+    run_service(role, lambda: chosen(role, load, sys.argv[1:2]))
+
+
+def chosen(role: str, load: Callable[[str], NamesServices], words: Sequence[str] = ()) -> Service:
+    """The service of `role` that the first word names, or else the scenario. Raises BusConfigError, ChoiceError."""
+    scenario = load(str(Settings.read().required("scenario", "want a scenario file, as `palpate prepare` writes it")))
+    return create(role, words[0] if words else getattr(scenario.services, role), scenario)
+
+
+def run_service(role: str, make: Callable[[], Service], transport: Callable[[zenoh.Session], Transport] = Transport) -> None:
+    """As `main`, for the service that `make` returns; `transport` carries its messages."""
     status = 0
     session = None
     log = logging.getLogger(role)
@@ -73,8 +89,7 @@ def main(
         settings = Settings.read()
         logging.basicConfig(level=settings.log, format=f"%(asctime)s {role} %(levelname)s %(message)s", stream=sys.stderr)
         rules = contract()
-        scenario = settings.required("scenario", "want a scenario file, as `palpate prepare` writes it")
-        service = create(load(str(scenario)))
+        service = make()
         if stands_back(rules.roles[role], settings.runtime):
             in_the_background()
         session = open_session(BusOptions.from_settings(settings))
@@ -88,7 +103,7 @@ def main(
         status = EXIT_FAILED
     except KeyboardInterrupt:
         status = EXIT_FAILED
-    except BusConfigError as error:
+    except (BusConfigError, ChoiceError) as error:
         log.error("%s", error)
         status = EXIT_FAILED
     except Exception:

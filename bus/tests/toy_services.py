@@ -39,7 +39,7 @@ from palpate_bus.messages import (
     WrenchStamped,
 )
 from palpate_bus.messages.stamps import NS, duration_message, header
-from palpate_bus.run import main
+from palpate_bus.run import run_service
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.transport import Transport
 
@@ -207,4 +207,4 @@ def transport(session: zenoh.Session) -> Transport:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], lambda _: TOYS[sys.argv[1]](), lambda _: None, transport)
+    run_service(sys.argv[1], TOYS[sys.argv[1]], transport)

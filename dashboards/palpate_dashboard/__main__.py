@@ -1,8 +1,7 @@
-"""Runs the dashboard on the bus."""
+"""`python -m palpate_dashboard [NAME_OR_FILE]`: the dashboard as a process of its own."""
 
 from palpate_bus.run import main
-from palpate_dashboard.service import create
 from palpate_models.load import load_scenario
 
 if __name__ == "__main__":
-    main("dashboard", create, load_scenario)
+    main("dashboard", load_scenario)

@@ -4,10 +4,9 @@ import numpy as np
 
 from palpate_bus.messages import ExamState, Finding, Findings, Point
 from palpate_bus.messages.stamps import header
-from palpate_bus.run import main
 from palpate_bus.service import Service
 from palpate_models.frames import apply, inverse
-from palpate_models.load import exam_input, load_scenario
+from palpate_models.load import exam_input
 from palpate_models.phantom import quadrant
 
 
@@ -44,7 +43,3 @@ class Threshold(Service):
 def create(scenario):
     """The service of a scenario."""
     return Threshold(exam_input(scenario))
-
-
-if __name__ == "__main__":
-    main("assessment", create, load_scenario)

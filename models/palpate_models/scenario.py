@@ -11,7 +11,7 @@ from enum import StrEnum
 from math import dist
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -46,7 +46,7 @@ class Lesion(_Section):
     edge_m: Positive = 0.008
     """Width of the smooth edge."""
     depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
-    """How far below the skin it begins (tissue.implementation: elastic): an ellipsoid whose vertical half axis is the smaller of
+    """How far below the skin it begins (services.tissue: elastic): an ellipsoid whose vertical half axis is the smaller of
     `radii_m`. None: it reaches from the skin inward. The surface tier knows no depth: there every lesion lies in the skin."""
 
 
@@ -199,9 +199,6 @@ class Robot(_Section):
     """Robot, tool and its sensor."""
 
     lbr: LbrConnection = LbrConnection()
-
-    implementation: str = "default"
-    """`default`, or the name of another driver that an installed package registers (`lbr`)."""
     indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Mass below the F/T sensor: stand-off and indenter."""
@@ -229,11 +226,8 @@ class Camera(_Section):
     """Kinect-like depth camera on a tripod (Nguyen 2012)."""
 
     ros: RosCamera = RosCamera()
-
-    implementation: str = "default"
-    """`default`, or the name of another camera that an installed package registers (`replay`, `ros`)."""
     recording: str | None = None
-    """A run's folder, a rosbag2 folder or an MCAP file whose frames `implementation: replay` shows."""
+    """A run's folder, a rosbag2 folder or an MCAP file whose frames `services.camera: replay` shows."""
     position_m: Vec3 = (0.95, -0.45, 1.85)
     """Optical centre in world."""
     look_at_m: Vec3 = (0.56, 0.0, 0.90)
@@ -248,9 +242,7 @@ class Camera(_Section):
     """Frames fused for a perceived surface."""
 
     @model_validator(mode="after")
-    def _recording(self) -> Camera:
-        if (self.implementation == "replay") != (self.recording is not None):
-            raise ValueError("camera.implementation: replay needs camera.recording: FILE, and camera.recording needs it")
+    def _apart(self) -> Camera:
         if dist(self.position_m, self.look_at_m) < 0.1:
             raise ValueError(
                 f"camera.position_m {self.position_m} and look_at_m {self.look_at_m}: want at least 0.1 m between them"
@@ -295,21 +287,33 @@ class Limits(_Section):
 
 
 class TissueChoice(_Section):
-    """Which tissue plays the role."""
+    """What the tissue is made from."""
 
-    implementation: str = "default"
-    """`default`; the name of another that an installed package registers (`fmu`, `elastic`); `none` where what the arm touches is
-    real: then no tissue is simulated, nothing is known of a truth, and nothing is scored (wall clock only)."""
     fmu: str | None = None
-    """File of a co-simulation FMU for `implementation: fmu`; built from the phantom when empty."""
+    """File of a co-simulation FMU for `services.tissue: fmu`; built from the phantom when empty."""
     fmu_map: str | None = None
     """File of the map of its variables to topic fields (YAML); that of the abdomen FMU when empty."""
 
-    @model_validator(mode="after")
-    def _fmu(self) -> TissueChoice:
-        if (self.fmu is not None or self.fmu_map is not None) and self.implementation != "fmu":
-            raise ValueError("tissue.fmu and tissue.fmu_map need tissue.implementation: fmu")
-        return self
+
+class Services(_Section):
+    """Which implementation plays each role: the name of an entry point in the group `palpate.<role>`, or the path of a Python
+    file that has `create(scenario)`.
+    """
+
+    robot: str = "dart"
+    """`dart`, `mujoco`, or `lbr` for the real arm (wall clock only)."""
+    tissue: str = "winkler"
+    """`winkler`, `elastic` or `fmu`; `none` where what the arm touches is real: then no tissue is simulated, no truth is known,
+    and nothing is scored (wall clock only)."""
+    camera: str = "kinect"
+    """`kinect`, `replay`, or `ros` for a real camera (wall clock only)."""
+    perception: str = "default"
+    planning: str = "default"
+    control: str = "default"
+    assessment: str = "default"
+    supervisor: str = "default"
+    dashboard: str = "default"
+    recorder: str = "default"
 
 
 class Scenario(_Section):
@@ -324,6 +328,17 @@ class Scenario(_Section):
     camera: Camera = Camera()
     limits: Limits = Limits()
     tissue: TissueChoice = TissueChoice()
+    services: Annotated[Services, Field(validate_default=True)] = Services()
+
+    @field_validator("services")
+    @classmethod
+    def _fitting(cls, services: Services, info: ValidationInfo) -> Services:
+        camera, tissue = info.data.get("camera"), info.data.get("tissue")
+        if camera is not None and (services.camera == "replay") != (camera.recording is not None):
+            raise ValueError("services.camera: replay needs camera.recording: FILE, and camera.recording needs it")
+        if tissue is not None and tissue.fmu is not None and services.tissue != "fmu":
+            raise ValueError("tissue.fmu needs services.tissue: fmu")
+        return services
 
 
 class ExamInput(_Section):

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
-from importlib.metadata import entry_points
 from typing import Annotated
 
 import typer
 
 from palpate.check.live_rig import LiveRig
-from palpate.check.report import Report, Verdict
-from palpate.check.rig import ServiceRig, Settings
+from palpate.check.report import ConformanceReport, Verdict
+from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
 from palpate.check.suites import SUITES, check
+from palpate.command_line import refuse
+from palpate.live.connection import Connect
 from palpate.live.console import EXIT_TROUBLE, command, console, print_json, table
-from palpate.live.joining import Connect
+from palpate_bus import implementations
+from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.joining import NoBus
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.load import ScenarioError, load_scenario
@@ -28,9 +30,9 @@ def check_command(
     connect: Connect = None,
     listen: Annotated[str, typer.Option(help="Where the check waits for the implementation, as a router.")] = LISTEN,
     start: Annotated[str | None, typer.Option(metavar="COMMAND", help="Start the implementation with this command.")] = None,
-    installed: Annotated[
+    service: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Check an installed one in this process, in simulated time: default, fmu, ..."),
+        typer.Option(metavar="NAME_OR_FILE", help="Check an installed one or a Python file in this process, in simulated time."),
     ] = None,
     scenario: Annotated[str, typer.Option(help="What it was configured with.")] = "rlq_guarding",
     motion: Annotated[bool, typer.Option("--motion", help="It may move: needed for most of the robot's checks.")] = False,
@@ -49,12 +51,11 @@ def check_command(
         if role not in SUITES:
             raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
         try:
-            settings = Settings(load_scenario(scenario), slack, motion or role != "robot" or installed is not None)
-        except ScenarioError as error:
-            raise NoBus(str(error)) from error
-        if installed is not None:
-            report = _check_installed(role, installed, settings)
-        else:
+            settings = RigSettings(load_scenario(scenario), slack, motion or role != "robot" or service is not None)
+            report = None if service is None else _check_here(role, service, settings)
+        except (ScenarioError, ChoiceError) as error:
+            refuse(error)
+        if report is None:
             report = _check_live(role, settings, connect, listen, start, domain, wait)
     if as_json:
         print_json(report.as_json())
@@ -64,22 +65,15 @@ def check_command(
         raise typer.Exit(EXIT_TROUBLE)
 
 
-def _check_installed(role: str, name: str, settings: Settings) -> Report:
-    group, wanted = ("palpate.services", role) if name == "default" else ("palpate.implementations", f"{role}.{name}")
-    found = {point.name: point for point in entry_points(group=group)}
-    if wanted not in found:
-        others = sorted(
-            p.name.partition(".")[2] for p in entry_points(group="palpate.implementations") if p.name.startswith(f"{role}.")
-        )
-        raise NoBus(f"no installed implementation {name!r} of {role}; there are {', '.join(['default', *others])}")
-    return check(ServiceRig(found[wanted].load()(settings.scenario), settings))
+def _check_here(role: str, choice: str, settings: RigSettings) -> ConformanceReport:
+    return check(ServiceRig(implementations.create(role, choice, settings.scenario), settings))
 
 
 def _check_live(
-    role: str, settings: Settings, connect: list[str] | None, listen: str, start: str | None, domain: int, wait: float
-) -> Report:
+    role: str, settings: RigSettings, connect: list[str] | None, listen: str, start: str | None, domain: int, wait: float
+) -> ConformanceReport:
     options = BusOptions(connect=tuple(connect)) if connect else BusOptions(mode="router", listen=(listen,))
-    report = Report(role)
+    report = ConformanceReport(role)
     with session(options) as bus:
         where = ", ".join(connect) if connect else listen
         typer.echo(f"waiting for {role} at {where}, domain {domain}", err=True)
@@ -94,7 +88,7 @@ def _check_live(
     return report
 
 
-def _print(report: Report, failures: bool) -> None:
+def _print(report: ConformanceReport, failures: bool) -> None:
     out = console()
     rows = table("", "check", "expected", "got")
     group = ""

@@ -13,8 +13,8 @@ from typing import Any
 
 import zenoh
 
-from palpate.check.report import Report
-from palpate.check.rig import Feed, Heard, Rig, Settings
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import Feed, HeardMessage, Rig, RigSettings
 from palpate.live.listening import Listener
 from palpate_bus.contract import MS
 from palpate_bus.messages import RunControl, ServiceReport, codec
@@ -39,7 +39,7 @@ class LiveRig(Rig):
 
     live = True
 
-    def __init__(self, session: zenoh.Session, role: str, settings: Settings, domain: int = 0) -> None:
+    def __init__(self, session: zenoh.Session, role: str, settings: RigSettings, domain: int = 0) -> None:
         super().__init__(role, settings)
         self._session = session
         self._domain = domain
@@ -67,7 +67,7 @@ class LiveRig(Rig):
 
     # -- the conversation
 
-    def await_implementation(self, seconds: float, report: Report) -> None:
+    def await_implementation(self, seconds: float, report: ConformanceReport) -> None:
         """Waits for the role to appear, greets it and starts it. Raises NoBus when nobody comes within `seconds`."""
         report.section("protocol")
         gc.freeze()  # a full collection in mid-check would keep commands back longer than they are valid
@@ -90,7 +90,7 @@ class LiveRig(Rig):
         ours = str(self._session.zid())
         return {entity.node for entity in self.graph.alive.values() if entity.zid != ours}
 
-    def _greet(self, report: Report) -> None:
+    def _greet(self, report: ConformanceReport) -> None:
         end = monotonic() + READY_S
         missing: list[str] | None = None
         while missing != [] and monotonic() < end:
@@ -105,7 +105,7 @@ class LiveRig(Rig):
         got = "READY" if self.ready else "nothing" if missing is None else f"READY, but it hears nothing on {', '.join(missing)}"
         report.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
 
-    def _check_graph(self, report: Report) -> None:
+    def _check_graph(self, report: ConformanceReport) -> None:
         self.graph.changes()
         ours = str(self._session.zid())
         ends = [e for e in self.graph.alive.values() if e.node == self.role.name and e.zid != ours and e.endpoint is not None]
@@ -120,7 +120,7 @@ class LiveRig(Rig):
             report.expect(f"publishes {topic.name}", got == wanted, wanted, got)
         report.expect("publishes nothing else", not sent, "the topics of its role only", ", ".join(sent) or "nothing else")
 
-    def finish(self, report: Report) -> None:
+    def finish(self, report: ConformanceReport) -> None:
         """Disturbs it, ends it, and judges how it takes that."""
         report.section("garbage")
         self._disturb(report)
@@ -145,7 +145,7 @@ class LiveRig(Rig):
             ear.close()
         self._reports.close()
 
-    def _disturb(self, report: Report) -> None:
+    def _disturb(self, report: ConformanceReport) -> None:
         """Bytes that are no messages, and messages of a stranger, on every input."""
         stranger = AttachmentWriter(gid("a stranger")).pack
         for name in self._publishers:
@@ -235,4 +235,4 @@ class LiveRig(Rig):
                 except codec.CodecError as error:
                     self.undecodable.append(f"{name}: {error}")
                     continue
-                self.log[name].append(Heard(self.t, message, heard.sequence, heard.sent))
+                self.log[name].append(HeardMessage(self.t, message, heard.sequence, heard.sent))

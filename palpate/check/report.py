@@ -28,7 +28,7 @@ class Result:
 
 
 @dataclass
-class Report:
+class ConformanceReport:
     """All checks of one implementation."""
 
     role: str

@@ -24,7 +24,7 @@ Feed = Mapping[str, Source]
 """What the suite sends, by topic; a topic that is not in it is silent."""
 
 
-class Heard(NamedTuple):
+class HeardMessage(NamedTuple):
     """A message of the implementation."""
 
     t: int
@@ -36,7 +36,7 @@ class Heard(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Settings:
+class RigSettings:
     """How a check is to be done."""
 
     scenario: Scenario
@@ -52,11 +52,11 @@ class Rig(ABC):
     live = False
     """Whether time is the wall's and the implementation is somebody else's process."""
 
-    def __init__(self, role: str, settings: Settings, rules: Contract | None = None) -> None:
+    def __init__(self, role: str, settings: RigSettings, rules: Contract | None = None) -> None:
         self.rules = rules or contract()
         self.role = self.rules.roles[role]
         self.settings = settings
-        self.log: dict[str, list[Heard]] = {topic.name: [] for topic in self.rules.outputs(role)}
+        self.log: dict[str, list[HeardMessage]] = {topic.name: [] for topic in self.rules.outputs(role)}
         """Everything that the implementation sent, by topic."""
         self.undecodable: list[str] = []
         """What it sent that is no message, a sentence each."""
@@ -70,7 +70,7 @@ class Rig(ABC):
         """What transport and an ordinary scheduler may add to a reaction [ns]; nothing in simulated time."""
         return round(self.settings.slack_ms * MS) if self.live else 0
 
-    def run(self, seconds: float, feed: Feed) -> dict[str, list[Heard]]:
+    def run(self, seconds: float, feed: Feed) -> dict[str, list[HeardMessage]]:
         """Lets time pass while `feed` is sent; returns what the implementation sent meanwhile, by topic."""
         before = {name: len(heard) for name, heard in self.log.items()}
         self._advance(self.t + round(seconds * 1e9), feed)
@@ -97,7 +97,7 @@ class Rig(ABC):
 class ServiceRig(Rig):
     """A service of ours in this process: simulated time, exact."""
 
-    def __init__(self, service: Service, settings: Settings) -> None:
+    def __init__(self, service: Service, settings: RigSettings) -> None:
         super().__init__(service.role, settings)
         self._stepper = Stepper(service, self.rules, strict=False)
         self._sequences = dict.fromkeys(self._stepper.buffers, 0)
@@ -127,4 +127,4 @@ class ServiceRig(Rig):
     def _take(self, sent: list[Sent]) -> None:
         for port, payload, sequence in sent:
             message = codec.decode(payload, port.topic.type)
-            self.log[port.topic.name].append(Heard(self.t, message, sequence, self.t))
+            self.log[port.topic.name].append(HeardMessage(self.t, message, sequence, self.t))

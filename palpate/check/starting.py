@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from palpate.check.rig import Settings
+from palpate.check.rig import RigSettings
 from palpate_bus.runs.joining import NoBus
 from palpate_models.load import dump_scenario, redacted
 
 
 @contextmanager
-def started(words: str | None, role: str, settings: Settings, endpoint: str, domain: int) -> Iterator[None]:
+def started(words: str | None, role: str, settings: RigSettings, endpoint: str, domain: int) -> Iterator[None]:
     """Starts the implementation for the time of the check, if its command was given."""
     if words is None:
         yield

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from palpate.command_line import refuse
 from palpate_bus.runs.joining import NoBus
-from palpate_bus.wire.zenoh_config import BusConfigError
+from palpate_bus.settings import BusConfigError
 
 EXIT_TROUBLE = 1
 WIDE = 140

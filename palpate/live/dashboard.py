@@ -20,9 +20,9 @@ from rich.status import Status
 from palpate.command_line import refuse
 from palpate_bus.runs.announcement import Run, live, matching
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
-from palpate_bus.wire.zenoh_config import BusConfigError
+from palpate_bus.settings import BusConfigError
 from palpate_dashboard import replay
-from palpate_dashboard.join import follow
+from palpate_dashboard.follow import follow
 from palpate_dashboard.picture import NoPicture, take
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import MEMORY_LIMIT, Live, address

@@ -12,7 +12,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from palpate.live import graph
-from palpate.live.joining import Joined
+from palpate.live.connection import Joined
 from palpate_bus.contract import Contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.live import LiveMonitor
@@ -28,7 +28,7 @@ CLOCK_AHEAD_MS = -2.0
 SILENT_S = 5.0
 
 
-class Level(StrEnum):
+class Severity(StrEnum):
     """How a finding is."""
 
     OK = "ok"
@@ -37,11 +37,11 @@ class Level(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class Remark:
     """One thing that was looked at."""
 
     about: str
-    level: Level
+    level: Severity
     text: str
 
 
@@ -49,7 +49,7 @@ class Finding:
 class Diagnosis:
     """All that was found."""
 
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[Remark] = field(default_factory=list)
     topics: list[TopicHealth] = field(default_factory=list)
     violations: list[tuple[Violation, int]] = field(default_factory=list)
     """Each with how often it was seen."""
@@ -57,7 +57,7 @@ class Diagnosis:
     @property
     def healthy(self) -> bool:
         """Whether nothing is in trouble."""
-        return not self.violations and all(finding.level is not Level.BAD for finding in self.findings)
+        return not self.violations and all(finding.level is not Severity.BAD for finding in self.findings)
 
     def as_json(self) -> dict[str, Any]:
         """For `--json`."""
@@ -95,102 +95,102 @@ def diagnose(bus: Joined, rules: Contract, live: LiveMonitor) -> Diagnosis:
         *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(rules, live), *_waiting(live),
     ]  # fmt: skip
     differing = mismatches(found)
-    findings += [Finding("types", Level.BAD, sentence) for sentence in differing]
+    findings += [Remark("types", Severity.BAD, sentence) for sentence in differing]
     if not differing:
-        findings.append(Finding("types", Level.OK, "everyone has the same message definitions"))
+        findings.append(Remark("types", Severity.OK, "everyone has the same message definitions"))
     seen = [(s.violation, s.count) for s in live.monitor.active.values()]
     return Diagnosis(findings, live.monitor.health(), seen)
 
 
-def _versions(bus: Joined) -> list[Finding]:
+def _versions(bus: Joined) -> list[Remark]:
     ours = versions()
     text = f"python {platform.python_version()}, " + ", ".join(f"{name} {number}" for name, number in ours.items())
     run = bus.target.run
     if run is None:
-        return [Finding("versions", Level.OK, text)]
+        return [Remark("versions", Severity.OK, text)]
     other = [f"{name} {number} there, {ours.get(name)} here" for name, number in run.versions.items() if ours.get(name) != number]
     if other:
-        return [Finding("versions", Level.WARN, f"{text}; the run has {'; '.join(other)}")]
-    return [Finding("versions", Level.OK, f"{text}; the run has the same")]
+        return [Remark("versions", Severity.WARN, f"{text}; the run has {'; '.join(other)}")]
+    return [Remark("versions", Severity.OK, f"{text}; the run has the same")]
 
 
-def _endpoints(bus: Joined, live: LiveMonitor) -> list[Finding]:
+def _endpoints(bus: Joined, live: LiveMonitor) -> list[Remark]:
     run, options = bus.target.run, bus.target.options
     links = {str(zid) for zid in (*bus.session.info.peers_zid(), *bus.session.info.routers_zid())}
     there = {entity.node: entity.zid for entity in live.graph.alive.values()}
     if run is None or options.mode == "client":
         where = ", ".join((*options.connect, *([options.router] if options.router else [])))
-        return [Finding("endpoints", Level.OK if links else Level.BAD, f"{where}: {len(links)} links, domain {bus.domain}")]
+        return [Remark("endpoints", Severity.OK if links else Severity.BAD, f"{where}: {len(links)} links, domain {bus.domain}")]
     findings = []
     deaf = [role for role in run.endpoints if there.get(role) not in links]
     reached = len(run.endpoints) - len(deaf)
     text = (
         f"{run.name}, process {run.pid}, {run.runtime}, domain {bus.domain}: {reached} of {len(run.endpoints)} endpoints answer"
     )
-    findings.append(Finding("endpoints", Level.WARN if deaf else Level.OK, text))
-    findings += [Finding("endpoints", Level.WARN, f"{role} does not answer at {run.endpoints[role]}") for role in deaf]
+    findings.append(Remark("endpoints", Severity.WARN if deaf else Severity.OK, text))
+    findings += [Remark("endpoints", Severity.WARN, f"{role} does not answer at {run.endpoints[role]}") for role in deaf]
     return findings
 
 
-def _shared_memory(bus: Joined) -> list[Finding]:
+def _shared_memory(bus: Joined) -> list[Remark]:
     if not bus.target.options.shared_memory:
-        return [Finding("shared memory", Level.OK, "switched off (PALPATE_SHARED_MEMORY=0): large messages go over the network")]
+        return [Remark("shared memory", Severity.OK, "off (PALPATE_SHARED_MEMORY=0): large messages go over the network")]
     if not SHARED.is_dir():
-        return [Finding("shared memory", Level.WARN, f"no {SHARED}: large messages go over the network")]
+        return [Remark("shared memory", Severity.WARN, f"no {SHARED}: large messages go over the network")]
     state = os.statvfs(SHARED)
     free, size = state.f_bavail * state.f_frsize / 1e6, state.f_blocks * state.f_frsize / 1e6
-    level = Level.WARN if free < LITTLE_SHARED_MB else Level.OK
-    hint = "; too little for depth images and meshes: enlarge it (docker: shm_size)" if level is Level.WARN else ""
-    return [Finding("shared memory", level, f"{SHARED}: {free:.0f} MB of {size:.0f} MB free{hint}")]
+    level = Severity.WARN if free < LITTLE_SHARED_MB else Severity.OK
+    hint = "; too little for depth images and meshes: enlarge it (docker: shm_size)" if level is Severity.WARN else ""
+    return [Remark("shared memory", level, f"{SHARED}: {free:.0f} MB of {size:.0f} MB free{hint}")]
 
 
-def _clock(live: LiveMonitor) -> list[Finding]:
+def _clock(live: LiveMonitor) -> list[Remark]:
     findings = []
     time, progress = live.monitor.time.now, live.monitor.time.progress
     if time is not None:
         kind = "wall-clock" if live.monitor.wallclock else "simulated"
         moves = f"at {progress:.2f} x real time" if progress else "stands still (paused, or somebody holds it up)"
-        findings.append(Finding("clock", Level.OK if progress else Level.WARN, f"{kind} time {time / 1e9:.2f} s, {moves}"))
+        findings.append(Remark("clock", Severity.OK if progress else Severity.WARN, f"{kind} time {time / 1e9:.2f} s, {moves}"))
     else:
-        findings.append(Finding("clock", Level.WARN, "no time: no stamped message came"))
+        findings.append(Remark("clock", Severity.WARN, "no time: no stamped message came"))
     for name, age in live.offsets.items():
         if age < CLOCK_AHEAD_MS:
             sender = live.monitor.rules.topics[name].producer
             text = f"the clock of {sender}'s host is at least {-age:.1f} ms ahead of ours ({name}); synchronise them (NTP, PTP)"
-            findings.append(Finding("clock", Level.WARN, text))
+            findings.append(Remark("clock", Severity.WARN, text))
     return findings
 
 
-def _who(rules: Contract, live: LiveMonitor) -> list[Finding]:
+def _who(rules: Contract, live: LiveMonitor) -> list[Remark]:
     absent = graph.missing(rules, live.graph.alive.values())
     workers = [role for role in absent if not rules.roles[role].observer]
     others = [role for role in absent if rules.roles[role].observer]
     strangers = sorted(live.graph.roles() - rules.roles.keys())
-    findings = [Finding("roles", Level.BAD, f"{role} is missing: {rules.roles[role].doc}") for role in workers]
+    findings = [Remark("roles", Severity.BAD, f"{role} is missing: {rules.roles[role].doc}") for role in workers]
     if not workers:
-        findings.append(Finding("roles", Level.OK, "every role that works is there"))
+        findings.append(Remark("roles", Severity.OK, "every role that works is there"))
     if others:
-        findings.append(Finding("roles", Level.OK, f"without {', '.join(others)} (observers)"))
+        findings.append(Remark("roles", Severity.OK, f"without {', '.join(others)} (observers)"))
     if strangers:
-        findings.append(Finding("roles", Level.OK, f"also there: {', '.join(strangers)}"))
+        findings.append(Remark("roles", Severity.OK, f"also there: {', '.join(strangers)}"))
     if live.graph.garbage:
-        findings.append(Finding("roles", Level.WARN, f"{live.graph.garbage} liveliness tokens are not rmw_zenoh's"))
+        findings.append(Remark("roles", Severity.WARN, f"{live.graph.garbage} liveliness tokens are not rmw_zenoh's"))
     return findings
 
 
-def _waiting(live: LiveMonitor) -> list[Finding]:
+def _waiting(live: LiveMonitor) -> list[Remark]:
     """Who holds whom up, by what the services report of themselves."""
     findings = []
     now = monotonic()
     for role, report in sorted(live.reports.items()):
         if now - report.heard > SILENT_S:
-            findings.append(Finding("progress", Level.WARN, f"{role} has said nothing for {now - report.heard:.0f} s"))
+            findings.append(Remark("progress", Severity.WARN, f"{role} has said nothing for {now - report.heard:.0f} s"))
     if live.reports and live.monitor.time.progress == 0:
         for role, report in sorted(live.reports.items()):
             wait = f"waits for {report.waiting_for}" if report.waiting_for else "waits for nobody"
-            findings.append(Finding("progress", Level.WARN, f"{role} is at {report.tick / 1e9:.3f} s and {wait}"))
+            findings.append(Remark("progress", Severity.WARN, f"{role} is at {report.tick / 1e9:.3f} s and {wait}"))
     elif live.reports:
         slowest = min(live.reports, key=lambda role: live.reports[role].tick)
         text = f"{len(live.reports)} services report; the last of them, {slowest}, is at {live.reports[slowest].tick / 1e9:.2f} s"
-        findings.append(Finding("progress", Level.OK, text))
+        findings.append(Remark("progress", Severity.OK, text))
     return findings

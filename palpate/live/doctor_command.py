@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from palpate.live.connection import AsJson, ChosenRun, Connect, Domain, joined
 from palpate.live.console import EXIT_TROUBLE, bandwidth, command, console, number, print_json, print_line, table
-from palpate.live.doctor import POLL_S, Diagnosis, Level, examine
-from palpate.live.joining import AsJson, ChosenRun, Connect, Domain, joined
+from palpate.live.doctor import POLL_S, Diagnosis, Severity, examine
 from palpate_bus.contract import contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.live import LiveMonitor
 
-_COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.BAD: "bold red"}
+_COLOURS = {Severity.OK: "green", Severity.WARN: "yellow", Severity.BAD: "bold red"}
 
 
 def doctor(

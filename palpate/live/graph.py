@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from time import monotonic
 
-from palpate.live.joining import Joined
+from palpate.live.connection import Joined
 from palpate_bus.contract import Contract
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 

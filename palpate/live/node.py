@@ -5,8 +5,8 @@ from __future__ import annotations
 import typer
 
 from palpate.live import graph
+from palpate.live.connection import AsJson, ChosenRun, Connect, Domain, joined
 from palpate.live.console import command, console, print_json, table
-from palpate.live.joining import AsJson, ChosenRun, Connect, Domain, joined
 from palpate_bus.contract import contract
 
 app = typer.Typer(help="Nodes on a live bus.", no_args_is_help=True)

@@ -13,7 +13,8 @@ from rich.markup import escape
 from palpate.command_line import EXIT_FAILED, refuse, say
 from palpate_bus.runs.joining import NoBus, find, find_all
 from palpate_bus.runs.operator_requests import NotAnswered, ask
-from palpate_bus.wire.zenoh_config import BusConfigError, session
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire.zenoh_config import session
 
 MEET_S = 1.0
 """How long a run may take to be met on the bus."""

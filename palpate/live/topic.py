@@ -13,8 +13,8 @@ import yaml
 from rich.console import Console
 
 from palpate.live import graph
+from palpate.live.connection import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate.live.console import bandwidth, command, console, print_json, print_line, table
-from palpate.live.joining import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate.live.listening import Heard, Listener, plain
 from palpate.live.statistics import Spacing
 from palpate_bus.contract import Topic, contract

@@ -14,20 +14,20 @@ from rich.table import Table
 
 from palpate.command_line import fail, refuse
 from palpate.replay.compare import RELATIVE, Tolerance, TopicResult
-from palpate.replay.golden import Case, make_reference, prepare, replay_service
+from palpate.replay.golden import GoldenCase, make_reference, prepare, replay_service
 from palpate.replay.play import Player, PlayError
-from palpate.replay.services import ChoiceError
 from palpate_bus.contract import contract
+from palpate_bus.implementations import ChoiceError
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordingError, open_recording
-from palpate_bus.wire.zenoh_config import BusConfigError
+from palpate_bus.settings import BusConfigError
 from palpate_models.load import ScenarioError
 
 
 def replay(
     file: Annotated[Path, typer.Argument(help="A run's folder, a rosbag2 folder or an .mcap file.")],
     service: Annotated[
-        str | None, typer.Option(metavar="ROLE[=IMPL]", help="Re-run this service: tissue, tissue=fmu, tissue=module:factory.")
+        str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Run this service again: tissue, tissue=fmu, ...")
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, help="Simulated seconds a second.")] = 1.0,
     begin: Annotated[float, typer.Option("--from", min=0.0, help="Simulated time to begin at, s.")] = 0.0,
@@ -138,7 +138,7 @@ def as_dict(result: TopicResult) -> dict[str, Any]:
     return row
 
 
-def _print(case: Case, results: dict[str, TopicResult]) -> None:
+def _print(case: GoldenCase, results: dict[str, TopicResult]) -> None:
     table = Table("topic", "messages", "identical", "missing", "extra", "worst field", "off by", "allowed", "at \\[s]", box=None)
     for result in results.values():
         worst = max(result.worst.values(), key=lambda d: d.ratio, default=None)

@@ -11,8 +11,9 @@ from pathlib import Path
 from palpate.replay.compare import Tolerance, TopicResult, compare
 from palpate.replay.reference import cut, rounded, write_reference
 from palpate.replay.rerun import rerun
-from palpate.replay.services import factory
+from palpate_bus import implementations
 from palpate_bus.contract import MS, Contract, contract
+from palpate_bus.implementations import ChoiceError
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Service
 from palpate_models.load import load_scenario
@@ -23,7 +24,7 @@ KNOWS_PHANTOM = "tissue"
 
 
 @dataclass(frozen=True)
-class Case:
+class GoldenCase:
     """One service against one recording."""
 
     recording: Recording
@@ -53,14 +54,19 @@ class Case:
         return self.recording.last - self.recording.last % period
 
 
-def prepare(path: Path, choice: str, scenario: Path | None = None) -> Case:
-    """Opens a recording and makes the service `choice` (see `services.factory`).
+def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase:
+    """Opens a recording and makes the service `choice`: ROLE as the scenario has it, or ROLE=NAME_OR_FILE.
 
     The scenario is `scenario`, else the recording's own, else the one beside it. Raises RecordingError, ChoiceError or
     ScenarioError.
     """
     rules = contract()
-    role, create = factory(choice, rules)
+    role, _, name = choice.partition("=")
+    workers = [row.name for row in rules.roles.values() if not row.observer and row.name != "conductor"]
+    if role not in workers:
+        raise ChoiceError(f"--service {choice}: no service {role!r}; services are {', '.join(workers)}")
+    if name:
+        implementations.check(role, name)
     recording = open_recording(path)
     text = scenario.read_text(encoding="utf-8") if scenario else recording.scenario or _beside(path, role)
     topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]
@@ -68,7 +74,8 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> Case:
     if not any(recording.counts.get(topic.name) for topic in rules.outputs(role)):
         raise RecordingError(f"{path}: has nothing that {role} sent, so there is nothing to compare with")
     loaded = load_text(text)
-    return Case(recording, role, create(loaded), text, rules)
+    service = implementations.create(role, name or getattr(loaded.services, role), loaded)
+    return GoldenCase(recording, role, service, text, rules)
 
 
 def load_text(text: str) -> Scenario:
@@ -87,7 +94,7 @@ def _beside(path: Path, role: str) -> str:
     raise RecordingError(f"{path}: no {name} in it or beside it; {role} needs the scenario of the run: --scenario FILE")
 
 
-def replay_service(case: Case, tolerance: Tolerance) -> dict[str, TopicResult]:
+def replay_service(case: GoldenCase, tolerance: Tolerance) -> dict[str, TopicResult]:
     """Re-runs the service and compares all that it sends."""
     expected = case.recording.messages(case.outputs, end=case.end)
     sent = rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end)
@@ -97,7 +104,7 @@ def replay_service(case: Case, tolerance: Tolerance) -> dict[str, TopicResult]:
     return results
 
 
-def make_reference(case: Case, path: Path, begin: int, end: int) -> None:
+def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
     """Writes what the service gets from `begin` to `end` [ns], and what it answers, as a reference."""
     period = case.rules.roles[case.role].period
     begin -= begin % max(period, 100 * MS)  # a tick of every role

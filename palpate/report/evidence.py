@@ -40,7 +40,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Contact:
+class ContactRecord:
     """Measured and true contact at equal stamps while the examination says it is steady; m instants."""
 
     measured: Array
@@ -115,12 +115,12 @@ def centroids_of(findings: Any | None) -> Array:
     return np.array([(f.centroid.x, f.centroid.y, f.centroid.z) for f in found], dtype=np.float64).reshape(-1, 3)
 
 
-def steady_contact(exam_states: list[Any], indentation: list[Any], X_WA: Array) -> Contact:
+def steady_contact(exam_states: list[Any], indentation: list[Any], X_WA: Array) -> ContactRecord:
     """Exam states that count, with the true contact at the same stamp. `X_WA`: true pose of A in world."""
     true = {nanoseconds(m.header.stamp): m for m in indentation}
     pairs = [(s, true[t]) for s in exam_states if s.steady and (t := nanoseconds(s.header.stamp)) in true]
     place = [(m.surface_point.x, m.surface_point.y, m.surface_point.z) for _, m in pairs]
-    return Contact(
+    return ContactRecord(
         measured=np.array([s.depth for s, _ in pairs]),
         true=np.array([m.depth for _, m in pairs]),
         wanted=np.array([s.depth_setpoint for s, _ in pairs]),

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from palpate.report import archive, scoring
 from palpate.report.evidence import (
-    Contact,
+    ContactRecord,
     Samples,
     centroids_of,
     map_of,
@@ -26,7 +26,7 @@ from palpate.report.evidence import (
 from palpate.report.figures import draw_map
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
-from palpate.run.result import RunResult
+from palpate_conductor.result import RunResult
 from palpate_models.frames import apply, inverse
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import Scenario
@@ -277,7 +277,7 @@ def _lesion(lesion: scoring.TrueLesion) -> LesionRow:
     )
 
 
-def _depth(contact: Contact | None, truth: scoring.Truth | None) -> DepthRow:
+def _depth(contact: ContactRecord | None, truth: scoring.Truth | None) -> DepthRow:
     if contact is None or truth is None or not len(contact.true):
         return DepthRow(**dict.fromkeys(DepthRow.model_fields))
     lesion = scoring.lesion_at(truth, contact.position)

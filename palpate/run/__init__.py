@@ -1,1 +1,1 @@
-"""Starting and conducting a run, with its processes or in one process."""
+"""Starts a run, with its processes or in one process, and writes its results."""

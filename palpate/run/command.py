@@ -1,4 +1,4 @@
-"""The commands of `palpate` that start and conduct runs, and say of what; the others stand by themselves (see `commands`)."""
+"""`palpate run`, and the two halves of a run in containers: `palpate prepare` and `palpate conduct`."""
 
 from __future__ import annotations
 
@@ -11,63 +11,33 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from palpate.command_line import fail, refuse
 from palpate.report.page import write_page
 from palpate.report.results import print_findings, write_results
 from palpate.run.composed import run_composed
-from palpate.run.distributed import OBSERVERS, run_distributed, workers, write_scenario_files
-from palpate.run.distributed import conduct as run_conduct
-from palpate.run.implementations import NONE, chosen_services
+from palpate.run.distributed import run_distributed
 from palpate.run.inputs import Settings, usable
-from palpate.run.join import Absent, JoinError
-from palpate.run.own import OwnServiceError, own_services
+from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
-from palpate.run.result import RunResult
+from palpate.run.roles import NONE, OBSERVERS, ServiceChoices, workers, write_scenario_files
 from palpate.run.secure import SecureBus
-from palpate_bus.contract import contract
+from palpate_bus.implementations import ChoiceError
 from palpate_bus.security.keys import KeysError
-from palpate_bus.wire.zenoh_config import BusConfigError, close_session, open_session
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire.zenoh_config import close_session, open_session
+from palpate_conductor.conduct import conduct as conduct_run
 from palpate_conductor.outcome import RunFailed
+from palpate_conductor.result import RunResult
+from palpate_conductor.timing import Timing
 from palpate_conductor.tree import FrameTree
-from palpate_models.load import ScenarioError, exam_input, load_scenario, scenario_names
+from palpate_models.load import ScenarioError, exam_input, load_scenario
 from palpate_models.scenario import Scenario
 
-NEEDS_WALLCLOCK = "tissue.implementation = 'none' is for hardware, which does not wait: run with --wallclock"
-WIDE = 160
-"""Columns of the wide tables, where the terminal has fewer or there is none."""
-
-app = typer.Typer(
-    name="palpate",
-    help="Autonomous robotic palpation as a co-simulation of independent processes on an Eclipse zenoh bus.",
-    no_args_is_help=True,
-    rich_markup_mode="rich",
-    pretty_exceptions_show_locals=False,
-)
+NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
 
 
-RUN_EXAMPLES = """
-[bold]Examples[/]
-
-  palpate run                                   the paper's case: guarding in the right lower quadrant
-
-  palpate run healthy --seed 3 --out results    another scenario, seed and folder
-
-  palpate run --set exam.pattern=raster --set exam.mode=point
-
-  palpate run --service assessment=mine.py      a service of your own in place of ours
-
-  palpate run --without control                 waits until you start it: palpate join control
-
-  palpate run --secure                          encrypted, and nobody does what is not his
-
-  palpate run my.yaml --composed                all services in one process, for sweeps and debugging
-"""
-
-
-@app.command(epilog=RUN_EXAMPLES)
 def run(
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")
@@ -90,10 +60,7 @@ def run(
         Path | None, typer.Option(help="With --secure: folder of `palpate keys init`; else keys of this run.")
     ] = None,
     settings: Settings = None,
-    services: Annotated[
-        list[str] | None,
-        typer.Option("--service", metavar="ROLE=FILE.py", help="A service of your own in place of ours; may be repeated."),
-    ] = None,
+    services: ServiceChoices = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON, and nothing else.")] = False,
 ) -> None:
@@ -101,22 +68,38 @@ def run(
 
     In a terminal, keys are an operator's hand on it: s soft stop (the arm retreats and waits), e emergency stop (the driver
     holds), r release.
+
+    [bold]Examples[/]
+
+      palpate run                                   the paper's case: guarding in the right lower quadrant
+
+      palpate run healthy --seed 3 --out results    another scenario, seed and folder
+
+      palpate run --set exam.pattern=raster --set exam.mode=point
+
+      palpate run --service tissue=fmu              another implementation of a role
+
+      palpate run --service assessment=mine.py      a service of your own
+
+      palpate run --without control                 waits until you start it: palpate join control
+
+      palpate run --secure                          encrypted, and each role may do only what it has to
+
+      palpate run my.yaml --composed                all services in one process, for sweeps and debugging
     """
     console = Console(stderr=True)
     quiet = quiet or as_json
-    chosen = usable(scenario, settings, seed)
+    chosen = usable(scenario, settings, seed, services)
     try:
-        chosen_services(chosen)
-        own = own_services(services or ())
         absent = Absent(tuple(without or ()), wait, partial(console.print, highlight=False, soft_wrap=True))
-    except (ScenarioError, OwnServiceError, JoinError) as error:
+    except PlaceError as error:
         refuse(error)
     if composed and (realtime or wallclock):
         refuse("--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
-    if chosen.tissue.implementation == NONE and not wallclock:
+    if chosen.services.tissue == NONE and not wallclock:
         refuse(NEEDS_WALLCLOCK)
-    if without and (composed or set(without) & own.keys()):
-        refuse("--without ROLE leaves out a process: it goes without --composed and --service ROLE=...")
+    if without and composed:
+        refuse("--without ROLE leaves out a process: it goes without --composed")
     if handover and not wallclock:
         refuse("--handover is for --wallclock: in lockstep every message of a service is awaited")
     if (composed and secure) or (keys and not secure):
@@ -131,14 +114,12 @@ def run(
         folder.mkdir(parents=True, exist_ok=True)
         with RunDisplay(console, quiet) as display:
             if composed:
-                result = run_composed(chosen, folder.resolve(), display.tell, observers, own)
+                result = run_composed(chosen, folder.resolve(), display.tell, observers)
             else:
-                pace = 1.0 if realtime else None
+                timing = Timing(wallclock, 1.0 if realtime else None, handover_s=handover)
                 with SecureBus(keys) if secure else nullcontext() as bus:
-                    result = run_distributed(
-                        chosen, folder.resolve(), display.tell, observers, pace, wallclock, None, bus, own, handover, absent
-                    )
-    except (ProcessListError, OwnServiceError, JoinError, BusConfigError, KeysError, OSError) as error:
+                    result = run_distributed(chosen, folder.resolve(), display.tell, observers, timing, secure=bus, absent=absent)
+    except (ProcessListError, ChoiceError, PlaceError, BusConfigError, KeysError, OSError) as error:
         refuse(error)
     except RunFailed as error:
         fail(error)
@@ -162,7 +143,6 @@ def _conclude(
         fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
 
 
-@app.command()
 def prepare(
     scenario: Annotated[str, typer.Argument(help="Name of a scenario or a YAML file.")] = "rlq_guarding",
     out: Annotated[Path, typer.Option(help="Folder for the scenario files.")] = Path("out"),
@@ -170,10 +150,9 @@ def prepare(
     settings: Settings = None,
 ) -> None:
     """Write scenario.yaml (for tissue and scoring) and exam.yaml (for everybody else): the first step of a run in containers."""
-    write_scenario_files(usable(scenario, settings, seed), out)
+    write_scenario_files(usable(scenario, settings, seed, elsewhere=True), out)
 
 
-@app.command()
 def conduct(
     out: Annotated[Path, typer.Option(help="Folder with scenario.yaml, for the results.")] = Path("out"),
     observers: Annotated[str, typer.Option(help="Observers of this run, comma-separated.")] = ",".join(OBSERVERS),
@@ -189,47 +168,14 @@ def conduct(
             refuse(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
     try:
         chosen = load_scenario(str(out / "scenario.yaml"))
-        if chosen.tissue.implementation == NONE and not wallclock:
+        if chosen.services.tissue == NONE and not wallclock:
             refuse(NEEDS_WALLCLOCK)
         session = open_session()
     except (ScenarioError, BusConfigError) as error:
         refuse(error)
     roles = (*workers(chosen), *watching)
     with RunDisplay(console, quiet) as display:
-        pace, tree = 1.0 if realtime else None, FrameTree(exam_input(chosen))
-        result = run_conduct(session, roles, display.tell, realtime=pace, wallclock=wallclock, tree=tree)
+        timing = Timing(wallclock, 1.0 if realtime else None)
+        result = conduct_run(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
     close_session(session)
     _conclude(console, out, chosen, result, quiet)
-
-
-@app.command()
-def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False) -> None:
-    """List the scenarios that come with Palpate."""
-    if as_json:
-        print(json.dumps([load_scenario(name).model_dump(mode="json") for name in scenario_names()]))
-        return
-    table = Table("scenario", "lesions", "description", box=None)
-    for name in scenario_names():
-        scenario = load_scenario(name)
-        table.add_row(name, str(len(scenario.phantom.lesions)), scenario.description)
-    Console().print(table)
-
-
-@app.command()
-def topics() -> None:
-    """Show the contract: every topic with type, rate, who writes and who reads it."""
-    table = Table("topic", "type", "producer", "period", "QoS", "hashed", "readers", box=None)
-    for topic in contract().topics.values():
-        period = "latched" if topic.latched else f"{topic.period_ms} ms{' event' if topic.event else ''}"
-        readers = ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking)
-        name = topic.name if topic.visibility == "public" else f"{topic.name} [dim]({topic.visibility})[/]"
-        table.add_row(
-            name,
-            topic.type.replace("/msg/", "/"),
-            topic.producer,
-            period,
-            topic.qos,
-            "yes" if topic.hashed else "",
-            readers,
-        )
-    Console(width=max(WIDE, Console().width)).print(table)

@@ -4,63 +4,43 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
-from importlib.metadata import entry_points
 from pathlib import Path
 from time import perf_counter
 
-from palpate.run.distributed import KNOWS_PHANTOM, OBSERVERS, SIM_LIMIT, WORKERS, write_scenario_files
-from palpate.run.implementations import chosen_services
-from palpate.run.own import load
-from palpate.run.result import Progress, RunResult, Tell, given_up
+from palpate.run.roles import KNOWS_PHANTOM, OBSERVERS, WORKERS, choice, write_scenario_files
+from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.recording import RawRecorder
 from palpate_bus.service import Service
 from palpate_conductor.collector import Collector
-from palpate_conductor.outcome import RunFailed
+from palpate_conductor.result import RunProgress, RunResult, Tell, given_up
+from palpate_conductor.timing import SIM_LIMIT
 from palpate_conductor.tree import FrameTree
 from palpate_models.load import exam_input, redacted
 from palpate_models.scenario import Scenario
 
 
-def load_services(scenario: Scenario, roles: tuple[str, ...], own: Mapping[str, Path] | None = None) -> list[Service]:
-    """The services of `roles` in this process, from the files of `own` and the entry points `palpate.services`.
+def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
+    """The services of `roles` in this process, as the scenario chooses them.
 
-    Raises OwnServiceError for a file without a service, RunFailed naming a role that no installed package provides.
+    Raises ChoiceError for one that there is not, or that lacks its libraries.
     """
-    found = {point.name: point for point in entry_points(group="palpate.services")}
-    found.update(chosen_services(scenario))
     exam = redacted(scenario)
-    services = []
-    for role in roles:
-        path = (own or {}).get(role)
-        if path is None and role not in found:
-            raise RunFailed(f"no installed package provides the service {role!r} (entry point palpate.services)")
-        create: Callable[[Scenario], Service] = found[role].load() if path is None else load(role, path)
-        services.append(create(scenario if role in KNOWS_PHANTOM else exam))
-    return services
+    return [create(role, choice(scenario, role), scenario if role in KNOWS_PHANTOM else exam) for role in roles]
 
 
-def run_composed(
-    scenario: Scenario,
-    out: Path,
-    tell: Tell,
-    observers: tuple[str, ...] = OBSERVERS,
-    own: Mapping[str, Path] | None = None,
-) -> RunResult:
-    """Runs all services in this process; `own` gives the file that plays a role in place of an installed service."""
+def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
+    """Runs all services in this process. Raises ChoiceError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
     os.environ["PALPATE_OUT"] = str(out)
     collector = Collector(tree=FrameTree(exam_input(scenario)))
-    observing = load_services(scenario, observers, own)
+    observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
-    run = Composed(
-        [*load_services(scenario, WORKERS, own), *viewers, collector], taps=[recorder.record for recorder in recorders]
-    )
+    run = Composed([*load_services(scenario, WORKERS), *viewers, collector], taps=[recorder.record for recorder in recorders])
     start = perf_counter()
     failure = None
     last = 0
@@ -71,7 +51,7 @@ def run_composed(
         now = perf_counter()
         if now - told > 0.1:
             told = now
-            tell(Progress(run.t, run.t / NS / (now - start), collector.collected, tuple(run.trouble)))
+            tell(RunProgress(run.t, run.t / NS / (now - start), collector.collected, tuple(run.trouble)))
         return collector.collected.end_tick
 
     lost: dict[str, int] = {}

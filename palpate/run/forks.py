@@ -67,20 +67,20 @@ class Forked:
 
 
 class Forks:
-    """Starts `python -m MODULE ARGUMENTS` by forking."""
+    """Starts `python -m PACKAGE [WORD]` by forking."""
 
-    def __init__(self, packages: Iterable[str]) -> None:
-        """`packages` are imported once, each with its module `service`; the fork server starts with the first process."""
+    def __init__(self, modules: Iterable[str]) -> None:
+        """`modules` are imported once, by the fork server, which starts with the first process."""
         self._context = get_context("forkserver")
-        self._context.set_forkserver_preload(["palpate_bus.run", *(f"{package}.service" for package in packages)])
+        self._context.set_forkserver_preload(["palpate_bus.run", *modules])
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Forked:
         """Starts `command`, which must be a Python module's, with that environment; what it prints goes to `log`.
 
         Raises ValueError for another command.
         """
-        if len(command) < len(("python", "-m", "module")) or command[1] != "-m":
-            raise ValueError(f"{' '.join(command)}: only python -m MODULE can be forked")
+        if len(command) < len(("python", "-m", "package")) or command[1] != "-m":
+            raise ValueError(f"{' '.join(command)}: only python -m PACKAGE can be forked")
         process = self._context.Process(
             target=_become, args=(tuple(command[2:]), dict(environment), str(log)), name=command[2], daemon=True
         )
@@ -88,7 +88,7 @@ class Forks:
         return Forked(process)
 
 
-def _become(words: tuple[str, ...], environment: Mapping[str, str], log: str) -> None:
+def _become(words: Sequence[str], environment: Mapping[str, str], log: str) -> None:
     """In the child: what the shell and the interpreter would have done for `python -m WORDS > log`."""
     os.setpgid(0, 0)
     os.environ.clear()
@@ -96,5 +96,5 @@ def _become(words: tuple[str, ...], environment: Mapping[str, str], log: str) ->
     with Path(log).open("wb") as file:
         os.dup2(file.fileno(), sys.stdout.fileno())
         os.dup2(file.fileno(), sys.stderr.fileno())
-    sys.argv = list(words)
+    sys.argv = [*words]
     runpy.run_module(words[0], run_name="__main__", alter_sys=True)

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from palpate.command_line import refuse
-from palpate.run.implementations import NONE
+from palpate.run.roles import NONE, checked, settings_of
+from palpate_bus.implementations import ChoiceError
 from palpate_models.load import ScenarioError, load_scenario
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.scenario import Scenario
@@ -17,12 +18,22 @@ Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", he
 """Overrides of a scenario."""
 
 
-def usable(name: str, settings: Sequence[str] | None = None, seed: int | None = None) -> Scenario:
-    """A scenario whose phantom can be made. Ends the command when there is none such."""
+def usable(
+    name: str,
+    settings: Sequence[str] | None = None,
+    seed: int | None = None,
+    services: Sequence[str] | None = None,
+    elsewhere: bool = False,
+) -> Scenario:
+    """A scenario whose phantom can be made and whose services there are. Ends the command for any other.
+
+    `services` are choices ROLE=NAME_OR_FILE. With `elsewhere` the services run in containers or on other machines, so that they
+    are not looked for here.
+    """
     try:
-        scenario = load_scenario(name, settings or (), seed)
-        if scenario.tissue.implementation != NONE:
+        scenario = load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed)
+        if scenario.services.tissue != NONE:
             build_phantom(scenario.phantom, scenario.seed)
-    except (ScenarioError, MeshError) as error:
+        return scenario if elsewhere else checked(scenario)
+    except (ScenarioError, MeshError, ChoiceError) as error:
         refuse(error)
-    return scenario

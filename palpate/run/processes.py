@@ -18,12 +18,13 @@ from typing import IO, Any
 
 import yaml
 
-from palpate.__main__ import FIXED
+from palpate.environment import FIXED
 from palpate.run.forks import Child, Forks
 from palpate.run.secure import SecureBus
 from palpate_bus.runs.announcement import Announcement, Run
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import mesh
+from palpate_conductor.timing import Timing
 
 COMPOSE = "docker-compose.yml"
 BARRIER = ("robot", "control", "tissue")
@@ -45,20 +46,20 @@ class ServiceProcess:
 
 def override_files() -> tuple[Path, ...]:
     """The overrides that PALPATE_COMPOSE names after the compose file, separated as in a PATH."""
-    return tuple(map(Path, os.environ.get("PALPATE_COMPOSE", "").split(os.pathsep)[1:]))
+    return Settings.read().compose[1:]
 
 
 def compose_file() -> Path:
-    """The compose file: PALPATE_COMPOSE, else in the current folder, else in the checkout that holds this package.
+    """The compose file: PALPATE_COMPOSE, or that of the checkout, or the one that is installed with this package.
 
     Raises ProcessListError when there is none.
     """
-    named = os.environ.get("PALPATE_COMPOSE", "").partition(os.pathsep)[0]
-    candidates = [Path(named)] if named else [Path.cwd() / COMPOSE, *(p / COMPOSE for p in Path(__file__).resolve().parents)]
+    package = Path(__file__).resolve().parents[1]
+    candidates = Settings.read().compose[:1] or (package.parent / COMPOSE, package / COMPOSE)
     for path in candidates:
         if path.is_file():
             return path
-    raise ProcessListError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates[:2]))}. Set PALPATE_COMPOSE")
+    raise ProcessListError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates))}. Set PALPATE_COMPOSE")
 
 
 def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path] = ()) -> dict[str, ServiceProcess]:
@@ -123,20 +124,22 @@ class LocalProcesses:
         roles: tuple[str, ...],
         out: Path,
         scenario_files: Mapping[str, Path],
-        extra: Mapping[str, str],
+        timing: Timing,
+        record: bool = False,
         secure: SecureBus | None = None,
         forks: Forks | None = None,
     ) -> None:
         """`scenario_files` gives the scenario that each role may see; with `secure` all are clients of its router.
 
-        `forks` starts the processes in place of a fresh interpreter each.
+        `record` says that the run has a recorder; `forks` starts the processes in place of a fresh interpreter each.
         """
+        settings = Settings.read()
+        self._given = {"runtime": timing.runtime, "record": record, "out": out}
         self._forks = forks
         self._out = out
         self._scenario_files = scenario_files
-        self._extra = dict(extra)
         self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
-        router = secure.endpoint if secure else os.environ.get("PALPATE_ROUTER") or None
+        router = secure.endpoint if secure else settings.router
         bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
         self.bus = {role: replace(options, router=router) for role, options in bus.items()}
         """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
@@ -144,14 +147,13 @@ class LocalProcesses:
         if secure is not None:
             self.bus = {role: secure.options(role) for role in bus}
             endpoints = dict.fromkeys(bus, secure.endpoint)
-        domain = Settings.read().domain
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
         self._announcement = Announcement(
             Run(
                 name=out.name,
                 endpoints=endpoints,
-                domain=domain,
-                runtime=self._extra.get("PALPATE_RUNTIME", "lockstep"),
+                domain=settings.domain,
+                runtime=timing.runtime,
                 router=router,
                 out=str(out),
                 keys=None if secure is None else str(secure.keys),
@@ -163,13 +165,12 @@ class LocalProcesses:
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """What a service is given beyond the environment of this process."""
+        settings = Settings.read({**os.environ, **process.environment})
         return {
-            **{k: v for k, v in process.environment.items() if not k.startswith("PALPATE_ROUTER")},
+            **process.environment,
             **FIXED,
-            "PALPATE_SCENARIO": str(self._scenario_files[process.role]),
-            "PALPATE_OUT": str(self._out),
+            **settings.replaced(scenario=self._scenario_files[process.role], **self._given).to_env(),
             **self.bus[process.role].to_env(),
-            **self._extra,
         }
 
     def start(self, process: ServiceProcess) -> None:

@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
 
-from palpate.run.result import Progress as RunProgress
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
 from palpate_bus.runs.operator_requests import WORDS
+from palpate_conductor.result import RunProgress
 
 PHASES = {
     getattr(ExamState, f"PHASE_{name}"): name.lower()

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from conductor_messages import collected, result
 
-from palpate.run.result import Progress
 from palpate_benchmarks.campaign import COMPLETE, WENT_ON, Case, CaseOver, Finding, _conclude, _Watch
 from palpate_benchmarks.campaign_tables import markdown
 from palpate_bus.messages import ExamState
+from palpate_conductor.result import RunProgress
 
 
 def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
@@ -20,11 +20,11 @@ def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
     return _Watch(Case("nan", where, False), local, target, struck, since=1e12)
 
 
-def in_phase(phase: int, message: str = "") -> Progress:
+def in_phase(phase: int, message: str = "") -> RunProgress:
     messages = collected()
     last = messages.exam_states[-1]
     messages.exam_states.append(ExamState(**{**vars(last), "phase": phase, "message": message}))
-    return Progress(0, 1.0, messages)
+    return RunProgress(0, 1.0, messages)
 
 
 @pytest.mark.parametrize(

@@ -6,23 +6,25 @@ from pathlib import Path
 
 import pytest
 
-from palpate.run.implementations import ImplementationError, installed_command
-from palpate.run.join import Absent, JoinError, given_to
+from palpate.run.places import Absent, PlaceError, ServicePlace, command_for, place_to_join, place_to_take, write_places
+from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.announcement import Run
 
 ENVIRONMENT = {"PALPATE_LISTEN": "unixsock-stream//tmp/x/control.sock", "PALPATE_SCENARIO": "/out/exam.yaml"}
 COMMAND = ("python", "-m", "palpate_control")
+PLACE = ServicePlace(COMMAND, ENVIRONMENT, True)
 
 
 def absent(folder: Path) -> tuple[Absent, list[str]]:
     said: list[str] = []
     waiting = Absent(("control",), 30.0, said.append)
-    waiting.call(folder, {"control": (COMMAND, ENVIRONMENT)})
+    write_places(folder, {"control": PLACE})
+    waiting.call(folder, {"control": PLACE})
     return waiting, said
 
 
-def run(folder: Path) -> Run:
-    return Run(folder.name, {}, 0, "lockstep", None, str(folder))
+def run(folder: Path, runtime: str = "lockstep") -> Run:
+    return Run(folder.name, {"camera": "tcp/a:1", "robot": "tcp/b:2"}, 0, runtime, None, str(folder))
 
 
 def test_it_says_who_is_awaited_where_and_what_joins(tmp_path: Path) -> None:
@@ -33,14 +35,14 @@ def test_it_says_who_is_awaited_where_and_what_joins(tmp_path: Path) -> None:
 
 def test_a_process_that_joins_is_given_what_the_run_would_have_given_it(tmp_path: Path) -> None:
     absent(tmp_path)
-    assert given_to("control", run(tmp_path)) == (COMMAND, ENVIRONMENT)
-    with pytest.raises(JoinError, match="does not wait for 'robot', but for control"):
-        given_to("robot", run(tmp_path))
+    assert place_to_join("control", run(tmp_path)) == PLACE
+    with pytest.raises(PlaceError, match="does not wait for 'robot', but for control"):
+        place_to_join("robot", run(tmp_path))
 
 
 def test_a_run_that_lacks_nobody_says_how_one_is_started(tmp_path: Path) -> None:
-    with pytest.raises(JoinError, match="palpate run --without robot"):
-        given_to("robot", run(tmp_path))
+    with pytest.raises(PlaceError, match="palpate run --without robot"):
+        place_to_join("robot", run(tmp_path))
 
 
 def test_only_a_failure_for_want_of_an_answer_is_explained(tmp_path: Path) -> None:
@@ -50,9 +52,28 @@ def test_only_a_failure_for_want_of_an_answer_is_explained(tmp_path: Path) -> No
 
 
 def test_unknown_roles_and_implementations_are_answered_with_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(JoinError, match="--without arm: allowed are robot"):
+    with pytest.raises(PlaceError, match="--without arm: allowed are robot"):
         Absent(("arm",), 1.0, print)
-    with pytest.raises(ImplementationError, match="--implementation dart: for robot there are default"):
-        installed_command("robot", "dart", None)
-    with pytest.raises(ImplementationError, match="is no file"):
-        installed_command("robot", "default", tmp_path / "mine.py")
+    with pytest.raises(ChoiceError, match=r"services\.robot = 'bullet': want one of dart"):
+        command_for("robot", PLACE, "bullet")
+    with pytest.raises(ChoiceError, match="no such file"):
+        command_for("robot", PLACE, str(tmp_path / "mine.py"))
+
+
+def test_a_place_is_entered_by_what_was_there_or_by_what_is_named() -> None:
+    assert command_for("control", PLACE, None) == COMMAND
+    assert command_for("control", PLACE, "default") == (*COMMAND, "default")
+
+
+def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> None:
+    with pytest.raises(PlaceError, match="robot: only assessment, camera, perception can change hands"):
+        place_to_take("robot", run(tmp_path, "wallclock"))
+    with pytest.raises(PlaceError, match="in wall-clock runs only"):
+        place_to_take("camera", run(tmp_path))
+    with pytest.raises(PlaceError, match="--handover 60"):
+        place_to_take("camera", run(tmp_path, "wallclock"))
+    write_places(tmp_path, {"camera": PLACE._replace(awaited=False)})
+    environment = place_to_take("camera", run(tmp_path, "wallclock")).environment
+    assert environment["PALPATE_SCENARIO"] == ENVIRONMENT["PALPATE_SCENARIO"]
+    assert environment["PALPATE_LISTEN"] == ""
+    assert environment["PALPATE_CONNECT"] == "tcp/b:2"

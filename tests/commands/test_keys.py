@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from palpate_bus.messages import OperatorRequest
 from palpate_conductor.collector import Collected
 from palpate.run.progress import RunDisplay
-from palpate.run.result import Progress
+from palpate_conductor.result import RunProgress
 from rich.console import Console
 
 collected, asked = Collected(), []
@@ -22,7 +22,7 @@ def request(number, reason):
     collected.supervisor = SimpleNamespace(level=int(stops), reason="an operator" if stops else "")
 with RunDisplay(Console(stderr=True, width=200), False) as display:
     while len(asked) < 3:
-        display.tell(Progress(0, 1.0, collected, (), request))
+        display.tell(RunProgress(0, 1.0, collected, (), request))
         time.sleep(0.01)
 print("asked", asked, [OperatorRequest.SOFT_STOP, OperatorRequest.STOP, OperatorRequest.RELEASE], flush=True)
 """

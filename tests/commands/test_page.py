@@ -15,7 +15,7 @@ from conductor_messages import collected, findings, result
 from palpate.report import archive
 from palpate.report.page import verdict, write_page
 from palpate.report.results import assemble, write_results
-from palpate.run.distributed import write_scenario_files
+from palpate.run.roles import write_scenario_files
 from palpate_models.load import load_scenario
 
 

@@ -1,6 +1,5 @@
 """The process list."""
 
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -8,10 +7,9 @@ import yaml
 from typer.testing import CliRunner
 
 from palpate.command_line import EXIT_BAD_INPUT
-from palpate.run.command import app
-from palpate.run.distributed import OBSERVERS, WORKERS, workers
-from palpate.run.implementations import chosen_processes
+from palpate.commands import app_for
 from palpate.run.processes import ProcessListError, compose_file, how, override_files, read_processes
+from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers
 from palpate_benchmarks.swaps import read_swaps
 from palpate_models.load import load_scenario
 
@@ -45,6 +43,12 @@ def test_a_missing_compose_file_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
         compose_file()
 
 
+def test_the_compose_file_of_whatever_folder_one_is_in_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "docker-compose.yml").write_text("services: {}")
+    monkeypatch.chdir(tmp_path)
+    assert compose_file() == Path(__file__).parents[2] / "docker-compose.yml"
+
+
 def test_overrides_are_merged_as_docker_compose_merges_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     base, one, two = (tmp_path / name for name in ("base.yml", "one.yml", "two.yml"))
     base.write_text("services: {robot: {command: [a], environment: {B: 1, C: 2}}, tissue: {command: [t]}}")
@@ -61,20 +65,20 @@ def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs
     root = compose_file().parent
     swaps = read_swaps(root / "compose")
     assert {"tissue-fmu", "tissue-elastic", "robot-mujoco", "camera-replay", "planning-raster", "planning-point"} <= swaps.keys()
-    registered = {point.name: point.module.rpartition(".")[0] for point in entry_points(group="palpate.implementations")}
     for name, swap in swaps.items():
         role = name.partition("-")[0]
         file = root / "compose" / f"{name}.yml"
         document = yaml.safe_load(file.read_text(encoding="utf-8"))
         settings = dict(setting.split("=", 1) for setting in swap.settings)
-        chosen = settings.get(f"{role}.implementation")
+        chosen = settings.get(f"services.{role}")
         if role == "planning":
             assert chosen is None
             continue
         assert name == f"{role}-{chosen}"
         service = document["services"][role]
+        assert choice(checked(load_scenario("healthy", swap.settings)), role) == chosen
         processes = read_processes(compose_file(), (role,), (file,))
-        assert processes[role].command == ("python", "-m", registered[f"{role}.{chosen}"])
+        assert processes[role].command == ("python", "-m", f"palpate_{role}"), "which goes by the scenario"
         assert service["build"]["args"]["EXTRA"] == name
         assert service["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
 
@@ -89,15 +93,15 @@ def test_the_override_for_hardware_starts_no_simulation() -> None:
     assert set(WORKERS) - set(roles) == {"tissue"}
     assert document["services"]["tissue"]["profiles"] == ["simulated"]
     processes = read_processes(compose_file(), (*roles, *OBSERVERS), (file,))
-    chosen = chosen_processes(scenario, processes)
-    assert {role: process.command for role, process in processes.items()} == {r: p.command for r, p in chosen.items()}
+    assert (scenario.services.robot, scenario.services.camera) == ("lbr", "ros")
+    assert {process.command for process in processes.values()} == {("python", "-m", f"palpate_{role}") for role in processes}
     assert {process.environment["PALPATE_RUNTIME"] for process in processes.values()} == {"wallclock"}
     assert "--wallclock" in document["services"]["conductor"]["command"]
 
 
 @pytest.mark.parametrize("words", [["run"], ["run", "--composed"], ["run", "--realtime"]])
 def test_real_tissue_waits_for_no_simulated_time(words: list[str], tmp_path: Path) -> None:
-    called = CliRunner().invoke(app, [*words, "--set", "tissue.implementation=none", "--out", str(tmp_path / "out")])
+    called = CliRunner().invoke(app_for("run"), [*words, "--set", "services.tissue=none", "--out", str(tmp_path / "out")])
     assert called.exit_code == EXIT_BAD_INPUT
     assert "--wallclock" in called.output
     assert not (tmp_path / "out").exists()
@@ -128,7 +132,7 @@ def test_how_a_process_ended_is_said_in_its_own_words(tmp_path: Path) -> None:
 )
 def test_a_phantom_that_cannot_be_made_is_named_before_anything_starts(settings: list[str], words: str, tmp_path: Path) -> None:
     options = [word for setting in settings for word in ("--set", setting)]
-    called = CliRunner().invoke(app, ["run", *options, "--out", str(tmp_path / "out")])
+    called = CliRunner().invoke(app_for("run"), ["run", *options, "--out", str(tmp_path / "out")])
     assert called.exit_code == EXIT_BAD_INPUT
     assert words in called.output
     assert not (tmp_path / "out").exists()

@@ -15,7 +15,7 @@ from rich.console import Console
 from palpate.report.evidence import samples_of, steady_contact
 from palpate.report.page import write_page
 from palpate.report.results import Report, assemble, print_findings, write_results
-from palpate.run.distributed import write_scenario_files
+from palpate.run.roles import write_scenario_files
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
 

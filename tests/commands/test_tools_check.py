@@ -5,42 +5,39 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable
-from importlib.metadata import entry_points
 from typing import Any
 
 import numpy as np
 import pytest
 
 from palpate.check.live_rig import LiveRig
-from palpate.check.report import Report
-from palpate.check.rig import ServiceRig, Settings
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
 from palpate.check.suites import SUITES, check
+from palpate_bus.implementations import create, names
 from palpate_bus.messages import JointTorqueCommand
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.load import load_scenario
 
 SCENARIO = load_scenario("rlq_guarding")
-POINTS = {point.name: point for group in ("palpate.services", "palpate.implementations") for point in entry_points(group=group)}
 HARDWARE = {"robot.lbr", "camera.ros", "camera.replay"}
 """By the wall clock only: `palpate check` takes them live; and the replay, whose own tests check it on a recorded plane."""
-QUICK = {"assessment", "camera", "control", "perception", "planning", "robot", "tissue", "tissue.fmu"}
-IMPLEMENTATIONS = sorted(name for name in POINTS if name.partition(".")[0] in SUITES and name not in HARDWARE)
-
-
-def slow_unless(quick: bool) -> Any:
-    return () if quick else pytest.mark.slow
+SLOW = {"robot.mujoco", "supervisor.default", "tissue.elastic"}
+IMPLEMENTATIONS = sorted({f"{role}.{name}" for role in SUITES for name in names(role)} - HARDWARE)
 
 
 def made(name: str) -> Service:
-    service: Service = POINTS[name].load()(SCENARIO)
-    return service
+    role, _, choice = name.partition(".")
+    return create(role, choice or getattr(SCENARIO.services, role), SCENARIO)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=slow_unless(name in QUICK)) for name in IMPLEMENTATIONS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in IMPLEMENTATIONS]
+)
 def test_an_implementation_of_ours_conforms(name: str) -> None:
-    report = check(ServiceRig(made(name), Settings(SCENARIO)))
+    report = check(ServiceRig(made(name), RigSettings(SCENARIO)))
     assert report.failed == []
     assert report.passed
     assert len(report.results) > 10
@@ -142,15 +139,15 @@ QUICKLY_SPOILT = ("control", "perception", "tissue")
 
 @pytest.mark.parametrize(
     ("name", "change", "caught_by"),
-    [pytest.param(*row, id=row[1].__name__, marks=slow_unless(row[0] in QUICKLY_SPOILT)) for row in SPOILT],
+    [pytest.param(*row, id=row[1].__name__, marks=[] if row[0] in QUICKLY_SPOILT else [pytest.mark.slow]) for row in SPOILT],
 )
 def test_a_spoilt_implementation_is_caught(name: str, change: Callable[[int, dict[str, Any]], None], caught_by: str) -> None:
-    report = check(ServiceRig(Spoilt(made(name), change), Settings(SCENARIO)))
+    report = check(ServiceRig(Spoilt(made(name), change), RigSettings(SCENARIO)))
     assert caught_by in [result.name for result in report.failed]
 
 
 def test_a_robot_is_not_moved_without_consent() -> None:
-    rig = ServiceRig(made("robot"), Settings(SCENARIO, motion=False))
+    rig = ServiceRig(made("robot"), RigSettings(SCENARIO, motion=False))
     report = check(rig)
     assert report.failed == []
     assert any("--motion" in result.got for result in report.results)
@@ -166,8 +163,8 @@ TIMELY = ("rate", "stamps", "within", "sequence")
 @pytest.mark.parametrize("role", ["planning", "camera", "perception"])
 def test_a_process_on_a_live_bus_conforms(role: str, tmp_path: Any) -> None:
     where = f"unixsock-stream/{tmp_path}/router.sock"
-    settings = Settings(SCENARIO, slack_ms=3000)
-    report = Report(role)
+    settings = RigSettings(SCENARIO, slack_ms=3000)
+    report = ConformanceReport(role)
     with session(BusOptions(mode="router", listen=(where,))) as bus:
         rig = LiveRig(bus, role, settings)
         try:

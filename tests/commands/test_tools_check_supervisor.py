@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from palpate.check.rig import ServiceRig, Settings
+from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.load import load_scenario
@@ -63,6 +63,6 @@ def soft_only(state: Any) -> None:
     ],
 )
 def test_the_suite_catches_what_is_wrong_and_nothing_else(change: Callable[[Any], None], caught_by: str) -> None:
-    report = check(ServiceRig(Spoilt(change), Settings(SCENARIO)))
+    report = check(ServiceRig(Spoilt(change), RigSettings(SCENARIO)))
     failed = [result.name for result in report.failed]
     assert (caught_by in failed) if caught_by else (failed == [] and report.passed)

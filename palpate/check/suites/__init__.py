@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from palpate.check.report import Report
+from palpate.check.report import ConformanceReport
 from palpate.check.rig import Rig
 from palpate.check.suites import assessment, camera, common, control, perception, planning, robot, supervisor, tissue
 
-SUITES: dict[str, Callable[[Rig, Report], None]] = {
+SUITES: dict[str, Callable[[Rig, ConformanceReport], None]] = {
     "robot": robot.suite,
     "tissue": tissue.suite,
     "control": control.suite,
@@ -21,9 +21,9 @@ SUITES: dict[str, Callable[[Rig, Report], None]] = {
 """The suite of each role."""
 
 
-def check(rig: Rig, report: Report | None = None) -> Report:
+def check(rig: Rig, report: ConformanceReport | None = None) -> ConformanceReport:
     """Runs the suite of a rig's role, then what holds for every role, and returns the report."""
-    report = report or Report(rig.role.name)
+    report = report or ConformanceReport(rig.role.name)
     SUITES[rig.role.name](rig, report)
     common.suite(rig, report)
     return report

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check import shapes
-from palpate.check.report import Report
+from palpate.check.report import ConformanceReport
 from palpate.check.rig import Rig
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
@@ -61,7 +61,7 @@ class Examination:
         return 1.0 + (CONTRAST - 1.0) / (1.0 + float(np.exp((r - STIFF_RADIUS) / 0.004)))
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Silence before contact, samples, the map, findings."""
     exam = rig.settings.scenario.exam
     half = min(0.05, exam.region_m[0] / 2, exam.region_m[1] / 2)
@@ -79,7 +79,7 @@ def suite(rig: Rig, report: Report) -> None:
     _findings(rig, play, report)
 
 
-def _samples(rig: Rig, half: float, report: Report) -> None:
+def _samples(rig: Rig, half: float, report: ConformanceReport) -> None:
     report.section("samples")
     heard = [item.message for item in rig.log[SAMPLES]]
     if not report.expect("takes samples", len(heard) > 20, "many", len(heard)):
@@ -101,7 +101,7 @@ def _samples(rig: Rig, half: float, report: Report) -> None:
     )
 
 
-def _findings(rig: Rig, play: Examination, report: Report) -> None:
+def _findings(rig: Rig, play: Examination, report: ConformanceReport) -> None:
     report.section("findings")
     waited = 0.0
     while not rig.log[FINDINGS] and waited < ANSWER_S:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import Report
-from palpate.check.rig import Heard, Rig, Source
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import HeardMessage, Rig, Source
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, SurfaceMesh
 from palpate_bus.messages.geometry import transform_matrix
@@ -49,7 +49,7 @@ def plane(centre: Array) -> Source:
     return lambda t: SurfaceMesh(header(t, "world"), flat, up, triangles.ravel())
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Pose, bursts, format, geometry."""
     report.section("pose")
     centre = np.array(rig.settings.scenario.camera.look_at_m)
@@ -88,12 +88,12 @@ def suite(rig: Rig, report: Report) -> None:
         _geometry(depth, infos[-1].message, X_WC, centre, rig, report)
 
 
-def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[Heard]]:
+def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[HeardMessage]]:
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
     return rig.run(0.1 * FRAMES + 0.5 + rig.slack / 1e9, feed)
 
 
-def _format(image: Heard, info: Heard, report: Report) -> Array | None:
+def _format(image: HeardMessage, info: HeardMessage, report: ConformanceReport) -> Array | None:
     m, k = image.message, np.asarray(info.message.k, np.float64).reshape(3, 3)
     report.expect("encoding", m.encoding == "32FC1" and not m.is_bigendian, "32FC1 [m], little-endian", f"{m.encoding}")
     fits = m.step >= 4 * m.width and len(m.data) == m.step * m.height
@@ -118,7 +118,7 @@ def _format(image: Heard, info: Heard, report: Report) -> Array | None:
     return depth
 
 
-def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, report: Report) -> None:
+def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, report: ConformanceReport) -> None:
     """Pixels that look at the plane show it where it is."""
     if not rig.settings.motion:
         report.skip("geometry", "a real camera does not see sim/surface; look at a board of known pose")

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from palpate.check.report import Report
-from palpate.check.rig import Heard, Rig
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import HeardMessage, Rig
 from palpate_bus.contract import MS, Topic
 from palpate_bus.contract.conformance import Checker
 
@@ -19,7 +19,7 @@ LOST = 0.05
 """Part of a live implementation's messages that may be lost on the way to this check."""
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Topics, rates, stamps and values."""
     report.section("contract")
     for topic in rig.rules.outputs(rig.role.name):
@@ -43,7 +43,7 @@ def suite(rig: Rig, report: Report) -> None:
         )
 
 
-def _values(topic: Topic, heard: list[Heard], report: Report) -> None:
+def _values(topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
     checker = Checker(topic)
     faults = [fault for item in heard for fault in checker(item.message)]
     wanted = "frame, ranges and finite numbers as in its row"
@@ -54,7 +54,7 @@ def _values(topic: Topic, heard: list[Heard], report: Report) -> None:
     report.expect(f"{topic.name}: values", not faults, wanted, got)
 
 
-def _rate(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
+def _rate(rig: Rig, topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
     """In-process every tick has its message; live the mean rate is right, by the sender's own clock."""
     wanted = f"{1000 / topic.period_ms:g} Hz"
     if not rig.live:
@@ -69,7 +69,7 @@ def _rate(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
     report.expect(f"{topic.name}: rate", off < RATE_TOLERANCE, wanted, f"{rate:.4g} Hz, longest pause {longest:.0f} ms")
 
 
-def _stamps(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
+def _stamps(rig: Rig, topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
     checker = Checker(topic)
     stamps = [(item.t, stamp) for item in heard if (stamp := checker.stamp(item.message)) is not None]
     if not stamps:
@@ -89,7 +89,7 @@ def _stamps(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
         report.expect(f"{topic.name}: stamps", not wrong, "the tick", f"{wrong[0][1]} at {wrong[0][0]} ns" if wrong else "so")
 
 
-def _sequence(rig: Rig, topic: Topic, heard: list[Heard], report: Report) -> None:
+def _sequence(rig: Rig, topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
     steps = np.diff([item.sequence for item in heard])
     jumps = int(np.sum(steps != 1))
     ok = bool(np.all(steps > 0)) and jumps <= (LOST * len(steps) if rig.live else 0)

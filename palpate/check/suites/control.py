@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import Report
-from palpate.check.rig import Feed, Heard, Rig, Source
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import Feed, HeardMessage, Rig, Source
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
@@ -64,7 +64,7 @@ def feed(setpoint: Source | None = None, arm: Source | None = None) -> Feed:
     return sources
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Signs, limits, expiry, garbage."""
     report.section("law")
     idle = rig.run(0.3, feed())[TORQUE]
@@ -86,7 +86,7 @@ def suite(rig: Rig, report: Report) -> None:
     _silence(rig, report)
 
 
-def _ceased(heard: list[Heard]) -> bool:
+def _ceased(heard: list[HeardMessage]) -> bool:
     """Whether the last commands have expired already, or there are none: the driver holds then."""
     return all(nanoseconds(item.message.valid_for) == 0 for item in heard[-5:])
 
@@ -97,7 +97,7 @@ def _torque(rig: Rig, sources: Feed, seconds: float = 0.3) -> Array:
     return np.mean([item.message.torque for item in heard], axis=0) if heard else np.full(7, np.nan)
 
 
-def _joint_sign(rig: Rig, report: Report) -> None:
+def _joint_sign(rig: Rig, report: ConformanceReport) -> None:
     wrong = []
     for joint in range(7):
         target = lbr.HOME.copy()
@@ -114,7 +114,7 @@ def _joint_sign(rig: Rig, report: Report) -> None:
     )
 
 
-def _cartesian_sign(rig: Rig, report: Report) -> None:
+def _cartesian_sign(rig: Rig, report: ConformanceReport) -> None:
     X_WI = tool_pose(lbr.HOME, rig.settings.scenario.robot)
     J = tool_jacobian(lbr.HOME, rig.settings.scenario.robot)
     wrong = []
@@ -134,7 +134,7 @@ def _cartesian_sign(rig: Rig, report: Report) -> None:
     )
 
 
-def _limits(rig: Rig, report: Report) -> None:
+def _limits(rig: Rig, report: ConformanceReport) -> None:
     far = lbr.HOME + np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
     rig.run(0.6, feed(joint_target(far, 2000.0)))
     rig.run(0.3, feed(joint_target(lbr.HOME, 100.0)))
@@ -143,7 +143,7 @@ def _limits(rig: Rig, report: Report) -> None:
     report.expect("torques stay within the joints' limits, whatever is asked for", ok, f"{lbr.TORQUE_LIMIT} N m", worst.round(1))
 
 
-def _expiry(rig: Rig, report: Report) -> None:
+def _expiry(rig: Rig, report: ConformanceReport) -> None:
     rig.run(0.3, feed(joint_target(lbr.HOME, 100.0)))
     ended = rig.t
     heard = rig.run(0.6 + rig.slack / 1e9, feed())[TORQUE]
@@ -163,7 +163,7 @@ def _expiry(rig: Rig, report: Report) -> None:
     )
 
 
-def _garbage(rig: Rig, report: Report) -> None:
+def _garbage(rig: Rig, report: ConformanceReport) -> None:
     target = lbr.HOME.copy()
     target[0] += 0.05
     before = _torque(rig, feed(joint_target(target, 100.0)))
@@ -189,12 +189,12 @@ def _garbage(rig: Rig, report: Report) -> None:
     report.expect("and recovers with good ones", not _ceased(rig.log[TORQUE]), "valid commands", _last(rig.log[TORQUE]))
 
 
-def _silence(rig: Rig, report: Report) -> None:
+def _silence(rig: Rig, report: ConformanceReport) -> None:
     heard = rig.run(0.4 + rig.slack / 1e9, {"planning/setpoint": joint_target(lbr.HOME, 100.0)})[TORQUE]
     report.expect("no joint states: it ceases", _ceased(heard), "expired commands or none", _last(heard))
 
 
-def _last(heard: list[Heard]) -> str:
+def _last(heard: list[HeardMessage]) -> str:
     if not heard:
         return "none"
     message = heard[-1].message

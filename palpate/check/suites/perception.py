@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from palpate.check import shapes
-from palpate.check.report import Report
+from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, Rig
 from palpate.check.suites.camera import FRAME
 from palpate_bus.messages import (
@@ -35,7 +35,7 @@ FLOOR_M = -0.12
 ANSWER_S = 10.0
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Silence unasked, the surface of a known belly, an answer when nothing came."""
     known = exam_input(rig.settings.scenario)
     X_WA = np.array(known.X_WA)
@@ -94,7 +94,7 @@ def _frames(depth: Array, K: Array) -> Feed:
     }
 
 
-def _surface(rig: Rig, X_WA: Array, report: Report) -> None:
+def _surface(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
     message = rig.last(SURFACE)
     if not report.expect(
         "perceives a surface", message is not None, "perception/surface", "there" if message is not None else "none"
@@ -114,7 +114,7 @@ def _surface(rig: Rig, X_WA: Array, report: Report) -> None:
     report.expect("triangles index its vertices", inside, "indices below the number of vertices", "so" if inside else "not so")
 
 
-def _targets(rig: Rig, X_WA: Array, report: Report) -> None:
+def _targets(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
     message = rig.last(TARGETS)
     p_W = np.array([(p.x, p.y, p.z) for p in message.positions]).reshape(-1, 3)
     sizes = {len(p_W), len(message.normals), len(message.lines)}

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import Report
-from palpate.check.rig import Feed, Heard, Rig
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import Feed, HeardMessage, Rig
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header, nanoseconds
@@ -19,7 +19,7 @@ WEIGHT_N = 6.0
 AWAIT_S = 20.0
 
 
-class Follower:
+class PerfectFollower:
     """An arm that is where the last joint set-point wants it; it starts at the ready posture."""
 
     def __init__(self, rig: Rig) -> None:
@@ -42,10 +42,10 @@ class Follower:
         return RobotStatus(header(t), self.mode, cause, reason, self.q, velocity, weight, np.zeros(7), 0)
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Set-points, the way to the first picture, stop."""
     report.section("set-points")
-    arm = Follower(rig)
+    arm = PerfectFollower(rig)
     rig.run(0.5, arm.feed())
     heard = rig.log[SETPOINT]
     if not report.expect("set-points come", bool(heard), "100 Hz", len(heard)):
@@ -89,7 +89,7 @@ def suite(rig: Rig, report: Report) -> None:
     report.expect("goes on without robot/status", len(quiet[STATE]) > 0, "exam/state at its rate", len(quiet[STATE]))
 
 
-def _first(heard: list[Heard], report: Report) -> None:
+def _first(heard: list[HeardMessage], report: ConformanceReport) -> None:
     """Nothing may jump when a run starts."""
     message = heard[0].message
     if message.mode == ImpedanceSetpoint.MODE_JOINT:
@@ -99,7 +99,7 @@ def _first(heard: list[Heard], report: Report) -> None:
         report.skip("the first set-point is where the arm is", "it is not of mode JOINT")
 
 
-def _safe(heard: list[Heard], report: Report) -> None:
+def _safe(heard: list[HeardMessage], report: ConformanceReport) -> None:
     joint = [item.message for item in heard if item.message.mode == ImpedanceSetpoint.MODE_JOINT]
     q = np.array([m.joint_position for m in joint])
     t = np.array([nanoseconds(m.header.stamp) / 1e9 for m in joint])
@@ -125,7 +125,7 @@ def _norm(q: Any) -> float:
     return float(np.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2))
 
 
-def _phases(heard: list[Heard], report: Report) -> None:
+def _phases(heard: list[HeardMessage], report: ConformanceReport) -> None:
     phases = list(dict.fromkeys(int(item.message.phase) for item in heard))
     ok = phases == sorted(phases) and phases[-1] <= ExamState.PHASE_PLAN
     report.expect("phases follow their order", ok, "HOME, LOOK, PLAN", phases)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import Report
-from palpate.check.rig import Feed, Heard, Rig, Source
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import Feed, HeardMessage, Rig, Source
 from palpate_bus.contract import MS
 from palpate_bus.messages import (
     JointTorqueCommand,
@@ -50,7 +50,7 @@ def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> 
     return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns), "")}
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Signs, gravity, holds, latches, limits."""
     report.section("joints")
     rest = rig.run(0.5, quiet(rig))
@@ -92,7 +92,7 @@ def _mode_name(rig: Rig) -> str:
     )
 
 
-def _joints(heard: list[Heard], report: Report) -> None:
+def _joints(heard: list[HeardMessage], report: ConformanceReport) -> None:
     if not report.expect("joint_states come", len(heard) > 0, "messages", f"{len(heard)}"):
         return
     last = heard[-1].message
@@ -111,7 +111,7 @@ def _joints(heard: list[Heard], report: Report) -> None:
     )
 
 
-def _description(rig: Rig, report: Report) -> None:
+def _description(rig: Rig, report: ConformanceReport) -> None:
     described = rig.last("robot_description")
     text = "" if described is None else str(described.data)
     missing = [name for name in (*lbr.JOINT_NAMES, "indenter") if f'name="{name}"' not in text]
@@ -123,7 +123,7 @@ def _description(rig: Rig, report: Report) -> None:
     )
 
 
-def _gravity(rig: Rig, report: Report) -> None:
+def _gravity(rig: Rig, report: ConformanceReport) -> None:
     """Commands exclude gravity: with zero torque a compensated arm stays where it is."""
     moved = rig.run(0.4, commanding(rig, np.zeros(7)))["joint_states"]
     report.expect("obeys commands", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
@@ -136,7 +136,7 @@ def _gravity(rig: Rig, report: Report) -> None:
     )
 
 
-def _signs(rig: Rig, report: Report) -> None:
+def _signs(rig: Rig, report: ConformanceReport) -> None:
     """A positive torque accelerates its joint to the positive side, and is reported as applied with that sign."""
     wrong, unsaid = [], []
     settle(rig)
@@ -182,11 +182,11 @@ def _activate(rig: Rig) -> None:
     rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))
 
 
-def _holds(rig: Rig, heard: list[Heard]) -> Heard | None:
+def _holds(rig: Rig, heard: list[HeardMessage]) -> HeardMessage | None:
     return next((item for item in heard if item.message.mode == RobotStatus.MODE_SAFE_HOLD), None)
 
 
-def _expiry(rig: Rig, report: Report) -> None:
+def _expiry(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     report.expect("a release and a command make it active", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
     ended = rig.t
@@ -216,7 +216,7 @@ def _expiry(rig: Rig, report: Report) -> None:
     report.expect("the hold is latched: new commands do not end it", latched, "MODE_SAFE_HOLD", _mode_name(rig))
 
 
-def _provoke(rig: Rig, report: Report, what: str, torque: Any, cause: int) -> None:
+def _provoke(rig: Rig, report: ConformanceReport, what: str, torque: Any, cause: int) -> None:
     _activate(rig)
     heard = rig.run(0.1, commanding(rig, torque))["robot/status"]
     heard += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
@@ -227,7 +227,7 @@ def _provoke(rig: Rig, report: Report, what: str, torque: Any, cause: int) -> No
     )
 
 
-def _invalid(rig: Rig, report: Report) -> None:
+def _invalid(rig: Rig, report: ConformanceReport) -> None:
     bad = np.zeros(7)
     bad[3] = np.nan
     _provoke(rig, report, "a torque that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
@@ -236,7 +236,7 @@ def _invalid(rig: Rig, report: Report) -> None:
     _provoke(rig, report, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
 
 
-def _stop(rig: Rig, report: Report) -> None:
+def _stop(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
     heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))["robot/status"]
@@ -246,7 +246,7 @@ def _stop(rig: Rig, report: Report) -> None:
     report.expect("an operator's stop makes it hold", ok, "MODE_SAFE_HOLD, CAUSE_STOP_REQUESTED", got)
 
 
-def _emergency(rig: Rig, report: Report) -> None:
+def _emergency(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
     hold = _holds(rig, heard)
@@ -259,7 +259,7 @@ def _pressing(rig: Rig, force_W: Any) -> Feed:
     return {**quiet(rig), "sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), wrench)}
 
 
-def _force(rig: Rig, report: Report) -> None:
+def _force(rig: Rig, report: ConformanceReport) -> None:
     """`ft/wrench` is what tool and environment exert on the sensor, in its axes: a push on the tool shows with its sign."""
     if not rig.log["sim/tool_state"]:
         report.skip("the F/T sensor's sign", "no sim/tool_state: no simulated arm; press the tool by hand and look at ft/wrench")
@@ -279,12 +279,12 @@ def _force(rig: Rig, report: Report) -> None:
     )
 
 
-def _mean_force(heard: list[Heard]) -> np.ndarray[Any, Any]:
+def _mean_force(heard: list[HeardMessage]) -> np.ndarray[Any, Any]:
     forces = [item.message.wrench.force for item in heard]
     return np.mean([(f.x, f.y, f.z) for f in forces], axis=0) if forces else np.full(3, np.nan)
 
 
-def _twist(rig: Rig, report: Report) -> None:
+def _twist(rig: Rig, report: ConformanceReport) -> None:
     """The twist is the pose's rate of change, over all of the check."""
     states = [item.message for item in rig.log["sim/tool_state"]]
     if not states:
@@ -305,7 +305,7 @@ def _twist(rig: Rig, report: Report) -> None:
     )
 
 
-def _lost(rig: Rig, report: Report) -> None:
+def _lost(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     rig.lose("control")
     heard = rig.run(0.1 + rig.slack / 1e9, quiet(rig))["robot/status"]
@@ -315,7 +315,7 @@ def _lost(rig: Rig, report: Report) -> None:
     report.expect("the loss of control makes it hold", hold is not None and hold.message.cause in causes, "MODE_SAFE_HOLD", got)
 
 
-def _limits(rig: Rig, report: Report) -> None:
+def _limits(rig: Rig, report: ConformanceReport) -> None:
     """Over all that was asked for in this check."""
     efforts = [item.message.effort for item in rig.log["joint_states"] if np.shape(item.message.effort) == (7,)]
     worst = np.max(np.abs(efforts), axis=0)

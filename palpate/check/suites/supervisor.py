@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import Report
-from palpate.check.rig import Feed, Heard, Rig
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import Feed, HeardMessage, Rig
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, OperatorRequest, Point, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
 from palpate_bus.messages.stamps import header
@@ -33,7 +33,7 @@ STOPPED = (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.LEVEL_EMERGENCY)
 EMERGENCY = (SupervisorState.LEVEL_EMERGENCY,)
 
 
-class Arm:
+class PlayedArm:
     """An arm that stands still in the ready posture, free of everything, until something is changed."""
 
     def __init__(self, rig: Rig) -> None:
@@ -79,9 +79,9 @@ class Arm:
         return SurfaceMesh(header(t, "world"), vertices.ravel(), normals.ravel(), triangles.ravel())
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Measures, limits one by one, the latch, an operator, silence, loss."""
-    arm = Arm(rig)
+    arm = PlayedArm(rig)
     limits = exam_input(rig.settings.scenario).limits
     report.section("rest")
     rest = rig.run(2.0, arm.feed())[STATE]
@@ -137,7 +137,7 @@ def suite(rig: Rig, report: Report) -> None:
     _stops(rig, arm, report, "the loss of control", EMERGENCY, SupervisorState.CAUSE_LOST, REACT_MS)
 
 
-def _measures(rig: Rig, arm: Arm, report: Report) -> None:
+def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
     """Force, speed and depth are those of the arm."""
     report.section("measures")
     arm.qd = _turning(arm, 0.05)
@@ -152,7 +152,7 @@ def _measures(rig: Rig, arm: Arm, report: Report) -> None:
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
 
 
-def _press(rig: Rig, arm: Arm, force: float) -> list[Heard]:
+def _press(rig: Rig, arm: PlayedArm, force: float) -> list[HeardMessage]:
     """Presses up to `force` [N] as slowly as an examination does, and keeps it for half a second."""
     for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / RISE_NPS / STEP_S)):
         arm.push_N = float(push)
@@ -160,13 +160,13 @@ def _press(rig: Rig, arm: Arm, force: float) -> list[Heard]:
     return rig.run(0.5, arm.feed())[STATE]
 
 
-def _turning(arm: Arm, speed: float) -> Array:
+def _turning(arm: PlayedArm, speed: float) -> Array:
     """Joint velocities [rad/s], of the first joint alone, that move the tool at `speed` [m/s]."""
     lever = float(np.linalg.norm(tool_jacobian(arm.q, arm.robot)[:3, 0]))
     return np.array((speed / lever, *np.zeros(6)))
 
 
-def _workspace(rig: Rig, arm: Arm, report: Report) -> None:
+def _workspace(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
     known = exam_input(rig.settings.scenario)
     low, high = np.array(known.limits.workspace_min_m), np.array(known.limits.workspace_max_m)
     X_AW = inverse(np.array(known.X_WA))
@@ -180,7 +180,9 @@ def _workspace(rig: Rig, arm: Arm, report: Report) -> None:
     report.skip("stops for a tool outside of the workspace", "the workspace is larger than what this check tries")
 
 
-def _stops(rig: Rig, arm: Arm, report: Report, what: str, levels: tuple[int, ...], cause: int, within_ms: float) -> None:
+def _stops(
+    rig: Rig, arm: PlayedArm, report: ConformanceReport, what: str, levels: tuple[int, ...], cause: int, within_ms: float
+) -> None:
     """Expects a stop with the right cause and words for what was just made wrong."""
     start = rig.t
     heard = rig.run(0.5, arm.feed())[STATE]
@@ -195,14 +197,14 @@ def _stops(rig: Rig, arm: Arm, report: Report, what: str, levels: tuple[int, ...
     report.expect(f"soon: {what}", after <= within_ms, f"within {within_ms:.0f} ms", f"{after:.0f} ms")
 
 
-def _refuses(rig: Rig, arm: Arm, report: Report) -> None:
+def _refuses(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
     """A release while the force is still there."""
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
     heard = rig.run(0.3, arm.feed())[STATE]
     report.expect("a release is refused while its cause stands", _level(heard) in STOPPED, "still stopped", _words(heard))
 
 
-def _released(rig: Rig, arm: Arm, report: Report, name: str) -> None:
+def _released(rig: Rig, arm: PlayedArm, report: ConformanceReport, name: str) -> None:
     """All is well again: the stop stays, and ends on release, which is counted."""
     arm.calm()
     heard = rig.run(0.5, arm.feed())[STATE]
@@ -215,11 +217,11 @@ def _released(rig: Rig, arm: Arm, report: Report, name: str) -> None:
     report.expect(name, ok, "stopped until released, then level 0 and one release more", got)
 
 
-def _level(heard: list[Heard]) -> int | None:
+def _level(heard: list[HeardMessage]) -> int | None:
     return int(heard[-1].message.level) if heard else None
 
 
-def _words(heard: list[Heard]) -> str:
+def _words(heard: list[HeardMessage]) -> str:
     if not heard:
         return "nothing"
     state = heard[-1].message

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import Report
-from palpate.check.rig import Feed, Heard, Rig
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import Feed, HeardMessage, Rig
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.geometry import rotation, vector
 from palpate_bus.messages.stamps import header
@@ -20,14 +20,14 @@ DEPTH = 0.008
 CLEARANCE = 0.01
 
 
-class Tool:
+class PressingTool:
     """An indenter that is led along straight legs; poses in world."""
 
     def __init__(self, p: Array, radius: float) -> None:
         self.p, self.v, self.radius = p.astype(float), np.zeros(3), radius
         self._since = 0
 
-    def lead(self, rig: Rig, to: Array, seconds: float) -> list[Heard]:
+    def lead(self, rig: Rig, to: Array, seconds: float) -> list[HeardMessage]:
         """Moves to `to` [m] in `seconds`; returns the contact wrenches meanwhile."""
         start, t0 = self.p.copy(), rig.t
         self.v = (to - start) / seconds
@@ -38,7 +38,7 @@ class Tool:
 
         return rig.run(seconds, {"sim/tool_state": source})[WRENCH]
 
-    def rest(self, rig: Rig, seconds: float) -> list[Heard]:
+    def rest(self, rig: Rig, seconds: float) -> list[HeardMessage]:
         """Stays."""
         return self.lead(rig, self.p.copy(), seconds)
 
@@ -49,13 +49,13 @@ def _state(t: int, p: Array, v: Array, radius: float) -> Any:
     return ToolState(header(t, "world"), pose, twist, radius)
 
 
-def force(item: Heard) -> Array:
+def force(item: HeardMessage) -> Array:
     """The force of a wrench [N], shape (3,)."""
     f = item.message.wrench.force
     return np.array((f.x, f.y, f.z))
 
 
-def suite(rig: Rig, report: Report) -> None:
+def suite(rig: Rig, report: ConformanceReport) -> None:
     """Truth, contact, friction, energy, silence."""
     report.section("truth")
     rig.run(0.05, {})
@@ -68,10 +68,10 @@ def suite(rig: Rig, report: Report) -> None:
     radius = rig.settings.scenario.robot.indenter_radius_m
     report.section("contact")
     touch = p_W + n_W * radius
-    tool = Tool(touch + n_W * CLEARANCE, radius)
+    tool = PressingTool(touch + n_W * CLEARANCE, radius)
     above = tool.rest(rig, 0.2)
     _check_free(above, report, "no force out of contact")
-    legs: list[tuple[list[Heard], Array]] = []
+    legs: list[tuple[list[HeardMessage], Array]] = []
     down = tool.lead(rig, touch - n_W * DEPTH, (CLEARANCE + DEPTH) / SPEED)
     legs.append((down, tool.v.copy()))
     _check_press(rig, down, n_W, report)
@@ -94,7 +94,7 @@ def suite(rig: Rig, report: Report) -> None:
     report.expect("goes on without tool states", ok, "a wrench a tick", f"{len(heard)} messages")
 
 
-def _spot(truth: Any, report: Report) -> tuple[Array, Array]:
+def _spot(truth: Any, report: ConformanceReport) -> tuple[Array, Array]:
     """A point near the umbilicus and the outward normal there, in world."""
     vertices = np.asarray(truth.surface.vertices, np.float64).reshape(-1, 3)
     normals = np.asarray(truth.surface.normals, np.float64).reshape(-1, 3)
@@ -112,12 +112,12 @@ def _spot(truth: Any, report: Report) -> tuple[Array, Array]:
     return R_WA @ vertices[top] + p_WA, R_WA @ normals[top]
 
 
-def _check_free(heard: list[Heard], report: Report, name: str) -> None:
+def _check_free(heard: list[HeardMessage], report: ConformanceReport, name: str) -> None:
     worst = max((float(np.linalg.norm(force(item))) for item in heard[len(heard) // 2 :]), default=np.inf)
     report.expect(name, worst < 1e-6, "0 N", f"{worst:.3g} N")
 
 
-def _check_press(rig: Rig, heard: list[Heard], n_W: Array, report: Report) -> None:
+def _check_press(rig: Rig, heard: list[HeardMessage], n_W: Array, report: ConformanceReport) -> None:
     normal = np.array([force(item) @ n_W for item in heard])
     report.expect(
         "a pressed surface pushes back, outward",
@@ -133,7 +133,7 @@ def _check_press(rig: Rig, heard: list[Heard], n_W: Array, report: Report) -> No
     report.expect("pressed straight, it pushes straight", side < 0.2 * normal[-1], "tangential below 20 %", f"{side:.3f} N")
 
 
-def _check_slide(heard: list[Heard], tangent: Array, n_W: Array, report: Report) -> None:
+def _check_slide(heard: list[HeardMessage], tangent: Array, n_W: Array, report: ConformanceReport) -> None:
     tail = heard[len(heard) // 2 :]
     along = float(np.mean([force(item) @ tangent for item in tail]))
     normal = float(np.mean([force(item) @ n_W for item in tail]))
@@ -145,7 +145,7 @@ def _check_slide(heard: list[Heard], tangent: Array, n_W: Array, report: Report)
     )
 
 
-def _check_truth(rig: Rig, n_W: Array, report: Report) -> None:
+def _check_truth(rig: Rig, n_W: Array, report: ConformanceReport) -> None:
     truth, wrench = rig.last(TRUTH), rig.log[WRENCH][-1]
     if truth is None:
         return
@@ -160,7 +160,7 @@ def _check_truth(rig: Rig, n_W: Array, report: Report) -> None:
     report.expect("truth/indentation: the force is that of the wrench", near, f"{normal:.2f} N", f"{truth.normal_force:.2f} N")
 
 
-def _check_energy(legs: list[tuple[list[Heard], Array]], report: Report) -> None:
+def _check_energy(legs: list[tuple[list[HeardMessage], Array]], report: ConformanceReport) -> None:
     """Over a closed loop a passive tissue gives nothing back: the work that it does on the tool is not positive."""
     work = 0.0
     stored = 0.0
@@ -176,7 +176,7 @@ def _check_energy(legs: list[tuple[list[Heard], Array]], report: Report) -> None
     )
 
 
-def _surface(rig: Rig, report: Report) -> None:
+def _surface(rig: Rig, report: ConformanceReport) -> None:
     meshes = [item.message for item in rig.log["sim/surface"]]
     if not meshes:
         return

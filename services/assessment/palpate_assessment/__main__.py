@@ -1,8 +1,7 @@
-"""`python -m palpate_assessment`: the assessment service as a process."""
+"""`python -m palpate_assessment [NAME_OR_FILE]`: the assessment as a process of its own."""
 
-from palpate_assessment.service import create
 from palpate_bus.run import main
 from palpate_models.load import load_scenario
 
 if __name__ == "__main__":
-    main("assessment", create, load_scenario)
+    main("assessment", load_scenario)

@@ -1,8 +1,7 @@
-"""Runs the role as a process: `python -m palpate_camera`."""
+"""`python -m palpate_camera [NAME_OR_FILE]`: the camera as a process of its own."""
 
 from palpate_bus.run import main
-from palpate_camera.backends.kinect.service import create
 from palpate_models.load import load_scenario
 
 if __name__ == "__main__":
-    main("camera", create, load_scenario)
+    main("camera", load_scenario)

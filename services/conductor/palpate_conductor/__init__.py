@@ -1,1 +1,1 @@
-"""Conducts a run: the `palpate` command, start, pacing, watchdog, scores and report."""
+"""Conducts a run: start, grants of simulated time, watchdog, end."""

@@ -21,9 +21,10 @@ from palpate_conductor.contract_watch import ContractWatch
 from palpate_conductor.grants import Grants
 from palpate_conductor.handover import Places
 from palpate_conductor.operator import OperatorDesk
-from palpate_conductor.outcome import Outcome, Patience, RunFailed
+from palpate_conductor.outcome import Patience, RunFailed, RunOutcome
 from palpate_conductor.service_health import service_statuses
-from palpate_conductor.watchdog import Watchdog
+from palpate_conductor.timing import Timing
+from palpate_conductor.watchdog import RunWatchdog
 
 log = logging.getLogger(__name__)
 
@@ -45,17 +46,10 @@ class Conductor:
         roles: tuple[str, ...],
         collector: Collector,
         patience: Patience | None = None,
-        realtime: float | None = None,
-        limit: int | None = None,
-        wallclock: bool = False,
-        handover_s: float = 0.0,
+        timing: Timing | None = None,
     ) -> None:
-        """Prepares a run.
-
-        `realtime` paces it at so many simulated seconds a wall second; `limit` [ns] ends a run that nobody else ends.
-        With `wallclock` the services run on their own timers, and nothing is granted but the common start and the end; the place
-        of a service that goes is kept for `handover_s`, if the run can do without it for that time (see `handover`).
-        """
+        """Prepares a run."""
+        timing = timing or Timing()
         member = Member(session, collector.role, rules, domain)
         self._member = member
         self._rules = rules
@@ -65,8 +59,8 @@ class Conductor:
         self._collector = collector
         self._observed = ObservedService(collector, member, lossless=True)
         self._patience = patience or Patience()
-        self._wallclock = wallclock
-        self._places = Places(handover_s if wallclock else 0.0)
+        self._wallclock = timing.wallclock
+        self._places = Places(timing.handover_s if timing.wallclock else 0.0)
         self._control = member.internal_publisher("palpate/control", "palpation_msgs/msg/RunControl", "event")
         self._encode = codec.encoder("palpation_msgs/msg/RunControl")
         self._decode = codec.decoder("palpation_msgs/msg/ServiceReport")
@@ -74,11 +68,11 @@ class Conductor:
             role: member.internal_subscription(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport") for role in roles
         }
         self._sequence = 0
-        self.watchdog = Watchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
-        self.outcome = Outcome()
-        self._contract = ContractWatch(session, rules, domain, wallclock)
+        self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
+        self.outcome = RunOutcome()
+        self._contract = ContractWatch(session, rules, domain, timing.wallclock)
         collector.diagnose = self._diagnose
-        self.grants = Grants(lambda tick, last: self._say(RunControl.GRANT, tick, last), realtime, limit, wallclock)
+        self.grants = Grants(lambda tick, last: self._say(RunControl.GRANT, tick, last), timing)
         self._desk = OperatorDesk(session, domain, self.request, self.grants.pace)
         self._started_at = 0.0
         self._complained = False
@@ -127,7 +121,7 @@ class Conductor:
         self,
         died: Callable[[], Mapping[str, str]] = dict,
         tell: Callable[[Conductor], None] = lambda _: None,
-    ) -> Outcome:
+    ) -> RunOutcome:
         """Runs to the end. `died` gives the roles whose process is gone, with how; `tell` is called often, for progress.
 
         Raises RunFailed when the run cannot start; later failures are in the outcome, KeyboardInterrupt among them.

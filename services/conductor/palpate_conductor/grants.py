@@ -15,6 +15,7 @@ from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.operator_requests import PACE
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_conductor.outcome import RunFailed
+from palpate_conductor.timing import Timing
 
 WINDOW = 500 * MS
 """Simulated time granted beyond the newest exam state; less than the second by which planning announces the end."""
@@ -29,12 +30,10 @@ EXAM_SILENT_S = 10.0
 class Grants:
     """Decides what is granted, and says it."""
 
-    def __init__(
-        self, say: Callable[[int, bool], None], realtime: float | None = None, limit: int | None = None, wallclock: bool = False
-    ) -> None:
-        """`say(tick, last)` tells every service. The others are the conductor's."""
+    def __init__(self, say: Callable[[int, bool], None], timing: Timing) -> None:
+        """`say(tick, last)` tells every service."""
         self._say = say
-        self._realtime, self._limit, self._wallclock = realtime, limit, wallclock
+        self._realtime, self._limit, self._wallclock = timing.realtime, timing.limit, timing.wallclock
         self.horizon = NEVER
         """The last tick that is granted [ns]; of a wall-clock run its start by the wall clock, then its end."""
         self.last = False
@@ -64,7 +63,7 @@ class Grants:
         if self.last:
             self._again()
             return
-        if end is None and self._limit is not None and exam + WINDOW >= self._limit:
+        if end is None and exam + WINDOW >= self._limit:
             end = self._limit
         tick = max(exam, 0) + WINDOW
         if recorded is not None:

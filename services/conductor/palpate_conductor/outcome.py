@@ -26,7 +26,7 @@ class Patience:
 
 
 @dataclass
-class Outcome:
+class RunOutcome:
     """How a run went."""
 
     digests: dict[str, str] = field(default_factory=dict)

@@ -10,11 +10,14 @@ from palpate_bus.messages import DiagnosticStatus, KeyValue
 from palpate_bus.messages.stamps import NS
 from palpate_bus.monitor.diagnostics import RECENT_S
 from palpate_bus.monitor.health import SeenViolation
-from palpate_conductor.watchdog import Progress
+from palpate_conductor.watchdog import RoleProgress
 
 
 def service_statuses(
-    progress: Mapping[str, Progress], lost: Container[str], silent_s: float, violations: Callable[[str], Sequence[SeenViolation]]
+    progress: Mapping[str, RoleProgress],
+    lost: Container[str],
+    silent_s: float,
+    violations: Callable[[str], Sequence[SeenViolation]],
 ) -> list[Any]:
     """A status a service: ERROR when it is lost or violates the contract, WARN when it says nothing for `silent_s` [s].
 
@@ -37,7 +40,7 @@ def service_statuses(
 
 
 def _judged(
-    at: Progress, lost: bool, silent: float, silent_s: float, found: Sequence[SeenViolation], now: float
+    at: RoleProgress, lost: bool, silent: float, silent_s: float, found: Sequence[SeenViolation], now: float
 ) -> tuple[int, str]:
     if lost:
         return DiagnosticStatus.ERROR, "lost"

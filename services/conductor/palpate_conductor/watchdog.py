@@ -8,7 +8,7 @@ from time import monotonic
 
 
 @dataclass
-class Progress:
+class RoleProgress:
     """What one service last reported."""
 
     tick: int = -1
@@ -20,12 +20,12 @@ class Progress:
     """When it last finished a tick, by the monotonic clock [s]."""
 
 
-class Watchdog:
+class RunWatchdog:
     """Keeps the progress of every service and names the one that holds the others up."""
 
     def __init__(self, roles: tuple[str, ...], producers: dict[str, str]) -> None:
         """`producers` gives the producing role of each topic."""
-        self.progress = {role: Progress() for role in roles}
+        self.progress = {role: RoleProgress() for role in roles}
         self._producers = producers
 
     def report(self, role: str, tick: int, waiting_for: str) -> None:

@@ -1,13 +1,13 @@
 """Who blocks whom."""
 
-from palpate_conductor.watchdog import Watchdog
+from palpate_conductor.watchdog import RunWatchdog
 
 PRODUCERS = {"joint_states": "robot", "control/joint_torque": "control", "sim/contact_wrench": "tissue", "exam/state": "planning"}
 ROLES = ("robot", "control", "tissue", "planning", "assessment")
 
 
-def watchdog() -> Watchdog:
-    return Watchdog((*ROLES, "dashboard"), PRODUCERS)
+def watchdog() -> RunWatchdog:
+    return RunWatchdog((*ROLES, "dashboard"), PRODUCERS)
 
 
 def test_the_one_that_waits_for_nobody_is_the_culprit() -> None:

@@ -1,8 +1,7 @@
-"""`python -m palpate_control`: the control service as a process."""
+"""`python -m palpate_control [NAME_OR_FILE]`: the control as a process of its own."""
 
 from palpate_bus.run import main
-from palpate_control.service import create
 from palpate_models.load import load_scenario
 
 if __name__ == "__main__":
-    main("control", create, load_scenario)
+    main("control", load_scenario)

@@ -1,8 +1,7 @@
-"""Runs the role as a process: `python -m palpate_perception`."""
+"""`python -m palpate_perception [NAME_OR_FILE]`: the perception as a process of its own."""
 
 from palpate_bus.run import main
 from palpate_models.load import load_scenario
-from palpate_perception.service import create
 
 if __name__ == "__main__":
-    main("perception", create, load_scenario)
+    main("perception", load_scenario)

@@ -1,8 +1,7 @@
-"""`python -m palpate_planning`: the planning service as a process."""
+"""`python -m palpate_planning [NAME_OR_FILE]`: the planning as a process of its own."""
 
 from palpate_bus.run import main
 from palpate_models.load import load_scenario
-from palpate_planning.service import create
 
 if __name__ == "__main__":
-    main("planning", create, load_scenario)
+    main("planning", load_scenario)

@@ -1,8 +1,7 @@
-"""Runs the recorder on the bus."""
+"""`python -m palpate_recorder [NAME_OR_FILE]`: the recorder as a process of its own."""
 
 from palpate_bus.run import main
 from palpate_models.load import load_scenario
-from palpate_recorder.service import create
 
 if __name__ == "__main__":
-    main("recorder", create, load_scenario)
+    main("recorder", load_scenario)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.run.implementations import chosen_processes, chosen_services
-from palpate.run.processes import ServiceProcess
 from palpate_bus.contract import MS, contract
+from palpate_bus.implementations import create_for
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
@@ -47,12 +46,10 @@ def tool_state(t, p, radius=0.015):
     return ToolState(header(t, "world"), pose, Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), radius)
 
 
-def test_the_scenario_chooses_it_for_process_and_composition():
+def test_the_scenario_chooses_it():
     scenario = load_scenario("deep_lesion")
     assert scenario.phantom.lesions[0].depth_m == 0.008
-    assert chosen_services(scenario)["tissue"].load() is create
-    processes = {"tissue": ServiceProcess("tissue", ("python", "-m", "palpate_tissue"), {})}
-    assert chosen_processes(scenario, processes)["tissue"].command == ("python", "-m", "palpate_tissue.backends.elastic")
+    assert create_for("tissue", scenario.services.tissue) is create
 
 
 def test_it_publishes_what_the_contract_says_and_presses_back():

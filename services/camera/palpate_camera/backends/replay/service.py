@@ -73,7 +73,5 @@ def create(scenario: Scenario) -> ReplayedCamera:
     """The camera of `camera.recording`. Raises RecordingError."""
     path = scenario.camera.recording
     if path is None:
-        raise RecordingError(
-            "camera.implementation: replay needs camera.recording: a run's folder, a rosbag2 folder or an .mcap file"
-        )
+        raise RecordingError("services.camera: replay needs camera.recording: a run's folder, a rosbag2 folder or an .mcap file")
     return ReplayedCamera(open_recording(Path(path)))

@@ -171,6 +171,6 @@ def _intrinsics(t: int, info: Any, *, rectified: bool) -> Any:
 def create(scenario: Scenario) -> RosCameraService:
     """The camera that the scenario's `camera.ros` names. Raises CameraError."""
     if runtime() != "wallclock":
-        raise CameraError("a real camera does not wait for simulated time: run with --wallclock")
+        raise CameraError("services.camera = ros takes a real camera, which does not wait: run with --wallclock")
     ros = scenario.camera.ros
     return RosCameraService(ZenohCamera(ros), ros.frame.strip("/"), ros.world.strip("/"))

@@ -6,9 +6,9 @@ Between a joint state and the torque that answers it there is then no transport 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.metadata import entry_points
 from typing import Any
 
+from palpate_bus.implementations import create
 from palpate_bus.messages.codec import Message
 from palpate_bus.service import Inbox, Service
 from palpate_models.scenario import Scenario
@@ -80,9 +80,5 @@ class InnerLoop:
 
 
 def load_control(scenario: Scenario) -> Service:
-    """The installed control service. Raises LookupError when there is none."""
-    for point in entry_points(group="palpate.services"):
-        if point.name == "control":
-            service: Service = point.load()(scenario)
-            return service
-    raise LookupError("no installed package provides the service 'control' (entry point palpate.services)")
+    """The control service that the scenario chooses. Raises ChoiceError when there is none."""
+    return create("control", scenario.services.control, scenario)

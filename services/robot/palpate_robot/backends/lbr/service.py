@@ -229,9 +229,7 @@ def _wrench(values: Array) -> Message:
 def create(scenario: Scenario) -> LbrService:
     """The driver of a scenario, of which it may know the exam input; it joins the ROS side that `robot.lbr` names."""
     if runtime() != "wallclock":
-        raise BusConfigError(
-            "robot.implementation = lbr drives hardware, which does not wait for simulated time: run with --wallclock"
-        )
+        raise BusConfigError("services.robot = lbr drives hardware, which does not wait for simulated time: run with --wallclock")
     exam = exam_input(scenario)
     inner = InnerLoop(load_control(scenario)) if exam.robot.lbr.level == "setpoint" else None
     return LbrService(exam, ZenohPort(exam.robot.lbr), inner)

@@ -70,8 +70,8 @@ def compliance(
     free = np.flatnonzero(~model.fixed)
     if len(free) > MOST_VERTICES:
         raise SizeError(
-            f"tissue.implementation elastic: {len(free)} free vertices, at most {MOST_VERTICES} are possible: use a coarser mesh "
-            "(phantom.edge_m), or tissue.implementation default"
+            f"services.tissue = elastic: {len(free)} free vertices, at most {MOST_VERTICES} are possible: use a coarser mesh "
+            "(phantom.edge_m), or services.tissue = winkler"
         )
     thickness = float(np.ptp(model.vertices[:, 2])) if thickness_m is None else thickness_m
     return Compliance(_Body(model, free, thickness, poisson, pitch_m).matrix(tuple(lesions)), free)

@@ -33,7 +33,7 @@ class RunResult:
 
 
 @dataclass(frozen=True)
-class Progress:
+class RunProgress:
     """What a user wants to see while a run is on."""
 
     t: int
@@ -46,7 +46,8 @@ class Progress:
     """Passes on an operator's request, with its reason; None where there is nobody to pass it to."""
 
 
-Tell = Callable[[Progress], None]
+Tell = Callable[[RunProgress], None]
+"""Hears often, while a run is on, where it stands."""
 
 
 def given_up(collected: Collected) -> str | None:

@@ -14,7 +14,8 @@ import zenoh
 from palpate_bus.contract import Contract
 from palpate_bus.runs.joining import BusTarget, NoBus, find
 from palpate_bus.security.access import public
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, session
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire.zenoh_config import BusOptions, session
 
 FIND_S = 1.0
 """How long a tool waits for its links before it goes on with those that it has."""

@@ -1,4 +1,4 @@
-"""Services that are not what they were, to be found out by their references."""
+"""A controller that is not what it was, to be found out by its reference."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from palpate_control.service import create as create_control
 from palpate_models.scenario import Scenario
 
 
-def weaker(scenario: Scenario) -> Any:
+def create(scenario: Scenario) -> Any:
     """A controller that gives one part in a hundred less."""
     service = create_control(scenario)
     honest = service.step
@@ -18,13 +18,4 @@ def weaker(scenario: Scenario) -> Any:
         return out
 
     service.step = step  # type: ignore[method-assign]
-    return service
-
-
-def silent(scenario: Scenario) -> Any:
-    """An assessment that says nothing."""
-    from palpate_assessment.service import create
-
-    service = create(scenario)
-    service.step = lambda t, inbox: {}  # type: ignore[method-assign]
     return service

@@ -1,0 +1,44 @@
+"""`palpate scenarios` and `palpate topics`: what there is."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from palpate_bus.contract import contract
+from palpate_models.load import load_scenario, scenario_names
+
+WIDE = 160
+"""Columns of the table of topics, where the terminal has fewer or there is none."""
+
+
+def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False) -> None:
+    """List the scenarios that come with Palpate."""
+    if as_json:
+        print(json.dumps([load_scenario(name).model_dump(mode="json") for name in scenario_names()]))
+        return
+    table = Table("scenario", "lesions", "description", box=None)
+    for name in scenario_names():
+        scenario = load_scenario(name)
+        table.add_row(name, str(len(scenario.phantom.lesions)), scenario.description)
+    Console().print(table)
+
+
+def topics() -> None:
+    """Show the contract: every topic with type, rate, who writes and who reads it."""
+    table = Table("topic", "type", "producer", "period", "QoS", "hashed", "readers", box=None)
+    for topic in contract().topics.values():
+        table.add_row(
+            topic.name if topic.visibility == "public" else f"{topic.name} [dim]({topic.visibility})[/]",
+            topic.type.replace("/msg/", "/"),
+            topic.producer,
+            "latched" if topic.latched else f"{topic.period_ms} ms{' event' if topic.event else ''}",
+            topic.qos,
+            "yes" if topic.hashed else "",
+            ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking),
+        )
+    Console(width=max(WIDE, Console().width)).print(table)

@@ -1,0 +1,179 @@
+"""Processes of a run that its user starts: one that the run was told to leave out (`palpate run --without ROLE`, `palpate join`),
+and one that takes the place of a service that was stopped (`palpate run --wallclock --handover`, `palpate takeover`).
+
+The run writes places.json, with the command and the environment of each such role; a command of this module reads it and becomes
+that process. A debugger, or a program in another language, can do the same.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, NamedTuple, NoReturn
+
+import typer
+
+from palpate.command_line import refuse
+from palpate_bus import implementations
+from palpate_bus.contract import contract
+from palpate_bus.implementations import ChoiceError
+from palpate_bus.runs import announcement as runs
+from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_conductor.handover import ROLES
+
+FILE = "places.json"
+"""In the results folder of a run."""
+
+NameOrFile = Annotated[
+    str | None,
+    typer.Option("--service", metavar="NAME_OR_FILE", help="An installed implementation or a Python file; else the run's own."),
+]
+RunName = Annotated[str | None, typer.Option(help="Which run: its process id, or part of its name; by default the newest.")]
+
+
+class PlaceError(ValueError):
+    """A place that cannot be left out, joined or taken. Says why, and what can be done."""
+
+
+class ServicePlace(NamedTuple):
+    """A process that somebody else may start."""
+
+    command: tuple[str, ...]
+    environment: Mapping[str, str]
+    """What it is given beyond the environment of its user."""
+    awaited: bool
+    """Whether the run was told to leave it out; otherwise its place is kept when it stops."""
+
+
+@dataclass
+class Absent:
+    """Roles that a run waits for without starting them."""
+
+    roles: tuple[str, ...]
+    wait_s: float
+    """How long the run waits, by the wall clock, after all others are there."""
+    tell: Callable[[str], None]
+    """Hears where each is awaited and what joins it."""
+    _sentences: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = [name for name in contract().roles if name != "conductor"]
+        for role in self.roles:
+            if role not in known:
+                raise PlaceError(f"--without {role}: allowed are {', '.join(known)}")
+
+    def check(self, roles: Collection[str]) -> None:
+        """Raises PlaceError for one that this run does not have."""
+        for role in self.roles:
+            if role not in roles:
+                raise PlaceError(f"--without {role}: this run has no {role}, but {', '.join(roles)}")
+
+    def call(self, out: Path, places: Mapping[str, ServicePlace]) -> None:
+        """Says who is awaited."""
+        for role in self.roles:
+            given = places[role].environment
+            where = given.get("PALPATE_LISTEN") or given.get("PALPATE_ROUTER", "")
+            self._sentences[role] = (
+                f"{role} is awaited at {where} for {self.wait_s:.0f} s: "
+                f"palpate join {role} --run {out.name} (or any program with the environment in {out / FILE})"
+            )
+            self.tell(self._sentences[role])
+
+    def explain(self, failure: str) -> str:
+        """The failure of a run, with what would have joined those who never answered."""
+        if "no answer from" not in failure:
+            return failure
+        return f"{failure.rstrip()} {'; '.join(words for role, words in self._sentences.items() if role in failure)}"
+
+
+def write_places(out: Path, places: Mapping[str, ServicePlace]) -> None:
+    """Writes places.json into a results folder."""
+    rows = {role: place._asdict() for role, place in places.items()}
+    (out / FILE).write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+def read_places(run: runs.Run) -> dict[str, ServicePlace]:
+    """The places of a run; none when it started all its services itself and keeps no place."""
+    file = Path(run.out) / FILE
+    rows = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return {role: ServicePlace(tuple(row["command"]), row["environment"], row["awaited"]) for role, row in rows.items()}
+
+
+def place_to_join(role: str, run: runs.Run) -> ServicePlace:
+    """The place of a role that `run` was told to leave out. Raises PlaceError when it was not."""
+    awaited = {name: place for name, place in read_places(run).items() if place.awaited}
+    if not awaited:
+        raise PlaceError(f"run {run.name} started all its services itself; start one with `palpate run --without {role}`")
+    if role not in awaited:
+        raise PlaceError(f"run {run.name} does not wait for {role!r}, but for {', '.join(awaited)}")
+    return awaited[role]
+
+
+def place_to_take(role: str, run: runs.Run) -> ServicePlace:
+    """The place of a service of `run` that may change hands. Raises PlaceError when it may not."""
+    if role not in ROLES:
+        raise PlaceError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
+    if run.runtime != "wallclock":
+        raise PlaceError(f"run {run.name} is in {run.runtime}: services change hands in wall-clock runs only")
+    kept = {name: place for name, place in read_places(run).items() if not place.awaited}
+    if role not in kept:
+        raise PlaceError(f"run {run.name} keeps no places: start it with `palpate run --wallclock --handover 60`")
+    others = tuple(endpoint for name, endpoint in run.endpoints.items() if name != role)
+    bus = BusOptions(connect=others, router=run.router) if run.keys is None else run.options(role)
+    environment = {**kept[role].environment, **bus.to_env(), "ROS_DOMAIN_ID": str(run.domain)}  # it listens at a place of its own
+    return kept[role]._replace(environment=environment)
+
+
+def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[str, ...]:
+    """The words that start the process: those of the run, or those of the chosen implementation. Raises ChoiceError."""
+    if service is None:
+        return place.command
+    implementations.check(role, service)
+    word = str(Path(service).resolve()) if implementations.is_file(service) else service
+    return ("python", "-m", f"palpate_{role}", word)
+
+
+def live_run(name: str | None) -> runs.Run:
+    """The newest live run, or the newest that `name` means. Raises PlaceError that names those there are."""
+    found = runs.matching(name)
+    if not found:
+        there = ", ".join(run.name for run in runs.live()) or "none"
+        raise PlaceError(f"no run{f' {name}' if name else ''} is on; on this machine: {there}")
+    return found[-1]
+
+
+def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
+    """Replaces this process by another program; `environment` is added to this process's own."""
+    program = sys.executable if command[0] == "python" else command[0]
+    os.execvpe(program, [program, *command[1:]], {**os.environ, **environment})
+
+
+def join(
+    role: Annotated[str, typer.Argument(help="The role that the run was told to do without.")],
+    service: NameOrFile = None,
+    run: RunName = None,
+) -> NoReturn:
+    """Join a run that was started with --without ROLE; becomes that service."""
+    _enter(place_to_join, role, service, run)
+
+
+def takeover(
+    role: Annotated[str, typer.Argument(help=f"One of {', '.join(sorted(ROLES))}.")],
+    service: NameOrFile = None,
+    run: RunName = None,
+) -> NoReturn:
+    """Take the place of a service that was stopped, in a run with --wallclock --handover SECONDS; becomes that service."""
+    _enter(place_to_take, role, service, run)
+
+
+def _enter(find: Callable[[str, runs.Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
+    try:
+        place = find(role, live_run(run))
+        command = command_for(role, place, service)
+    except (PlaceError, ChoiceError) as error:
+        refuse(error)
+    become(command, place.environment)

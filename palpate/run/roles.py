@@ -1,0 +1,83 @@
+"""The roles of a run, which implementation the scenario chooses for each, and what each may know of the scenario."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from palpate_bus import implementations
+from palpate_bus.implementations import ChoiceError
+from palpate_models.load import dump_scenario, redacted
+from palpate_models.scenario import Scenario, Services
+
+WORKERS = ("robot", "tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
+OBSERVERS = ("dashboard", "recorder")
+KNOWS_PHANTOM = frozenset({"tissue"})
+NONE = "none"
+"""`services.tissue: none`: nothing plays the tissue, since what is examined is real."""
+RESULTS = ("report.json", "report.html", "map.png", "samples.csv", "evidence.npz", "bus.json", "recording.rrd")
+"""What the end of a run leaves in its folder, and the viewer's drawing; the recorder removes its own files."""
+
+ServiceChoices = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--service",
+        metavar="ROLE=NAME_OR_FILE",
+        help="Who plays a role: an installed implementation, or a Python file with create(scenario). Short for "
+        "--set services.ROLE=...; may be repeated.",
+    ),
+]
+
+
+def workers(scenario: Scenario) -> tuple[str, ...]:
+    """The roles that a run of this scenario cannot do without: all, except for the tissue where what is examined is real."""
+    return tuple(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE)
+
+
+def choice(scenario: Scenario, role: str) -> str:
+    """The implementation that the scenario names for a role."""
+    return str(getattr(scenario.services, role))
+
+
+def settings_of(options: Sequence[str]) -> list[str]:
+    """What `--service ROLE=NAME_OR_FILE` is short for. Raises ChoiceError for an option that names no role."""
+    settings = []
+    for option in options:
+        role, equals, name = option.partition("=")
+        if not equals or role not in Services.model_fields:
+            raise ChoiceError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {', '.join(Services.model_fields)}")
+        settings.append(f"services.{role}={json.dumps(name)}")
+    return settings
+
+
+def checked(scenario: Scenario) -> Scenario:
+    """The scenario with files of one's own by their absolute path, after all its choices were found to exist.
+
+    Raises ChoiceError that names the scenario, the field, its value and what is allowed.
+    """
+    services = {role: choice(scenario, role) for role in Services.model_fields}
+    for role, name in services.items():
+        if (role, name) == ("tissue", NONE):
+            continue
+        try:
+            implementations.check(role, name)
+        except ChoiceError as error:
+            raise ChoiceError(f"{scenario.name}: {error}") from error
+        if implementations.is_file(name):
+            services[role] = str(Path(name).resolve())
+    return scenario.model_copy(update={"services": Services(**services)})
+
+
+def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
+    """Makes the results folder and the scenario files; returns the file that each role may see."""
+    (out / "logs").mkdir(parents=True, exist_ok=True)
+    for name in RESULTS:  # of an earlier run in the same folder: nobody is to take them for this one's
+        (out / name).unlink(missing_ok=True)
+    full, exam = out / "scenario.yaml", out / "exam.yaml"
+    full.write_text(dump_scenario(scenario), encoding="utf-8")
+    exam.write_text(dump_scenario(redacted(scenario)), encoding="utf-8")
+    return {role: full if role in KNOWS_PHANTOM else exam for role in (*WORKERS, *OBSERVERS)}

@@ -1,8 +1,0 @@
-"""`python -m palpate_robot.backends.mujoco`: the robot as a process of its own."""
-
-from palpate_bus.run import main
-from palpate_models.load import load_scenario
-from palpate_robot.backends.mujoco.service import create
-
-if __name__ == "__main__":
-    main("robot", create, load_scenario)

@@ -1,0 +1,110 @@
+"""Which implementation plays a role: what the scenario may choose, what is refused, and what takes our service's place."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from palpate.command_line import EXIT_BAD_INPUT
+from palpate.commands import app_for
+from palpate.run.composed import load_services
+from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
+from palpate_bus import implementations
+from palpate_bus.implementations import ChoiceError, check, check_libraries, create, create_for, names
+from palpate_models.load import load_scenario
+from palpate_models.scenario import Scenario, Services
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "threshold_assessment.py"
+
+
+def chosen(*options: str) -> Scenario:
+    return checked(load_scenario("healthy", settings_of(options)))
+
+
+def test_every_role_has_a_choice_and_its_default_is_installed() -> None:
+    assert set(Services.model_fields) == {*WORKERS, *OBSERVERS}
+    scenario = chosen()
+    for role in Services.model_fields:
+        assert choice(scenario, role) in names(role)
+    assert names("robot") == ("dart", "lbr", "mujoco")
+    assert names("tissue") == ("elastic", "fmu", "winkler")
+    assert names("camera") == ("kinect", "replay", "ros")
+
+
+@pytest.mark.parametrize("option", ["assessment", "nobody=a.py", "conductor=a.py"])
+def test_a_role_that_is_none_is_named(option: str) -> None:
+    with pytest.raises(ChoiceError, match=rf"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of robot, tissue"):
+        settings_of([option])
+
+
+def test_a_name_that_is_none_is_refused_with_scenario_field_value_and_what_is_allowed() -> None:
+    with pytest.raises(ChoiceError, match=r"healthy: services\.robot = 'bullet': want one of dart, lbr, mujoco, or the path"):
+        chosen("robot=bullet")
+    with pytest.raises(ChoiceError, match=r"services\.robot = 'none'"):
+        chosen("robot=none")
+    assert chosen("tissue=none").services.tissue == "none"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "there is no such file"),
+        ("", "no function create"),
+        ("def create(:", "is not Python"),
+        ("x = 1", "no function create"),
+    ],
+)
+def test_a_file_that_is_no_service_is_refused(tmp_path: Path, text: str | None, said: str) -> None:
+    file = tmp_path / "mine.py"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(ChoiceError, match=said):
+        chosen(f"assessment={file}")
+
+
+@pytest.mark.parametrize("words", [["run"], ["run", "--composed"]])
+def test_nothing_starts_with_a_service_that_there_is_not(words: list[str], tmp_path: Path) -> None:
+    called = CliRunner().invoke(app_for("run"), [*words, "--service", "robot=bullet", "--out", str(tmp_path / "out")])
+    assert called.exit_code == EXIT_BAD_INPUT
+    assert "services.robot = 'bullet'" in called.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_takes_the_place_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(EXAMPLE.parent)
+    scenario = chosen(f"assessment={EXAMPLE.name}")
+    assert scenario.services.assessment == str(EXAMPLE)
+    (service,) = load_services(scenario, ("assessment",))
+    assert type(service).__name__ == "Threshold"
+
+
+def test_a_file_may_import_what_is_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "beside_mine.py").write_text(EXAMPLE.read_text(encoding="utf-8"))
+    (tmp_path / "mine.py").write_text("from beside_mine import create\n")
+    assert create("assessment", str(tmp_path / "mine.py"), load_scenario("healthy")).role == "assessment"
+
+
+def test_a_service_of_another_role_is_refused() -> None:
+    with pytest.raises(ChoiceError, match=r"makes a service of the role 'assessment'"):
+        create("planning", str(EXAMPLE), load_scenario("healthy"))
+
+
+def test_a_missing_library_is_named_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> None:
+        raise PackageNotFoundError(name)
+
+    def fails(_: object) -> None:
+        raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
+
+    check_libraries("robot", "mujoco")
+    monkeypatch.setattr(implementations, "distribution", absent)
+    monkeypatch.setattr("importlib.metadata.EntryPoint.load", fails)
+    check("robot", "mujoco")
+    said = r"services\.robot = 'mujoco': the module mujoco is not installed; pip install 'palpate\[robot-mujoco\]'"
+    with pytest.raises(ChoiceError, match=said):
+        check_libraries("robot", "mujoco")
+    with pytest.raises(ChoiceError, match=said):
+        create_for("robot", "mujoco")
