@@ -7,7 +7,7 @@ import pytest
 
 from palpate_validation import dart_bodies, elastic, flex, hertz
 from palpate_validation.check import Section
-from palpate_validation.dart_scene import Box, DartScene, Ellipsoid, Flesh
+from palpate_validation.dart_scene import DartScene, Ellipsoid, Flesh, SoftBox
 from palpate_validation.twins import box_surface, ellipsoid_edges, ellipsoid_surface, graph_laplacian, twin
 
 
@@ -26,7 +26,7 @@ def test_sneddon_is_hertz_where_it_is_shallow() -> None:
     assert 0.93 < hertz.sneddon_force(0.010, 0.02) / float(hertz.hertz_force(0.010, 0.02)) < 0.96
 
 
-SMALL = Flesh(Box((0.06, 0.06, 0.03), (13, 13, 3)), k_v=4.25, k_e=0.0, damping=0.6, mass=0.02)
+SMALL = Flesh(SoftBox((0.06, 0.06, 0.03), (13, 13, 3)), k_v=4.25, k_e=0.0, damping=0.6, mass=0.02)
 DEPTHS = np.array((0.004,))
 
 
@@ -47,7 +47,7 @@ def test_dart_bodies() -> None:
 
 
 def test_twins_have_darts_vertices() -> None:
-    box, ellipsoid = Box((0.1, 0.08, 0.05), (5, 6, 4)), Ellipsoid((0.3, 0.2, 0.1), 7, 9)
+    box, ellipsoid = SoftBox((0.1, 0.08, 0.05), (5, 6, 4)), Ellipsoid((0.3, 0.2, 0.1), 7, 9)
     for (points, normals), shape in ((box_surface(box), box), (ellipsoid_surface(ellipsoid), ellipsoid)):
         assert len(points) == len(normals) == shape.vertices
         assert len(np.unique(points.round(9), axis=0)) == shape.vertices
@@ -60,7 +60,7 @@ def test_twins_have_darts_vertices() -> None:
 
 def test_a_twin_under_one_vertex_is_one_spring() -> None:
     """A tiny dent in a body without edges: only the middle vertex moves, with k_v."""
-    flesh = Flesh(Box((0.06, 0.06, 0.03), (13, 13, 3)), k_v=5.0, k_e=0.0, damping=0.5, mass=0.02)
+    flesh = Flesh(SoftBox((0.06, 0.06, 0.03), (13, 13, 3)), k_v=5.0, k_e=0.0, damping=0.5, mass=0.02)
     assert dart_bodies.press_ours(flesh, np.array((2e-4,))).force[0] == pytest.approx(5.0 * 2e-4, rel=1e-3)
     assert len(twin(flesh).model.vertices) == flesh.shape.vertices
 
