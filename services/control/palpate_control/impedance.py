@@ -93,8 +93,8 @@ class ImpedanceController:
         self._friction = (model.viscous_friction, model.coulomb_friction, model.velocity_limit)
         self._designed_for: Setpoint | None = None
         self._design_age = 0
-        self._cartesian_gains = CartesianGains(*np.zeros((2, 6)), *np.zeros((2, DOF)), np.zeros((DOF, 6)))
-        self._joint_gains = JointGains(*np.zeros((2, DOF, DOF)))
+        self._cartesian_gains = CartesianGains(np.zeros(6), np.zeros(6), np.zeros(DOF), np.zeros(DOF), np.zeros((DOF, 6)))
+        self._joint_gains = JointGains(np.zeros((DOF, DOF)), np.zeros((DOF, DOF)))
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
