@@ -94,7 +94,7 @@ class ImpedanceController:
         self._designed_for: Setpoint | None = None
         self._design_age = 0
         self._cartesian_gains = CartesianGains(np.zeros(6), np.zeros(6), np.zeros(DOF), np.zeros(DOF), np.zeros((DOF, 6)))
-        self._joint_gains = JointGains(*np.zeros((2, DOF, DOF)))
+        self._joint_gains = JointGains(np.zeros((DOF, DOF)), np.zeros((DOF, DOF)))
 
     def reset(self) -> None:
         """Starts the rate limit from zero torque: nothing has been commanded of late."""
