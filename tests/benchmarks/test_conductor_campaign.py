@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 from conductor_messages import collected, result
 
-from palpate_benchmarks.campaign import COMPLETE, WENT_ON, Case, CaseOver, Finding, _conclude, _Watch
+from palpate_benchmarks.campaign import COMPLETE, WENT_ON, CaseOver, FaultCase, FaultFinding, _conclude, _Watch
 from palpate_benchmarks.campaign_tables import markdown
 from palpate_bus.messages import ExamState
 from palpate_conductor.result import RunProgress
 
 
 def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
-    struck = Finding("nan", where, "lockstep", injected_s=0.0)
+    struck = FaultFinding("nan", where, "lockstep", injected_s=0.0)
     local: Any = SimpleNamespace(running={})
-    return _Watch(Case("nan", where, False), local, target, struck, since=1e12)
+    return _Watch(FaultCase("nan", where, False), local, target, struck, since=1e12)
 
 
 def in_phase(phase: int, message: str = "") -> RunProgress:
@@ -58,8 +58,8 @@ def test_an_end_that_names_nobody_is_bad() -> None:
 
 
 def test_the_page_sums_up_and_marks_what_is_bad() -> None:
-    fine = Finding("kill", "robot", "lockstep", 8.0, 20.0, "robot lost", "run ended", 5.0, 5.5, "robot lost", True)
-    slow = Finding("kill", "tissue", "lockstep", 8.0, 40.0, "tissue lost", "run ended", 5.0, 26.0, "tissue lost", True)
+    fine = FaultFinding("kill", "robot", "lockstep", 8.0, 20.0, "robot lost", "run ended", 5.0, 5.5, "robot lost", True)
+    slow = FaultFinding("kill", "tissue", "lockstep", 8.0, 40.0, "tissue lost", "run ended", 5.0, 26.0, "tissue lost", True)
     page = markdown([fine, slow])
     assert "1 of 2 as they should be; the largest force was 26.0 N." in page
     assert "| lockstep | kill | 2 | 1 | 2 | 30, 40 | 26.0 | run ended 2 |" in page

@@ -13,7 +13,7 @@ from PIL import Image
 
 from palpate.report.archive import Evidence, completed
 from palpate_reproduction import figures
-from palpate_reproduction.render import BACKGROUND, Body, View, picture
+from palpate_reproduction.render import BACKGROUND, Body, Viewpoint, picture
 from palpate_reproduction.reproduction import chosen_moments
 
 
@@ -25,7 +25,7 @@ def square(z: float, color: tuple[float, float, float], half: float = 1.0) -> Bo
 
 
 def test_a_picture_shows_what_is_nearest_lit_from_above_with_its_shadow() -> None:
-    view = View((0.0, -0.01, 4.0), (0.0, 0.0, 0.0), 40.0)
+    view = Viewpoint((0.0, -0.01, 4.0), (0.0, 0.0, 0.0), 40.0)
     image = picture([square(0.0, (200, 0, 0)), square(0.5, (0, 200, 0), 0.2)], view, 80, 80).astype(int)
     assert tuple(image[0, 0]) == BACKGROUND
     assert image[40, 40].argmax() == 1  # the green one lies above

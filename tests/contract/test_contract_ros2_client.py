@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from palpate.check.live_rig import LiveRig
-from palpate.check.report import Report
-from palpate.check.rig import Settings
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import RigSettings
 from palpate.check.starting import started
 from palpate.check.suites.camera import plane
 from palpate.check.suites.robot import quiet
@@ -66,7 +66,7 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
     write_definitions(tmp_path / "definitions")
     port = free_port()
     where = f"tcp/127.0.0.1:{port}"
-    settings = Settings(load_scenario("rlq_guarding"), slack_ms=3000)
+    settings = RigSettings(load_scenario("rlq_guarding"), slack_ms=3000)
     with ExitStack() as stack:
         bus = stack.enter_context(session(BusOptions(mode="router", listen=(where,))))
         rigs = {}
@@ -75,7 +75,7 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
             stack.callback(rig.close)
             stack.enter_context(started(shlex.join([sys.executable, "-m", f"palpate_{role}"]), role, settings, where, 0))
         for role, rig in rigs.items():
-            rig.await_implementation(120, Report(role))
+            rig.await_implementation(120, ConformanceReport(role))
         words = [sys.executable, str(CLIENT), str(port), str(tmp_path / "definitions"), "--seconds", "150"]
         client = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         lines: list[str] = []

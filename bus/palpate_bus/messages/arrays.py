@@ -20,7 +20,7 @@ def fitted(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> 
     fractions for an integer field).
     """
     array: NDArray[Any]
-    if value.__class__ is np.ndarray and value.dtype is dtype and value.flags.c_contiguous:
+    if value.__class__ is np.ndarray and value.dtype == dtype and value.flags.c_contiguous:
         array = value
     else:
         array = np.asarray(value)

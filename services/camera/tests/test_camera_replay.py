@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.check.rig import Heard, ServiceRig, Settings
+from palpate.check.rig import HeardMessage, RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate.check.suites.camera import plane
 from palpate_bus.contract import MS, contract
@@ -23,15 +23,15 @@ SCENARIO = load_scenario("rlq_guarding")
 
 
 @pytest.fixture(scope="module")
-def seen() -> dict[str, list[Heard]]:
+def seen() -> dict[str, list[HeardMessage]]:
     """A burst of the simulated camera that looks at a level square, as the conformance suite puts it there."""
-    rig = ServiceRig(create_camera(SCENARIO), Settings(SCENARIO))
+    rig = ServiceRig(create_camera(SCENARIO), RigSettings(SCENARIO))
     rig.send("planning/camera_trigger", CameraTrigger(header(0), FRAMES))
     rig.run(0.1 * FRAMES + 0.5, {"sim/surface": plane(np.array(SCENARIO.camera.look_at_m))})
     return rig.log
 
 
-def record(folder: Path, log: dict[str, list[Heard]], topics: tuple[str, ...] = (IMAGE, INFO, POSE)) -> Path:
+def record(folder: Path, log: dict[str, list[HeardMessage]], topics: tuple[str, ...] = (IMAGE, INFO, POSE)) -> Path:
     recorder = RecorderService(folder)
     rows = contract().topics
     for topic in topics:
@@ -42,17 +42,17 @@ def record(folder: Path, log: dict[str, list[Heard]], topics: tuple[str, ...] = 
 
 
 @pytest.fixture(scope="module")
-def recording(seen: dict[str, list[Heard]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(seen: dict[str, list[HeardMessage]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("run") / "recording_mcap", seen)
 
 
 def test_it_conforms_to_the_role_camera(recording: Path) -> None:
-    report = check(ServiceRig(ReplayedCamera(open_recording(recording)), Settings(SCENARIO)))
+    report = check(ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO)))
     assert report.passed, [result for result in report.results if result.verdict == "failed"]
 
 
-def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: Path, seen: dict[str, list[Heard]]) -> None:
-    rig = ServiceRig(ReplayedCamera(open_recording(recording)), Settings(SCENARIO))
+def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: Path, seen: dict[str, list[HeardMessage]]) -> None:
+    rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
     rig.run(2.0, {})
     assert not rig.log[IMAGE], "nothing unasked"
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES + 1))
@@ -67,13 +67,13 @@ def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: P
     assert rig.last(POSE) == seen[POSE][-1].message
 
 
-def test_frames_differ_as_their_noise_does(seen: dict[str, list[Heard]]) -> None:
+def test_frames_differ_as_their_noise_does(seen: dict[str, list[HeardMessage]]) -> None:
     """Else the order would not be tested."""
     first, second = (np.asarray(heard.message.data) for heard in seen[IMAGE][:2])
     assert not np.array_equal(first, second)
 
 
-def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[Heard]], tmp_path: Path) -> None:
+def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[HeardMessage]], tmp_path: Path) -> None:
     folder = record(tmp_path / "recording_mcap", seen, (IMAGE, INFO))
     with pytest.raises(RecordingError, match="no message of tf_static"):
         ReplayedCamera(open_recording(folder))
