@@ -10,7 +10,7 @@ from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import header
 from palpate_models import lbr
 from palpate_models.load import ScenarioError, load_scenario
-from palpate_robot.backends.lbr.arm import ArmModel
+from palpate_robot.backends.lbr.arm import GravityModel
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_velocity_is_differentiated_without_much_lag(rig: Rig) -> None:
 
 
 def test_the_overlay_excludes_gravity(rig: Rig) -> None:
-    gravity = ArmModel(SCENARIO.robot).at(np.array(lbr.HOME)).gravity
+    gravity = GravityModel(SCENARIO.robot).at(np.array(lbr.HOME)).gravity
     assert np.abs(gravity).max() > 20.0
     assert np.abs(rig.port.torques[-1]).max() < 1.0
     assert np.abs(rig.plant.q - lbr.HOME).max() < 0.01

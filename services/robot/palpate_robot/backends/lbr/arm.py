@@ -24,7 +24,7 @@ overtaken."""
 
 
 @dataclass(frozen=True, slots=True)
-class Tool:
+class CarriedLoad:
     """Pose-dependent quantities that the driver needs."""
 
     gravity: Array
@@ -33,7 +33,7 @@ class Tool:
     """World's z axis in the F/T sensor's axes, shape (3,)."""
 
 
-class ArmModel:
+class GravityModel:
     """Gravity and the sensor's orientation."""
 
     def __init__(self, robot: Robot) -> None:
@@ -41,12 +41,12 @@ class ArmModel:
         self._data = self._model.createData()
         self._sensor = self._model.getFrameId("ft_sensor")
 
-    def at(self, q: Array) -> Tool:
+    def at(self, q: Array) -> CarriedLoad:
         """At joint positions q [rad], shape (7,)."""
         pin.forwardKinematics(self._model, self._data, q)
         rotation = pin.updateFramePlacement(self._model, self._data, self._sensor).rotation
         gravity = pin.computeGeneralizedGravity(self._model, self._data, q)
-        return Tool(np.array(gravity), rotation[2].copy())
+        return CarriedLoad(np.array(gravity), rotation[2].copy())
 
 
 class Arm:

@@ -97,7 +97,7 @@ class ClientCommandMode(IntEnum):
     TORQUE = 3
 
 
-class ControlMode(IntEnum):
+class FriControlMode(IntEnum):
     """KUKA::FRI::EControlMode."""
 
     POSITION_CONTROL_MODE = 0

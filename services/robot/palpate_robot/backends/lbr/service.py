@@ -28,7 +28,7 @@ from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
-from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, ArmModel
+from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, GravityModel
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort, ZenohPort
 from palpate_robot.driver import Cause, Command, Driver, Mode
@@ -58,7 +58,7 @@ class LbrService(Service):
         self._port = port
         self._inner = inner
         self._arm = Arm()
-        self._model = ArmModel(exam.robot)
+        self._model = GravityModel(exam.robot)
         self._driver = Driver(exam.limits.force_emergency_n)
         lbr_side = exam.robot.lbr
         self._emulated = lbr_side.emulated
