@@ -74,7 +74,7 @@ def limits(report: Report, deformation_mm: float, peak_ratio: float) -> list[Lim
         ),
         Limit(
             "sources of Gazebo have to be changed and built",
-            "wheels from a package index; `make run` on Python 3.11",
+            "wheels from a package index; `make run` on Python 3.11 to 3.13",
             "Makefile",
         ),
         Limit(

@@ -336,8 +336,8 @@ class Scenario(_Section):
         camera, tissue = info.data.get("camera"), info.data.get("tissue")
         if camera is not None and (services.camera == "replay") != (camera.recording is not None):
             raise ValueError("services.camera: replay needs camera.recording: FILE, and camera.recording needs it")
-        if tissue is not None and tissue.fmu is not None and services.tissue != "fmu":
-            raise ValueError("tissue.fmu needs services.tissue: fmu")
+        if tissue is not None and (tissue.fmu is not None or tissue.fmu_map is not None) and services.tissue != "fmu":
+            raise ValueError("tissue.fmu and tissue.fmu_map need services.tissue: fmu")
         return services
 
 

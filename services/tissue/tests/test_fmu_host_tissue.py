@@ -33,7 +33,8 @@ def scenario() -> Scenario:
 
 def chosen(scenario: Scenario, **fields: str) -> Scenario:
     """The scenario with an FMU as its tissue."""
-    return scenario.model_copy(update={"tissue": TissueChoice(implementation="fmu", **fields)})
+    services = scenario.services.model_copy(update={"tissue": "fmu"})
+    return scenario.model_copy(update={"tissue": TissueChoice(**fields), "services": services})
 
 
 class Playback:
@@ -133,5 +134,5 @@ def test_a_missing_file_is_said(scenario: Scenario) -> None:
 
 def test_a_file_without_the_choice_is_refused() -> None:
     for field in ("fmu", "fmu_map"):
-        with pytest.raises(ScenarioError, match=r"need tissue\.implementation: fmu"):
+        with pytest.raises(ScenarioError, match=r"need services\.tissue: fmu"):
             load_scenario("rlq_guarding", (f"tissue.{field}=x",))
