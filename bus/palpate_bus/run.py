@@ -77,7 +77,7 @@ def main(role: str, load: Callable[[str], NamesServices]) -> None:
 def chosen(role: str, load: Callable[[str], NamesServices], words: Sequence[str] = ()) -> Service:
     """The service of `role` that the first word names, or else the scenario. Raises BusConfigError, ChoiceError."""
     scenario = load(str(Settings.read().required("scenario", "want a scenario file, as `palpate prepare` writes it")))
-    return create(role, words[0] if words else getattr(scenario.services, role), scenario)
+    return create(role, words[0] if words else getattr(scenario.services, role, "default"), scenario)
 
 
 def run_service(role: str, make: Callable[[], Service], transport: Callable[[zenoh.Session], Transport] = Transport) -> None:

@@ -297,8 +297,10 @@ class TissueChoice(_Section):
 
 class Services(_Section):
     """Which implementation plays each role: the name of an entry point in the group `palpate.<role>`, or the path of a Python
-    file that has `create(scenario)`.
+    file that has `create(scenario)`. A role that the contract has besides these is a field, too, by default `default`.
     """
+
+    model_config = ConfigDict(extra="allow")
 
     robot: str = "dart"
     """`dart`, `mujoco`, or `lbr` for the real arm (wall clock only)."""

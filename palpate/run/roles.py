@@ -10,12 +10,14 @@ from typing import Annotated
 import typer
 
 from palpate_bus import implementations
+from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
 from palpate_models.load import dump_scenario, redacted
 from palpate_models.scenario import Scenario, Services
 
-WORKERS = ("robot", "tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
-OBSERVERS = ("dashboard", "recorder")
+_ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
+WORKERS = tuple(name for name, role in _ROLES.items() if not role.observer)
+OBSERVERS = tuple(name for name, role in _ROLES.items() if role.observer)
 KNOWS_PHANTOM = frozenset({"tissue"})
 NONE = "none"
 """`services.tissue: none`: nothing plays the tissue, since what is examined is real."""
@@ -40,7 +42,7 @@ def workers(scenario: Scenario) -> tuple[str, ...]:
 
 def choice(scenario: Scenario, role: str) -> str:
     """The implementation that the scenario names for a role."""
-    return str(getattr(scenario.services, role))
+    return str(getattr(scenario.services, role, "default"))
 
 
 def settings_of(options: Sequence[str]) -> list[str]:
@@ -48,8 +50,8 @@ def settings_of(options: Sequence[str]) -> list[str]:
     settings = []
     for option in options:
         role, equals, name = option.partition("=")
-        if not equals or role not in Services.model_fields:
-            raise ChoiceError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {', '.join(Services.model_fields)}")
+        if not equals or role not in _ROLES:
+            raise ChoiceError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {', '.join(_ROLES)}")
         settings.append(f"services.{role}={json.dumps(name)}")
     return settings
 
@@ -59,7 +61,10 @@ def checked(scenario: Scenario) -> Scenario:
 
     Raises ChoiceError that names the scenario, the field, its value and what is allowed.
     """
-    services = {role: choice(scenario, role) for role in Services.model_fields}
+    services = {role: choice(scenario, role) for role in _ROLES}
+    for role in scenario.services.model_extra or {}:
+        if role not in _ROLES:
+            raise ChoiceError(f"{scenario.name}: services.{role}: the contract has no such role; it has {', '.join(_ROLES)}")
     for role, name in services.items():
         if (role, name) == ("tissue", NONE):
             continue
@@ -69,7 +74,7 @@ def checked(scenario: Scenario) -> Scenario:
             raise ChoiceError(f"{scenario.name}: {error}") from error
         if implementations.is_file(name):
             services[role] = str(Path(name).resolve())
-    return scenario.model_copy(update={"services": Services(**services)})
+    return scenario.model_copy(update={"services": Services.model_validate(services)})
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
