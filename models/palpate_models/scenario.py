@@ -203,7 +203,7 @@ class Robot(_Section):
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Mass below the F/T sensor: stand-off and indenter."""
     base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 1.17
-    """Height of the base. The three defaults of its placement are what `python -m palpate_models.placement` finds best."""
+    """Height of the base. The three defaults of its placement are what `python -m palpate_models.placement_base` finds best."""
     base_xy_m: Vec2 = (0.03, 0.02)
     """Where the base stands in world."""
     base_yaw_rad: float = 0.0

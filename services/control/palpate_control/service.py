@@ -98,7 +98,7 @@ class ControlService(Service):
         # The law compares the reference with a measurement, so it takes that of the same moment. With the present one a late
         # state would look like an error that grows with the speed, and wind the spring up: 17 mrad after 20 ms at 0.86 rad/s.
         followed = max(measured, t - self._setpoint_expiry)
-        for message in inbox.new(TOPIC):
+        for message in inbox.new("planning/setpoint"):
             self._take(message, t)
         while self._coming and self._coming[0].stamp <= followed:
             self._reference.accept(self._coming.popleft(), followed)
