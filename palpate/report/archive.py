@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected
+from palpate_models.frames import Array
 
 FILE: Final = "evidence.npz"
 _MESSAGES: Final = {
@@ -28,7 +29,6 @@ _MESSAGES: Final = {
     "targets": "palpation_msgs/msg/PalpationTargets",
 }
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

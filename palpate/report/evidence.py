@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from palpate.report.scoring import Map, Truth
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

@@ -17,13 +17,11 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 from matplotlib.tri import Triangulation
-from numpy.typing import NDArray
 
 from palpate.report.evidence import Samples, map_of
 from palpate.report.scoring import Map, TrueSurface, Truth
 from palpate_models.band import half_width
-
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 INK = "#1b2a33"
 QUIET = "#6b7a83"

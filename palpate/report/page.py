@@ -14,13 +14,12 @@ from typing import Any, Final
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from palpate.report import page_figures, page_surface
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
 from palpate.report.results import FindingRow, Report
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import ScenarioError, exam_input, load_scenario
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import Scenario
@@ -33,8 +32,6 @@ QUADRANTS: Final = {
     "LLQ": "left lower quadrant",
 }
 _PERCENT: Final = 100.0
-
-Array = NDArray[np.float64]
 
 
 def read_report(folder: Path) -> Report:

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from palpate.report.archive import Evidence
 from palpate.report.evidence import truth_of
@@ -27,8 +26,7 @@ from palpate.report.figures import (
 )
 from palpate_bus.messages import ExamState
 from palpate_models.band import half_width
-
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
 
 MEASURED: Final = "#c2410c"
 TRUE: Final = "#7c3aed"

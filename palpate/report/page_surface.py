@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from palpate.report.evidence import map_of
 from palpate.report.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS
 from palpate_models.band import half_width
+from palpate_models.frames import Array
 
-Array = NDArray[np.float64]
 MAX_VERTICES = 65_535
 """The viewer's indices have 16 bits."""
 _UNKNOWN = 0.80

@@ -14,7 +14,8 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import Delaunay, cKDTree
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
+
 IntArray = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 

@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_models.frames import Array
 from palpate_models.scenario import Camera
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

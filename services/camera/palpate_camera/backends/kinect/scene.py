@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from palpate_camera.backends.kinect.open3d_loader import open3d
 from palpate_camera.backends.kinect.pinhole import Pinhole
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Triangles = NDArray[np.uint32]
 

@@ -15,8 +15,8 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera.backends.kinect import surroundings
 from palpate_camera.backends.kinect.noise import KinectNoise
 from palpate_camera.backends.kinect.pinhole import Pinhole
-from palpate_camera.backends.kinect.scene import Array, Caster, Image, Mesh, Scene
-from palpate_models.frames import look_at, matrix
+from palpate_camera.backends.kinect.scene import Caster, Image, Mesh, Scene
+from palpate_models.frames import Array, look_at, matrix
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
 

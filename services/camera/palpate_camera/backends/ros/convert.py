@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from palpate_models.frames import Array
+
 Depth = NDArray[np.float32]
 
 ENCODINGS = {"16UC1": 2, "mono16": 2, "32FC1": 4}

@@ -16,7 +16,8 @@ from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_camera.backends.ros.convert import Array, CameraError, chain, depth_metres
+from palpate_camera.backends.ros.convert import CameraError, chain, depth_metres
+from palpate_models.frames import Array
 from palpate_models.scenario import RosCamera, Scenario
 
 FRAME = "camera_depth_optical_frame"
