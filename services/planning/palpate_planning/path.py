@@ -100,6 +100,13 @@ class SurfacePath:
         return SpeedLimit(self.s, allowed, 0.7 * ACCELERATION)
 
 
+def compile_ahead() -> None:
+    """Compiles what `SurfacePath.at` calls, so that no deadline waits for it."""
+    R = np.stack((np.eye(3), np.eye(3)))
+    first = np.zeros(1, np.int64)
+    SurfacePath(np.array((0.0, 1.0)), np.zeros((2, 3)), -R[:, :, 2], R, np.zeros((2, 7)), first, first).at(0.0)
+
+
 @compiled
 def _along(curve: CubicPieces, s: float) -> tuple[Array, Array, Array, Array]:
     """Interpolated values and their derivatives at path length s, shape (16,); orientation (3, 3) and its turn [rad/m] (3,)."""

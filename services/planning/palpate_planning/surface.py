@@ -105,14 +105,14 @@ class PerceivedSurface:
         Fixed point: slide the foot by the tangential part of what separates it from c. Converges at the rate of distance
         over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
         """
-        R_WA, p_WA = self._X_WA[:3, :3], self._X_WA[:3, 3]
-        p_A, n_A, distance = foot(self._field.spline, R_WA.T @ (c_W - p_WA))
-        return R_WA @ (p_A + self.offset * n_A) + p_WA, R_WA @ n_A, distance - self.offset
+        return foot(self._field.spline, self._X_WA, self.offset, np.ascontiguousarray(c_W))
 
 
 @compiled
-def foot(field: BicubicSpline, c_A: Array) -> tuple[Array, Array, float]:
-    """`PerceivedSurface.nearest` in frame A for an offset of zero."""
+def foot(field: BicubicSpline, X_WA: Array, offset: float, c_W: Array) -> tuple[Array, Array, float]:
+    """`PerceivedSurface.nearest` from the parts of the surface."""
+    R_WA, p_WA = X_WA[:3, :3].copy(), X_WA[:3, 3]
+    c_A = (c_W - p_WA) @ R_WA
     xy_A = c_A[:2]
     p_A, n_A, distance = c_A, c_A, 0.0
     for _ in range(ITERATIONS):
@@ -126,4 +126,4 @@ def foot(field: BicubicSpline, c_A: Array) -> tuple[Array, Array, float]:
         if size < CONVERGED_M:
             break
         xy_A = xy_A + min(1.0, STRIDE_M / size) * slide
-    return p_A, n_A, distance
+    return R_WA @ (p_A + offset * n_A) + p_WA, R_WA @ n_A, distance - offset
