@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped
 from palpate_bus.messages.geometry import transform_message
@@ -29,9 +28,10 @@ class FrameTree:
 
     def message(self, t: int, q: Iterable[float]) -> TFMessage:
         """The tree at joint positions `q` [rad], shape (7,), stamped `t` [ns]."""
-        turns = Rotation.from_rotvec(np.array(q, np.float64)[:, None] * _AXES)
+        half = 0.5 * np.array(q, np.float64)[:, None]
+        turns = np.hstack((np.sin(half) * _AXES, np.cos(half)))  # unit quaternions (x, y, z, w), shape (7, 4)
         transforms = self._transforms.copy()
-        for i, turn in enumerate(turns.as_quat(canonical=True).tolist(), _FIRST_JOINT):
+        for i, turn in enumerate(turns.tolist(), _FIRST_JOINT):
             transforms[i] = Transform(transforms[i].translation, Quaternion(*turn))
         return TFMessage(
             [

@@ -64,7 +64,7 @@ class ContactSensing:
         """The contact at a reading."""
         X_WI, R_WS = self._kinematics.poses(reading.q)
         p_W, n_W, distance = self.surface.nearest(X_WI[:3, 3])
-        velocity = (self._kinematics.jacobian(reading.q) @ reading.qd)[:3]
+        velocity = self._kinematics.jacobian(reading.q)[:3] @ reading.qd
         acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
         self._velocity = velocity
         force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ n_W)

@@ -19,6 +19,7 @@ from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.look import look_postures
 from palpate_planning.motion_planning import NoPathError
 from palpate_planning.palpation import Palpation, PalpationStep, StrokeStage
+from palpate_planning.path import compile_ahead
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
@@ -47,10 +48,13 @@ class ExamSequence:
         """`lockstep`: heavy planning takes exactly its simulated time; else at least that, and as long as it takes."""
         self._known, self._periods, self._lockstep = known, periods, lockstep
         self._kinematics = ArmKinematics(known.robot, known.limits)
+        plane = PerceivedSurface.plane(np.array(known.X_WA))
+        plane.nearest(np.zeros(3))  # compiles it ahead of any deadline
+        compile_ahead()
         self._sense = ContactSensing(
             self._kinematics,
             ToolWeight.of(known.robot),
-            PerceivedSurface.plane(np.array(known.X_WA)),
+            plane,
             known.robot.indenter_radius_m,
             periods.step_s,
         )

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from palpate_models import lbr
+from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_models.scenario import Limits
+from palpate_planning.compiled_splines import CubicPieces, cubic_at
 from palpate_planning.poses import angular_velocity, frame, least_twist
 from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import SpeedLimit
@@ -61,20 +63,18 @@ class SurfacePath:
         self.targets, self.visits = targets, s[visits]
         self.length = float(s[-1])
         self._order: tuple[list[float], list[int]] = self.visits.tolist(), targets.tolist()
-        self._curve = CubicSpline(s, np.hstack((p, n, R[:, :, 0], q)), bc_type="natural") if self.length else None
+        self._curve: CubicPieces | None = None
+        if self.length:
+            curve = CubicSpline(s, np.hstack((p, n, R[:, :, 0], q)), bc_type="natural")
+            self._curve = CubicPieces(curve.x, curve.c)
 
     def at(self, s: float) -> PathPoint:
         """The path at length s, clipped to its ends."""
         if self._curve is None:
             still = np.zeros(3)
             return PathPoint(self.p[0], self.n[0], self.R[0], self.q[0], dp=still, dn=still, w=still, dq=np.zeros(7))
-        s = min(max(s, 0.0), self.length)
-        y, dy = self._curve(s), self._curve(s, 1)
-        R, R_ahead = _orientation(y), _orientation(y + _STEP_M * dy)
-        return PathPoint(
-            p=y[:3], n=-R[:, 2], R=R, q=y[9:],
-            dp=dy[:3], dn=dy[3:6], w=angular_velocity(R, R_ahead, _STEP_M), dq=dy[9:],
-        )  # fmt: skip
+        y, dy, R, w = _along(self._curve, min(max(s, 0.0), self.length))
+        return PathPoint(p=y[:3], n=-R[:, 2], R=R, q=y[9:], dp=dy[:3], dn=dy[3:6], w=w, dq=dy[9:])
 
     def target(self, s: float) -> int:
         """Index of the target reached last at path length s, of the first before that."""
@@ -100,6 +100,22 @@ class SurfacePath:
         return SpeedLimit(self.s, allowed, 0.7 * ACCELERATION)
 
 
+def compile_ahead() -> None:
+    """Compiles what `SurfacePath.at` calls, so that no deadline waits for it."""
+    R = np.stack((np.eye(3), np.eye(3)))
+    first = np.zeros(1, np.int64)
+    SurfacePath(np.array((0.0, 1.0)), np.zeros((2, 3)), -R[:, :, 2], R, np.zeros((2, 7)), first, first).at(0.0)
+
+
+@compiled
+def _along(curve: CubicPieces, s: float) -> tuple[Array, Array, Array, Array]:
+    """Interpolated values and their derivatives at path length s, shape (16,); orientation (3, 3) and its turn [rad/m] (3,)."""
+    y, dy = cubic_at(curve, s)
+    R, R_ahead = _orientation(y), _orientation(y + _STEP_M * dy)
+    return y, dy, R, angular_velocity(R, R_ahead, _STEP_M)
+
+
+@compiled
 def _orientation(y: Array) -> Array:
     """Orientation from interpolated values of point, normal and x axis: z opposite to the normal, x near the x axis."""
     n = y[3:6]

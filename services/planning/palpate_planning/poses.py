@@ -7,8 +7,8 @@ point lies `depth` below the surface point p along the inward normal. Spin about
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 
+from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 
 
@@ -34,11 +34,12 @@ def least_twist(z_W: Array, R_ref: Array) -> Array:
     return np.stack((x, np.cross(z, x), z), axis=-1)
 
 
+@compiled
 def frame(z: Array, x_near: Array) -> Array:
     """The rotation, shape (3, 3), with unit z as its z axis and its x axis as near to x_near as it can be."""
     x = x_near - z * (z @ x_near)
     x = x / np.sqrt(x @ x)
-    return np.column_stack((x, pin.skew(z) @ x, z))
+    return np.column_stack((x, np.cross(z, x), z))
 
 
 def pose(R: Array, p: Array) -> Array:
@@ -49,6 +50,10 @@ def pose(R: Array, p: Array) -> Array:
     return X
 
 
+@compiled
 def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
-    """w_W [rad/s] that turns R0 into R1 in dt [s], shape (3,)."""
-    return np.asarray(pin.log3(R1 @ R0.T) / dt)
+    """w_W [rad/s] that turns R0 into R1 in dt [s], shape (3,), for turns of less than 90 degrees."""
+    turn = R1 @ R0.T
+    axis_by_sine = 0.5 * np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]))
+    sine = np.sqrt(axis_by_sine @ axis_by_sine)
+    return axis_by_sine * (np.arcsin(sine) / (sine * dt) if sine > 0.0 else 1.0 / dt)

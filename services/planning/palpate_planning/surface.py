@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NdBSpline, NearestNDInterpolator, make_interp_spline
 
+from palpate_models.compiled import compiled
 from palpate_models.frames import Array, apply, inverse
+from palpate_planning.compiled_splines import BicubicSpline, bicubic_at
 
 GRID_M = 0.004
 """Spacing of the grid on which the splines stand; finer than the perceived detail."""
@@ -30,12 +32,13 @@ class BicubicField:
         """`values`: height [m], slope along x, slope along y at the grid lines x (nx,) and y (ny,) [m], shape (nx, ny, 3)."""
         along_x = make_interp_spline(x, values, k=3, bc_type="clamped", axis=0)
         along_xy = make_interp_spline(y, along_x.c, k=3, bc_type="clamped", axis=1)
-        self._spline = NdBSpline((along_x.t, along_xy.t), along_xy.c.swapaxes(0, 1), 3)
+        self.spline = BicubicSpline(along_x.t, along_xy.t, np.ascontiguousarray(along_xy.c.swapaxes(0, 1)))
         self._low, self._high = np.array((x[0], y[0])), np.array((x[-1], y[-1]))
 
     def __call__(self, xy: Array) -> Array:
         """Height and slopes, shape (..., 3), at points of shape (..., 2). Outside the grid those of the nearest edge hold."""
-        return np.asarray(self._spline(np.minimum(np.maximum(xy, self._low), self._high)))
+        knots_x, knots_y, coefficients = self.spline
+        return np.asarray(NdBSpline((knots_x, knots_y), coefficients, 3)(np.clip(xy, self._low, self._high)))
 
 
 class PerceivedSurface:
@@ -102,18 +105,25 @@ class PerceivedSurface:
         Fixed point: slide the foot by the tangential part of what separates it from c. Converges at the rate of distance
         over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
         """
-        R_WA, p_WA = self._X_WA[:3, :3], self._X_WA[:3, 3]
-        c_A = R_WA.T @ (c_W - p_WA)
-        xy_A = c_A[:2]
-        for _ in range(ITERATIONS):
-            height, slope_x, slope_y = self._field(xy_A)
-            p_A = np.array((xy_A[0], xy_A[1], height))
-            n_A = np.array((-slope_x, -slope_y, 1.0)) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
-            gap = c_A - p_A
-            distance = float(gap @ n_A)
-            slide = (gap - distance * n_A)[:2]
-            size = float(np.abs(slide).max())
-            if size < CONVERGED_M:
-                break
-            xy_A = xy_A + min(1.0, STRIDE_M / size) * slide
-        return R_WA @ (p_A + self.offset * n_A) + p_WA, R_WA @ n_A, distance - self.offset
+        return foot(self._field.spline, self._X_WA, self.offset, np.ascontiguousarray(c_W))
+
+
+@compiled
+def foot(field: BicubicSpline, X_WA: Array, offset: float, c_W: Array) -> tuple[Array, Array, float]:
+    """`PerceivedSurface.nearest` from the parts of the surface."""
+    R_WA, p_WA = X_WA[:3, :3].copy(), X_WA[:3, 3]
+    c_A = (c_W - p_WA) @ R_WA
+    xy_A = c_A[:2]
+    p_A, n_A, distance = c_A, c_A, 0.0
+    for _ in range(ITERATIONS):
+        height, slope_x, slope_y = bicubic_at(field, xy_A[0], xy_A[1])
+        p_A = np.array((xy_A[0], xy_A[1], height))
+        n_A = np.array((-slope_x, -slope_y, 1.0)) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
+        gap = c_A - p_A
+        distance = gap @ n_A
+        slide = (gap - distance * n_A)[:2]
+        size = np.abs(slide).max()
+        if size < CONVERGED_M:
+            break
+        xy_A = xy_A + min(1.0, STRIDE_M / size) * slide
+    return R_WA @ (p_A + offset * n_A) + p_WA, R_WA @ n_A, distance - offset
