@@ -30,6 +30,7 @@ __all__ = [
     "type_hash",
 ]
 
+_LITTLE_ENDIAN = ENCAPSULATION[:2]
 Message = Any
 """A message of any class. Where the class is known, `palpate_bus.messages` has it with its fields."""
 
@@ -68,7 +69,7 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
 
     def decode(payload: bytes | memoryview) -> Message:
         try:
-            if own is None or payload[:2] != ENCAPSULATION[:2]:  # rosbags reads big-endian messages too
+            if own is None or payload[:2] != _LITTLE_ENDIAN:  # rosbags reads big-endian messages too
                 return store.deserialize_cdr(memoryview(payload), name)
             message, end = own.decode(bytes(payload))
             if not 0 <= len(payload) - end < 4:  # some encoders pad the end to a multiple of four

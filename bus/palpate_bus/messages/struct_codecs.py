@@ -44,11 +44,13 @@ _FLOAT64 = np.dtype(np.float64)
 
 _BYTE = Struct("<B")
 _LENGTH = Struct("<I")
-_HEADER = Struct("<4siII")  # encapsulation, seconds, nanoseconds, length of frame_id with its NUL
+_STAMP = Struct("<4siI")  # encapsulation, seconds, nanoseconds
+_HEADER = Struct("<4siII")  # the same and the length of frame_id with its NUL
 _WRENCH = Struct("<6d")  # force, torque
 _TOOL = Struct("<3d4d6dd")  # position, orientation, twist, radius
 _COMMAND = Struct("<56siII")  # torques, seconds and nanoseconds of valid_for, length of problem with its NUL
 _SETPOINT = Struct("<3d4d6d6d48s48s56s56s56siI")  # pose, twist, wrench, gains [6] x 2, joints [7] x 3, valid_for
+_JOINTS = {padding: Struct(f"<I{padding}x56sI4x56sI4x56s") for padding in (0, 4)}  # position, velocity, effort of seven joints
 _STATUS = Struct("<56s56s6d56sI")  # position, velocity, wrench, applied torque, commands rejected
 
 
@@ -59,16 +61,30 @@ def _padding(position: int, size: int) -> int:
 
 def _pack_header(header: Header, align: int) -> bytes:
     """Encapsulation and header, padded for a number of `align` bytes."""
-    frame = header.frame_id.encode() + b"\0"
-    data = _HEADER.pack(ENCAPSULATION, header.stamp.sec, header.stamp.nanosec, len(frame)) + frame
-    return data + bytes(_padding(len(data), align))
+    return _STAMP.pack(ENCAPSULATION, header.stamp.sec, header.stamp.nanosec) + _pack_frame(header.frame_id, align)
+
+
+@lru_cache(maxsize=64)
+def _pack_frame(frame_id: str, align: int) -> bytes:
+    """What follows the stamp of a header, padded for a number of `align` bytes. There are few frames."""
+    frame = frame_id.encode() + b"\0"
+    return _LENGTH.pack(len(frame)) + frame + bytes(_padding(_HEADER.size + len(frame), align))
 
 
 def _read_header(data: bytes, align: int) -> tuple[Header, int]:
     """The header, and the position of the number of `align` bytes that follows."""
     _, sec, nanosec, length = _HEADER.unpack_from(data)
-    frame, end = _read_text(data, _HEADER.size, length)
-    return Header(Time(sec, nanosec), frame), end + _padding(end, align)
+    frame, start = _read_frame(data[_STAMP.size : _HEADER.size + length], align)
+    return Header(Time(sec, nanosec), frame), start
+
+
+@lru_cache(maxsize=64)
+def _read_frame(block: bytes, align: int) -> tuple[str, int]:
+    """The frame whose length and text are `block`, and the position of the number of `align` bytes that follows the header."""
+    (length,) = _LENGTH.unpack_from(block)
+    frame, end = _read_text(block, _LENGTH.size, length)
+    end += _STAMP.size
+    return frame, end + _padding(end, align)
 
 
 def _read_text(data: bytes, start: int, length: int) -> tuple[str, int]:
@@ -128,8 +144,13 @@ def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
 def encode_joint_state(message: JointState) -> bytes:
     """`sensor_msgs/JointState`."""
     data = _pack_header(message.header, 4) + _pack_names(tuple(message.name))
-    for field, value in (("position", message.position), ("velocity", message.velocity), ("effort", message.effort)):
-        values = fitted(value, _FLOAT64, None, field)
+    position = fitted(message.position, _FLOAT64, None, "position")
+    velocity = fitted(message.velocity, _FLOAT64, None, "velocity")
+    effort = fitted(message.effort, _FLOAT64, None, "effort")
+    if position.size == velocity.size == effort.size == 7:
+        joints = _JOINTS[_padding(len(data) + _LENGTH.size, 8)]
+        return data + joints.pack(7, position.tobytes(), 7, velocity.tobytes(), 7, effort.tobytes())
+    for values in (position, velocity, effort):
         count = len(values)
         length = _LENGTH.pack(count)
         if count:  # an empty array has no padding
@@ -142,6 +163,12 @@ def decode_joint_state(data: bytes) -> tuple[JointState, int]:
     """`sensor_msgs/JointState`."""
     header, start = _read_header(data, 4)
     names, start = _read_names(data, start)
+    joints = _JOINTS[_padding(start + _LENGTH.size, 8)]
+    if len(data) - start == joints.size:
+        n, q, n_qd, qd, n_effort, effort = joints.unpack_from(data, start)
+        if n == n_qd == n_effort == 7:
+            state = JointState(header, names, np.frombuffer(q), np.frombuffer(qd), np.frombuffer(effort))
+            return state, len(data)
     position, start = _read_array(data, start)
     velocity, start = _read_array(data, start)
     effort, end = _read_array(data, start)
