@@ -1,6 +1,7 @@
 """ROS 2 messages to and from little-endian CDR with its four-byte encapsulation header.
 
-The types of the control loop have codecs of their own (`struct_codecs`); rosbags does the rest. The bytes are the same.
+The types of the control loop and the states of the examination have codecs of their own (`struct_codecs`, `exam_codecs`); rosbags
+does the rest. The bytes are the same.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.messages.arrays import array_dtype, fitted
-from palpate_bus.messages.struct_codecs import ENCAPSULATION, STRUCT_CODECS
+from palpate_bus.messages.cdr import ENCAPSULATION
+from palpate_bus.messages.exam_codecs import EXAM_CODECS
+from palpate_bus.messages.struct_codecs import STRUCT_CODECS
 from palpate_bus.messages.typestore import CodecError, message_type, palpation_definitions, store, type_hash
 
 __all__ = [
@@ -29,6 +32,9 @@ __all__ = [
     "store",
     "type_hash",
 ]
+
+_LITTLE_ENDIAN = ENCAPSULATION[:2]
+_STRUCT_CODECS = STRUCT_CODECS | EXAM_CODECS
 
 Message = Any
 """A message of any class. Where the class is known, `palpate_bus.messages` has it with its fields."""
@@ -48,7 +54,7 @@ def decode(payload: bytes | memoryview, name: str) -> Message:
 def encoder(name: str) -> Callable[[Message], bytes]:
     """`encode` for one type, for hot paths."""
     message_type(name)
-    own = STRUCT_CODECS.get(name)
+    own = _STRUCT_CODECS.get(name)
     encode_message = own.encode if own else _rosbags_encoder(name)
 
     def encode(message: Message) -> bytes:
@@ -64,11 +70,11 @@ def encoder(name: str) -> Callable[[Message], bytes]:
 def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
     """`decode` for one type, for hot paths."""
     message_type(name)
-    own = STRUCT_CODECS.get(name)
+    own = _STRUCT_CODECS.get(name)
 
     def decode(payload: bytes | memoryview) -> Message:
         try:
-            if own is None or payload[:2] != ENCAPSULATION[:2]:  # rosbags reads big-endian messages too
+            if own is None or payload[:2] != _LITTLE_ENDIAN:  # rosbags reads big-endian messages too
                 return store.deserialize_cdr(memoryview(payload), name)
             message, end = own.decode(bytes(payload))
             if not 0 <= len(payload) - end < 4:  # some encoders pad the end to a multiple of four

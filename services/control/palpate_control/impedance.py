@@ -31,7 +31,7 @@ import pinocchio as pin
 
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.model import DOF, ArmModel
-from palpate_control.reference import Reference
+from palpate_control.reference import QD, F, P, Q, Reference, V
 from palpate_control.safety import SafetyNet
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
@@ -90,10 +90,10 @@ class ImpedanceController:
         self.model = model
         self._net = SafetyNet(model.position_lower, model.position_upper, model.torque_limit, limit_zone, period_s)
         self._dead_time = DEAD_TICKS * period_s
-        self._friction = (model.viscous_friction, model.coulomb_friction, model.velocity_limit)
+        self._friction = np.stack((model.viscous_friction, model.coulomb_friction, model.velocity_limit))
         self._designed_for: Setpoint | None = None
         self._design_age = 0
-        self._cartesian_gains = CartesianGains(np.zeros(6), np.zeros(6), np.zeros(DOF), np.zeros(DOF), np.zeros((DOF, 6)))
+        self._cartesian_gains: Arrays = ()  # the fields of `CartesianGains`
         self._joint_gains = JointGains(np.zeros((DOF, DOF)), np.zeros((DOF, DOF)))
 
     def reset(self) -> None:
@@ -114,17 +114,18 @@ class ImpedanceController:
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
         """The torque that the law asks for in mode CARTESIAN [N m], shape (7,)."""
-        model, motion = self.model, reference.motion
+        model, (R_WD, x) = self.model, reference.motion
         model.update(q, qd)
         if self._outdated(reference.setpoint):
             setpoint = reference.setpoint  # copied: arrays of messages are read-only, which is another type to numba
             asked = (setpoint.stiffness.copy(), setpoint.damping_ratio.copy(), setpoint.joint_stiffness.copy())
             inertia, friction = model.inertia(q), model.viscous_friction
-            self._cartesian_gains = cartesian_gains(asked, motion.R_WD, model.J_W, inertia, friction, self._dead_time)
-        arm = (q, qd, model.p_WI, model.J_W, model.coriolis)
-        R_DI = motion.R_WD.T.dot(model.R_WI)
-        gains = tuple(self._cartesian_gains)
-        return cartesian_torque(arm, tuple(motion), pin.log3(R_DI), pin.Jlog3(R_DI), gains, self._friction)
+            self._cartesian_gains = tuple(cartesian_gains(asked, R_WD, model.J_W, inertia, friction, self._dead_time))
+        arm = (q, qd, model.p_WI, model.J_W, model.bias, model.gravity)
+        R_DI = R_WD.T.dot(model.R_WI)
+        gains, torque = self._cartesian_gains, np.empty(DOF)
+        cartesian_torque(arm, R_WD, x, pin.log3(R_DI), pin.Jlog3(R_DI), gains, self._friction, torque)
+        return torque
 
     def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
         """The torque that the law asks for in mode JOINT [N m], shape (7,)."""
@@ -148,41 +149,50 @@ class ImpedanceController:
         return True
 
 
-# The law is compiled, because it is most of a tick at 1 kHz; pinocchio's log3 and Jlog3 are called before it. What it takes comes
-# in plain tuples: numba reads them in half the time that it needs for named ones.
+# The law is compiled, because it is most of a tick at 1 kHz; pinocchio's log3 and Jlog3 are called before it. Each array that it
+# takes costs 0.1 us and one that it returned would cost 0.5 us, so some come as the rows or parts of one, and the result is
+# written into the last one. Plain tuples are read in half the time of named ones.
 
 
 @compiled
-def cartesian_torque(arm: Arrays, desired: Arrays, phi: Array, Jlog: Array, gains: Arrays, friction: Arrays) -> Array:
-    """Torque of mode CARTESIAN [N m], shape (7,), before limits.
+def cartesian_torque(
+    arm: Arrays, R_WD: Array, x: Array, phi: Array, Jlog: Array, gains: Arrays, friction: Array, torque: Array
+) -> None:
+    """The law of mode CARTESIAN, before limits.
 
     Args:
-        arm: q, qd, p_WI, J_W and C(q, qd) qd, as `ArmModel` evaluates them.
-        desired: the fields of `Motion`.
+        arm: q, qd, p_WI, J_W, C(q, qd) qd + gravity, and gravity, as `ArmModel` evaluates them.
+        R_WD: desired rotation of the indenter, shape (3, 3).
+        x: coordinates of the desired `Motion`, shape (39,).
         phi: rotation vector of R_DI [rad], shape (3,).
         Jlog: derivative of `phi` by a rotation in axes of I, shape (3, 3).
         gains: the fields of `CartesianGains`.
-        friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shapes (7,).
+        friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shape (3, 7).
+        torque: is set to the torque [N m], shape (7,).
     """
-    q, qd, p_WI, J, coriolis = arm
-    R_WD, p_WD, V_WD, F_W, q_0, qd_0, _ = desired
+    q, qd, p_WI, J, bias, gravity = arm
+    p_WD, V_WD, F_W, q_0, qd_0 = x[P], x[V], x[F], x[Q], x[QD]
     K, B, K_0, B_0, J_bar = gains
-    viscous, coulomb, velocity_limit = friction
+    viscous, coulomb, velocity_limit = friction[0], friction[1], friction[2]
 
-    p_error = np.clip(R_WD.T @ (p_WD - p_WI), -POSITION_CLIP_M, POSITION_CLIP_M)
-    R_error = np.clip(-phi, -ROTATION_CLIP_RAD, ROTATION_CLIP_RAD)
+    p_error = clip(R_WD.T @ (p_WD - p_WI), POSITION_CLIP_M)
+    R_error = clip(-phi, ROTATION_CLIP_RAD)
     V_error = to_axes(R_WD.T, V_WD - J @ qd)
     spring = np.concatenate((K[:3] * p_error, Jlog @ (K[3:] * R_error)))  # the gradient of 1/2 phi' K phi
-    F = to_axes(R_WD, spring + B * V_error) + F_W
+    force = to_axes(R_WD, spring + B * V_error) + F_W
 
     tau_0 = K_0 * (q_0 - q) + B_0 * (qd_0 - qd)
     null = tau_0 - J.T @ (J_bar.T @ tau_0)
     null *= NULL_TORQUE_NM / max(NULL_TORQUE_NM, np.abs(null).max())  # as a whole: so it stays in the null space
 
-    qd_d = qd_0 + J_bar @ (V_WD - J @ qd_0)
-    qd_d = np.minimum(np.maximum(qd_d, -velocity_limit), velocity_limit)
-    torque: Array = J.T @ F + null + coriolis + friction_torque(qd_d, viscous, coulomb)
-    return torque
+    qd_d = clip(qd_0 + J_bar @ (V_WD - J @ qd_0), velocity_limit)
+    torque[:] = J.T @ force + null + (bias - gravity) + friction_torque(qd_d, viscous, coulomb)
+
+
+@compiled
+def clip(x: Array, bound: Array | float) -> Array:
+    """`x` within plus and minus `bound`."""
+    return np.minimum(np.maximum(x, -bound), bound)
 
 
 @compiled
@@ -194,7 +204,7 @@ def friction_torque(qd: Array, viscous: Array, coulomb: Array) -> Array:
 @compiled
 def to_axes(R_AB: Array, x_B: Array) -> Array:
     """A twist or wrench at the same point, linear and angular part, shape (6,), from axes of B to those of A."""
-    return np.concatenate((R_AB @ x_B[:3], R_AB @ x_B[3:]))
+    return (x_B.reshape(2, 3) @ R_AB.T).ravel()
 
 
 @compiled

@@ -47,9 +47,7 @@ class ArmModel:
     def update(self, q: Array, qd: Array) -> None:
         """Evaluates the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (7,)."""
         model, data, frame = self._model, self._data, self._frame
-        pin.computeJointJacobians(model, data, q)  # also places the joints
-        pin.updateFramePlacement(model, data, frame)
-        self.J_W = pin.getFrameJacobian(model, data, frame, _AXES)
+        self.J_W = pin.computeFrameJacobian(model, data, q, frame, _AXES)  # also places the frame
         pin.nonLinearEffects(model, data, q, qd)
         self.update_gravity(q)
 

@@ -26,7 +26,7 @@ class SafetyNet:
         One torque comes every `period_s`.
         """
         gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)
-        self._joints = ((lower + upper) / 2, (upper - lower) / 2 - zone, gain, torque_limit)
+        self._joints = np.stack(((lower + upper) / 2, (upper - lower) / 2 - zone, gain, torque_limit))
         self._rate = TORQUE_RATE_NM * period_s / 1e-3
         self._last = np.zeros_like(torque_limit)
 
@@ -39,23 +39,24 @@ class SafetyNet:
 
         It and it plus `gravity` are within limits.
         """
-        safe = safe_torque(wanted, q, gravity, self._last, self._rate, self._joints)
-        self._last = np.array(safe, dtype=float)  # numba's array has a dtype that equals numpy's but is another: slow to encode
-        return self._last
+        safe = np.empty_like(self._last)
+        safe_torque(wanted, q, gravity, self._last, self._rate, self._joints, safe)
+        self._last = safe
+        return safe
 
 
 @compiled
-def safe_torque(wanted: Array, q: Array, gravity: Array, last: Array, rate: float, joints: tuple[Array, ...]) -> Array:
-    """The torque [N m], shape (7,), that pushes away from the joint limits, else is as `wanted`, within all limits.
+def safe_torque(wanted: Array, q: Array, gravity: Array, last: Array, rate: float, joints: Array, safe: Array) -> None:
+    """Sets `safe` [N m], shape (7,): it pushes away from the joint limits, else is as `wanted`, within all limits.
 
-    It is within the torque limits, also with `gravity` added, and within `rate` of `last` [N m]. `joints` are the middle of the
-    joints' ranges [rad], the angle from it at which the repulsion begins [rad], its gain [N m/rad^2] and the torque limits [N m].
+    It is within the torque limits, also with `gravity` added, and within `rate` of `last` [N m]. The rows of `joints` are the
+    middle of the joints' ranges [rad], the angle from it at which the repulsion begins [rad], its gain [N m/rad^2] and the torque
+    limits [N m].
     """
-    middle, free, gain, limit = joints
+    middle, free, gain, limit = joints[0], joints[1], joints[2], joints[3]
     off = q - middle
     depth = np.maximum(np.abs(off) - free, 0.0)
     repulsion = np.minimum(gain * depth**2, REPULSION_FRACTION * limit)
     low = np.maximum(np.maximum(-limit, -limit - gravity), last - rate)
     high = np.minimum(np.minimum(limit, limit - gravity), last + rate)
-    safe: Array = np.minimum(np.maximum(wanted - np.sign(off) * repulsion, low), high)
-    return safe
+    safe[:] = np.minimum(np.maximum(wanted - np.sign(off) * repulsion, low), high)

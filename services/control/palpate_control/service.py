@@ -117,7 +117,7 @@ class ControlService(Service):
             torque = self._controller.torque(joints.position, joints.velocity, reference)
         except ValueError as error:
             return self._reject_joints(t, str(error))
-        self._peak = np.maximum(self._peak, np.abs(torque))
+        np.maximum(self._peak, np.abs(torque), out=self._peak)
         self._torque, self._until = torque, t + self._validity
         return self._command(t, torque, self._valid)
 

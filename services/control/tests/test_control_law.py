@@ -221,7 +221,7 @@ def test_the_compiled_law_is_the_one_that_python_reads(arm: ArmModel, seed: int,
     twist, wrench = 0.1 * rng.normal(size=6), rng.normal(size=6)
     ref = reference(setpoint(arm, WORKING[seed], V_WD=twist, F_W=wrench, qd=0.1 * rng.normal(size=7)))
     compiled = ImpedanceController(arm).torque(q, qd, ref)
-    names = ("cartesian_torque", "cartesian_gains", "friction_torque", "to_axes")
+    names = ("cartesian_torque", "cartesian_gains", "friction_torque", "to_axes", "clip")
     for module, function in [(impedance, name) for name in names] + [(safety, "safe_torque")]:
         monkeypatch.setattr(module, function, getattr(module, function).py_func)
     np.testing.assert_allclose(ImpedanceController(arm).torque(q, qd, ref), compiled, rtol=1e-9, atol=1e-9)
