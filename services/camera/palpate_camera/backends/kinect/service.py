@@ -7,9 +7,11 @@ from typing import Any, ClassVar, Final
 from zlib import crc32
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from palpate_bus.messages.codec import Message, message_type
+from palpate_bus.messages import CameraInfo, RegionOfInterest, TFMessage, TransformStamped
+from palpate_bus.messages import Image as ImageMessage
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import transform_matrix, transform_message
 from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera.backends.kinect import surroundings
@@ -23,15 +25,6 @@ from palpate_models.scenario import ExamInput, Scenario
 FRAME = "camera_depth_optical_frame"
 ROBOT_TOLERANCE_M: Final = 1e-4
 """The arm's picture is kept while it trembles by less: it only hides, nobody measures it."""
-
-_CameraInfo: Any = message_type("sensor_msgs/msg/CameraInfo")
-_Image: Any = message_type("sensor_msgs/msg/Image")
-_Quaternion: Any = message_type("geometry_msgs/msg/Quaternion")
-_Region: Any = message_type("sensor_msgs/msg/RegionOfInterest")
-_Transform: Any = message_type("geometry_msgs/msg/Transform")
-_TransformStamped: Any = message_type("geometry_msgs/msg/TransformStamped")
-_TF: Any = message_type("tf2_msgs/msg/TFMessage")
-_Vector3: Any = message_type("geometry_msgs/msg/Vector3")
 
 
 class CameraService(Service):
@@ -55,7 +48,7 @@ class CameraService(Service):
 
     def start(self) -> Outbox:
         """The calibrated pose of the optical frame in world, latched."""
-        return {"tf_static": _TF([transform(0, "world", FRAME, self._X_WC_calibrated)])}
+        return {"tf_static": TFMessage([transform(0, "world", FRAME, self._X_WC_calibrated)])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """A frame with its intrinsics while a burst lasts; a new trigger replaces the burst that is under way."""
@@ -98,33 +91,24 @@ def surface_mesh(message: Message) -> Mesh:
 
 def link_poses(message: Message) -> dict[str, Array]:
     """X_WL, shape (4, 4), by link name."""
-    poses: dict[str, Array] = {}
-    for item in message.transforms:
-        p, q = item.transform.translation, item.transform.rotation
-        X = np.eye(4)
-        X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-        X[:3, 3] = p.x, p.y, p.z
-        poses[item.child_frame_id] = X
-    return poses
+    return {item.child_frame_id: transform_matrix(item.transform) for item in message.transforms}
 
 
 def transform(t: int, parent: str, child: str, X: Array) -> Message:
     """`geometry_msgs/TransformStamped` of a pose, shape (4, 4)."""
-    x, y, z, w = (float(value) for value in Rotation.from_matrix(X[:3, :3]).as_quat(canonical=True))
-    translation = _Vector3(*(float(value) for value in X[:3, 3]))
-    return _TransformStamped(header(t, parent), child, _Transform(translation, _Quaternion(x, y, z, w)))
+    return TransformStamped(header(t, parent), child, transform_message(X))
 
 
 def depth_image(t: int, image: Image) -> Message:
     """`sensor_msgs/Image` of encoding 32FC1 [m], little-endian, NaN where invalid."""
     height, width = image.shape
     data = np.ascontiguousarray(image, "<f4").view(np.uint8).reshape(-1)
-    return _Image(header(t, FRAME), height, width, "32FC1", 0, 4 * width, data)
+    return ImageMessage(header(t, FRAME), height, width, "32FC1", 0, 4 * width, data)
 
 
 def camera_info(t: int, pinhole: Pinhole) -> Message:
     """`sensor_msgs/CameraInfo` without distortion."""
     K = pinhole.matrix
     P = np.hstack((K, np.zeros((3, 1)))).ravel()
-    size, whole = (pinhole.height, pinhole.width), _Region(0, 0, 0, 0, False)
-    return _CameraInfo(header(t, FRAME), *size, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole)
+    size, whole = (pinhole.height, pinhole.width), RegionOfInterest(0, 0, 0, 0, False)
+    return CameraInfo(header(t, FRAME), *size, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole)
