@@ -1,4 +1,4 @@
-"""Renews the references of all services from one short examination: `python services/replay/tests/make_references.py`.
+"""Renews the references of all services from one short examination: `python tests/commands/make_references.py`.
 
 Needed after a change of a message type, or where the inputs themselves should change. When a service is meant to answer its old
 inputs in a new way, `palpate replay REFERENCE --service ROLE --update-refs REFERENCE` is enough.
