@@ -51,7 +51,7 @@ def _rotation(axis: Array, angle: float) -> Array:
 
 @compiled
 def _quaternion(R: Array) -> Array:
-    """Unit quaternion x, y, z, w, shape (4,), of a pose or rotation, by its largest part (Shepperd 1978, doi 10.2514/3.55767b)."""
+    """Unit quaternion x, y, z, w, shape (4,), by its largest part (Shepperd 1978, doi 10.2514/3.55767b); `R` may be a pose."""
     out = np.empty(4)
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace > 0.0:
@@ -82,7 +82,7 @@ def _placed(chain: Array, q: Array) -> Array:
 
 @compiled
 def _state(chain: Array, behind: Array, q: Array, v: Array) -> Array:
-    """See `Kinematics.state`. Where link k is behind joint i, `behind` (7, 7) has its mass [kg] in row i and column k, else zero."""
+    """See `Kinematics.state`. `behind` (7, 7) has in row i, column k the mass [kg] of link k if that is behind joint i, or 0."""
     placed = _placed(chain, q)
     p_WI, p_WL = placed[8, :3, _ORIGIN], placed[1:8, :3, _ORIGIN]
     axis, centre = np.ascontiguousarray(placed[1:8, :3, _AXIS]), np.ascontiguousarray(placed[2:, :3, _CENTRE])
