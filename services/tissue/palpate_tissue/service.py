@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from palpate_bus.contract import contract
 from palpate_bus.messages import IndentationTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import pose_message, vector, wrench_message
+from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import Array, apply, matrix
+from palpate_models.frames import Array, apply, inverse, matrix
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Pose
 from palpate_tissue.backend import TissueBackend
@@ -46,7 +46,13 @@ class TissueService(Service):
         self._surface = SkinSurface(truth)
         self._X_WA = matrix(pose)
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
+        self._R_AW = np.ascontiguousarray(self._R_WA.T)
         self._p_WA = self._X_WA[:3, 3].copy()
+        self._transposed_X_AW = np.ascontiguousarray(inverse(self._X_WA)[:3].T)
+        """Shape (4, 3): takes rows of homogeneous coordinates in world, of points (1) and vectors (0), to rows in A."""
+        self._vertices_W = np.ascontiguousarray(apply(self._X_WA, truth.vertices).T)
+        self._normals_W = self._R_WA @ truth.normals.T
+        """At rest, shape (3, n): with the long axis last numpy is several times faster."""
         self._triangles = truth.triangles.astype(np.uint32).ravel()
         self._p_A: Array = np.zeros(3)
         """The indenter's centre [m]."""
@@ -59,7 +65,7 @@ class TissueService(Service):
         """The truth about the phantom, latched; logs the facts."""
         truth = self._truth
         _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
-        surface = SurfaceMesh(header(0, "abdomen"), _flat(truth.vertices), _flat(truth.normals), self._triangles)
+        surface = SurfaceMesh(header(0, "abdomen"), _flat(truth.vertices.T), _flat(truth.normals.T), self._triangles)
         pose = pose_message(self._R_WA, self._p_WA)
         message = PhantomTruth(surface, truth.stiffness.copy(), truth.background.copy(), truth.lesion.copy(), pose)
         return {"truth/phantom": message}
@@ -97,11 +103,14 @@ class TissueService(Service):
         if tool is None:
             self._tissue.idle(t / NS)
             return np.zeros(6)
-        v_W, w_W = tool.twist.linear, tool.twist.angular
-        motion_W = np.array(((v_W.x, v_W.y, v_W.z), (w_W.x, w_W.y, w_W.z), vector(tool.pose.position) - self._p_WA))
-        v_A, w_A, self._p_A = motion_W @ self._R_WA  # each row times R_AW' = R_WA
+        p, v, w = tool.pose.position, tool.twist.linear, tool.twist.angular
+        motion_W = np.array((p.x, p.y, p.z, 1.0, v.x, v.y, v.z, 0.0, w.x, w.y, w.z, 0.0)).reshape(3, 4)
+        self._p_A, v_A, w_A = motion_W.dot(self._transposed_X_AW)  # `dot` takes a third of the time of `@`
         F_A = self._tissue.step(t / NS, self._p_A, v_A, float(tool.radius), w_A)
-        return (np.array(F_A) @ self._R_WA.T).ravel() if self._tissue.touching else np.zeros(6)
+        if not self._tissue.touching:
+            return np.zeros(6)
+        F_W: Array = np.array(F_A).dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
+        return F_W
 
     def _count(self, F_W: Array) -> None:
         """Counts the step and the force on the indenter."""
@@ -114,8 +123,9 @@ class TissueService(Service):
         self._touching = touching
 
     def _surface_message(self, t: int) -> Message:
-        vertices_W = apply(self._X_WA, self._tissue.deformed_vertices)
-        normals_W = (self._R_WA @ self._surface.normals(self._tissue.inward)).T
+        inward = self._tissue.inward
+        vertices_W = self._vertices_W - inward * self._normals_W
+        normals_W = self._R_WA @ self._surface.normals(inward)
         return SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_W), self._triangles)
 
     def _indentation(self, t: int, tool: Message | None, f_W: Array) -> Message:
@@ -137,5 +147,7 @@ class TissueService(Service):
         )
 
 
-def _flat(array: Array) -> NDArray[np.float32]:
-    return array.astype(np.float32).ravel()
+def _flat(vectors: Array) -> NDArray[np.float32]:
+    """The columns of an array of shape (3, n) one after the other, shape (3 n,)."""
+    x, y, z = vectors.astype(np.float32)
+    return np.stack((x, y, z), axis=1).ravel()

@@ -53,6 +53,7 @@ class SkinSurface:
     def __init__(self, model: PhantomModel) -> None:
         triangles = model.triangles.astype(np.uint32)
         self._skin = Skin(model.vertices, model.normals, model.breathing, model.stiffness, triangles)
+        self._normals = np.ascontiguousarray(model.normals.T)
         self._faces = _incident_faces(model)
         self._gradient = _gradient(model)
         self.nearest(model.vertices[0].copy())  # compiles it before it has a deadline
@@ -69,7 +70,7 @@ class SkinSurface:
 
         n + grad u, normalised. Exact for a plane, and otherwise to first order in u times curvature.
         """
-        tilted: Array = self._skin.normals.T + (self._gradient @ inward).reshape(3, -1)
+        tilted: Array = self._normals + (self._gradient @ inward).reshape(3, -1)
         tilted /= np.sqrt(np.einsum("ij,ij->j", tilted, tilted))
         return tilted
 

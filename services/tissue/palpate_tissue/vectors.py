@@ -11,9 +11,9 @@ Vector = tuple[float, float, float]
 
 
 @compiled
-def row(table: Array, k: int) -> Vector:
-    """Row `k` of an array of shape (n, 3)."""
-    return table[k, 0], table[k, 1], table[k, 2]
+def row(table: Array, k: int, first: int = 0) -> Vector:
+    """Three numbers of row `k` of an array, from column `first` on."""
+    return table[k, first], table[k, first + 1], table[k, first + 2]
 
 
 @compiled

@@ -336,16 +336,18 @@ def reference_step(wall, patch, motion, radius, excursion):
     """The step in numpy and scipy, from the equations of the README: u, y, contact forces f and the force on the sphere."""
     A = csr_array((wall.rate, wall.indices.astype(np.int32), wall.indptr.astype(np.int32)), shape=(len(wall.u),) * 2)
     u = wall.u + A @ (wall.u - wall.y.sum(axis=0))
-    d = motion[0] - patch.origin - patch.X
-    s = -(d * patch.n).sum(axis=1)
+    n, X, (beta, gain) = patch.table[:, :3], patch.table[:, 3:6], patch.table[:, 6:].T
+    d = motion[0] - X
+    s = -(d * n).sum(axis=1)
     half_chord = np.sqrt(np.maximum(radius**2 - (d**2).sum(axis=1) + s**2, 0.0))
-    w = np.where(half_chord > RIM * radius, s + half_chord + excursion * patch.beta, -np.inf)
+    w = np.where(half_chord > RIM * radius, s + half_chord + excursion * beta, -np.inf)
     gap = np.maximum(w - u[patch.vertex], 0.0)
     u[patch.vertex] += gap
-    f = patch.gain * gap
-    y = wall.decay[:, None] * wall.y + wall.feed[:, None] * u
-    inward_of_sphere = (d + s[:, None] * patch.n) / np.maximum(half_chord, 1e-9)[:, None]
-    return u, y, f, f @ (patch.n + inward_of_sphere)
+    f = gain * gap
+    decay, feed = wall.prony.T
+    y = decay[:, None] * wall.y + feed[:, None] * u
+    inward_of_sphere = (d + s[:, None] * n) / np.maximum(half_chord, 1e-9)[:, None]
+    return u, y, f, f @ (n + inward_of_sphere)
 
 
 def test_the_compiled_step_is_the_reference_step():

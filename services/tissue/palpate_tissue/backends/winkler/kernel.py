@@ -38,31 +38,28 @@ class Wall(NamedTuple):
     indices: Index
     rate: Array
     """A = -h C^-1 K, a matrix of shape (n, n) in CSR form."""
-    decay: Array
-    """e_k = exp(-h / tau_k), shape (b,)."""
-    feed: Array
-    """(1 - e_k) g_k, shape (b,)."""
+    prony: Array
+    """e_k = exp(-h / tau_k), and (1 - e_k) g_k, shape (b, 2)."""
     h: float
     """[s]"""
 
 
 class Patch(NamedTuple):
-    """Vertices that the sphere might hold while its centre stays near `origin`; m of them."""
+    """Vertices that the sphere might hold while its centre stays where it is; m of them.
 
-    origin: Array
-    """[m], shape (3,)."""
+    Compiled code takes a tenth of a microsecond to open an array at every step, so what never changes is one table.
+    """
+
     vertex: NDArray[np.uint32]
     """Which vertices, shape (m,)."""
-    n: Array
-    """Their outward normals, shape (m, 3)."""
-    X: Array
-    """Their positions from `origin` [m], shape (m, 3)."""
-    beta: Array
-    """Their share of the breathing excursion, shape (m,)."""
-    gain: Array
-    """C / h [N/m], shape (m,)."""
+    table: Array
+    """Of each the columns `_N`, `_X`, `_BETA` and `_GAIN`, shape (m, 8)."""
     f: Array
     """Their contact forces along the inward normals after the step [N], shape (m,). Changed in place."""
+
+
+_N, _X, _BETA, _GAIN = 0, 3, 6, 7
+"""Columns of a patch: outward normal (three), position (three) [m], share of the breathing excursion, and C / h [N/m]."""
 
 
 @compiled
@@ -116,25 +113,24 @@ def hold(wall: Wall, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bo
     f is the part along n, and the rest is borne by the tissue's guidance. As f holds the vertex exactly on the sphere, tool and
     field exchange the same work.
     """
-    u, R = wall.u, sphere.radius
-    p = subtract(sphere.p, (patch.origin[0], patch.origin[1], patch.origin[2]))
+    u, R, table = wall.u, sphere.radius, patch.table
     load = 0.0
     force = normal = moment = (0.0, 0.0, 0.0)
     for k in range(len(patch.vertex)):
         patch.f[k] = 0.0
-        i, n = patch.vertex[k], row(patch.n, k)
-        d = subtract(p, row(patch.X, k))
+        i, n = patch.vertex[k], row(table, k, _N)
+        d = subtract(sphere.p, row(table, k, _X))
         s = -dot(n, d)
         square = R * R - dot(d, d) + s * s
         if square <= R * R * RIM * RIM:
             continue
         c = sqrt(square)
         w = s + c
-        gap = w + excursion * patch.beta[k] - u[i]
+        gap = w + excursion * table[k, _BETA] - u[i]
         if gap <= 0.0:
             continue
         u[i] += gap
-        f = patch.gain[k] * gap
+        f = table[k, _GAIN] * gap
         patch.f[k] = f
         load += f
         normal = add(normal, scale(f, n))
@@ -148,7 +144,7 @@ def hold(wall: Wall, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bo
 @compiled
 def relax(wall: Wall) -> None:
     """The Prony branches, exact for a displacement held over the step: y_k = e_k y_k + (1 - e_k) g_k u."""
-    for k in range(len(wall.decay)):
-        y, e, feed = wall.y[k], wall.decay[k], wall.feed[k]
+    for k in range(len(wall.y)):
+        y, e, feed = wall.y[k], wall.prony[k, 0], wall.prony[k, 1]
         for i in range(len(y)):
             y[i] = y[i] * e + feed * wall.u[i]

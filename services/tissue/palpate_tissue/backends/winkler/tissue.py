@@ -58,7 +58,7 @@ class WinklerTissue(TissueBackend):
         self._free = np.flatnonzero(~model.fixed)
         self._search = Search(model.vertices[self._free], model.normals[self._free], self._amplitude, _MARGIN_M)
         self._near: Near | None = None
-        self._patch = self._nothing = self._patch_of(Near([0.0, 0.0, 0.0], 0.0, 0.0, _NONE, np.zeros((0, 3)), np.zeros((0, 3))))
+        self._patch = self._nothing = self._patch_of(_NONE)
         self._motion: Array = np.zeros((3, 3))
         """The sphere's centre [m], velocity [m/s] and angular velocity [rad/s], as rows."""
         self._last: list[float] | None = None
@@ -111,12 +111,12 @@ class WinklerTissue(TissueBackend):
         """Finds what a sphere near `p` [m] might touch."""
         deepest = float(self.displacement[self._patch.vertex].max(initial=0.0))
         self._near = self._search.around(p, radius, deepest)
-        self._patch = self._patch_of(self._near)
+        self._patch = self._patch_of(self._free[self._near.vertex])
 
-    def _patch_of(self, near: Near) -> Patch:
-        index = self._free[near.vertex]
-        beta, gain = self.model.breathing[index], self._gain[index]
-        return Patch(np.array(near.origin), index.astype(np.uint32), near.n, near.X, beta, gain, np.zeros(len(index)))
+    def _patch_of(self, index: NDArray[np.intp]) -> Patch:
+        model = self.model
+        table = np.column_stack((model.normals[index], model.vertices[index], model.breathing[index], self._gain[index]))
+        return Patch(index.astype(np.uint32), table, np.zeros(len(index)))
 
     def _wall_of(self, stiffness: Stiffness, h: float) -> Wall:
         """The wall with its matrices for steps of `h` [s]."""
@@ -127,7 +127,7 @@ class WinklerTissue(TissueBackend):
             columns = columns.astype(np.uint16)
         decay: Array = np.exp(-h / np.array(stiffness.prony_tau_s))
         feed: Array = np.array(stiffness.prony_g) * (1 - decay)
-        return Wall(self.displacement, self.branches, indptr, columns, A.data, decay, feed, h)
+        return Wall(self.displacement, self.branches, indptr, columns, A.data, np.column_stack((decay, feed)), h)
 
     @property
     def contacts(self) -> NDArray[np.intp]:
