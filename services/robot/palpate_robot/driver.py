@@ -43,7 +43,7 @@ _ZERO: Final = np.zeros(7)
 _ZERO.setflags(write=False)
 
 
-class Mode(IntEnum):
+class DriverMode(IntEnum):
     """Values of `palpation_msgs/RobotStatus.mode`."""
 
     IDLE = 0
@@ -51,7 +51,7 @@ class Mode(IntEnum):
     SAFE_HOLD = 2
 
 
-class Cause(IntEnum):
+class HoldCause(IntEnum):
     """Values of `palpation_msgs/RobotStatus.cause`."""
 
     NONE = 0
@@ -85,12 +85,12 @@ class Driver:
     def __init__(self, force_emergency_n: float) -> None:
         """`force_emergency_n` is the external force at the tool [N] above which the driver holds."""
         self._force_emergency = force_emergency_n
-        self.mode = Mode.IDLE
-        self.cause = Cause.NONE
+        self.mode = DriverMode.IDLE
+        self.cause = HoldCause.NONE
         self.reason = ""
         self.rejected = 0
         """Invalid commands since start."""
-        self.holds: list[tuple[int, Cause, str]] = []
+        self.holds: list[tuple[int, HoldCause, str]] = []
         """Every safe hold so far: when [ns], cause, reason."""
         self._since = -1
         self._brake = 0
@@ -104,19 +104,19 @@ class Driver:
     @property
     def held(self) -> bool:
         """Whether a safe hold is latched."""
-        return self.mode is Mode.SAFE_HOLD
+        return self.mode is DriverMode.SAFE_HOLD
 
-    def hold(self, t: int, cause: Cause, reason: str) -> None:
+    def hold(self, t: int, cause: HoldCause, reason: str) -> None:
         """Latches a safe hold at `t` [ns]. The first cause stands until the release."""
         if not self.held:
-            self.mode, self.cause, self.reason = Mode.SAFE_HOLD, cause, reason
+            self.mode, self.cause, self.reason = DriverMode.SAFE_HOLD, cause, reason
             self._brake = BRAKE_TICKS
             self.holds.append((t, cause, reason))
 
     def release(self, t: int) -> None:
         """Leaves a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a broken limit holds again."""
-        if self.mode is Mode.SAFE_HOLD:
-            self.mode, self.cause, self.reason = Mode.IDLE, Cause.NONE, ""
+        if self.mode is DriverMode.SAFE_HOLD:
+            self.mode, self.cause, self.reason = DriverMode.IDLE, HoldCause.NONE, ""
             self._since = t
             self._before = None
 
@@ -129,23 +129,23 @@ class Driver:
         if self.held:
             return _ZERO
         if lost:
-            self.hold(t, Cause.COMMANDER_LOST, "the service of role control, which commands, is gone")
+            self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control, which commands, is gone")
         elif force > self._force_emergency:
             limit = self._force_emergency
-            self.hold(t, Cause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
+            self.hold(t, HoldCause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
         else:
             self._check_joints(t, q, v)
         if command is not None and not self.held:
             if command.stamp > self._since:
                 self._take(t, command, gravity)
-            elif self.mode is Mode.ACTIVE:  # it has not been judged, so it must not be obeyed
+            elif self.mode is DriverMode.ACTIVE:  # it has not been judged, so it must not be obeyed
                 age = (t - command.stamp) / 1e6
-                self.hold(t, Cause.COMMAND_EXPIRED, f"the newest command of control is stamped {age:.0f} ms ago")
-        return command.torque if command is not None and self.mode is Mode.ACTIVE else _ZERO
+                self.hold(t, HoldCause.COMMAND_EXPIRED, f"the newest command of control is stamped {age:.0f} ms ago")
+        return command.torque if command is not None and self.mode is DriverMode.ACTIVE else _ZERO
 
     def damping(self, v: Array, gravity: Array) -> Array:
         """Joint damping that the driver adds in this tick [N m s/rad]; in a hold as much as the torque limits leave room for."""
-        if self.mode is Mode.ACTIVE:
+        if self.mode is DriverMode.ACTIVE:
             return _ZERO
         wanted = HOLD_DAMPING
         if self._brake:
@@ -159,32 +159,32 @@ class Driver:
             return
         for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, q.tolist(), v.tolist(), strict=True):
             if not -q_max <= q_i <= q_max:
-                self.hold(t, Cause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limit +-{q_max:.4f} rad")
+                self.hold(t, HoldCause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limit +-{q_max:.4f} rad")
             elif not -v_max <= v_i <= v_max:
-                self.hold(t, Cause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
+                self.hold(t, HoldCause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
 
     def _take(self, t: int, command: Command, gravity: Array) -> None:
         """Judges a command: obey it, ignore it (already expired while IDLE), or hold."""
         given_up = command.expires <= command.stamp  # however far its sender's clock is ahead of ours
         if given_up or t > command.expires:
-            if self.mode is Mode.ACTIVE:
+            if self.mode is DriverMode.ACTIVE:
                 late = max(t - command.expires, 0) / 1e6
                 words = f"the last command of control expired {late:.0f} ms ago, none came after it"
-                self.hold(t, Cause.COMMAND_EXPIRED, f"control gives up: {command.problem}" if command.problem else words)
+                self.hold(t, HoldCause.COMMAND_EXPIRED, f"control gives up: {command.problem}" if command.problem else words)
             return
         if command is not self._judged:
             self._judge(t, command, gravity)
             self._judged = command
-        if self.mode is Mode.IDLE:
-            self.mode = Mode.ACTIVE
+        if self.mode is DriverMode.IDLE:
+            self.mode = DriverMode.ACTIVE
 
     def _judge(self, t: int, command: Command, gravity: Array) -> None:
         shape = np.shape(command.torque)
         if shape != (7,):
-            self._reject(t, Cause.INVALID_COMMAND, f"control commands torques of shape {shape}, want (7,)")
+            self._reject(t, HoldCause.INVALID_COMMAND, f"control commands torques of shape {shape}, want (7,)")
             return
         if command.stamp > t + AHEAD:
-            self._reject(t, Cause.INVALID_COMMAND, f"control stamps its command {(command.stamp - t) / 1e6:.0f} ms ahead")
+            self._reject(t, HoldCause.INVALID_COMMAND, f"control stamps its command {(command.stamp - t) / 1e6:.0f} ms ahead")
             return
         before = command.torque if self._before is None else self._before
         apart = 1.0
@@ -195,19 +195,19 @@ class Driver:
             numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())
             for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, *numbers, strict=True):
                 if torque - torque != 0.0:  # NaN or infinite
-                    self._reject(t, Cause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
+                    self._reject(t, HoldCause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
                     return
                 if not -limit <= torque + weight <= limit:
                     text = f"control commands {joint} {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
-                    self._reject(t, Cause.TORQUE_LIMIT, text)
+                    self._reject(t, HoldCause.TORQUE_LIMIT, text)
                     return
                 if not -change <= torque - last <= change:
                     text = f"control commands {joint} {torque:.1f} N m after {last:.1f} N m, {apart:.0f} ms apart"
-                    self._reject(t, Cause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
+                    self._reject(t, HoldCause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
                     return
         self._before = command.torque
 
-    def _reject(self, t: int, cause: Cause, reason: str) -> None:
+    def _reject(self, t: int, cause: HoldCause, reason: str) -> None:
         self.rejected += 1
         self.hold(t, cause, reason)
 

@@ -36,7 +36,7 @@ from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import ExamInput
-from palpate_robot.driver import Cause, Command, Driver, Mode
+from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 from palpate_robot.ft_sensor import FtSensor
 from palpate_robot.plant import DT, PlantFactory
 
@@ -122,13 +122,13 @@ class RobotService(Service):
     def _obey_operator(self, t: int, inbox: Inbox) -> None:
         for message in inbox.new("operator/request"):
             if message.request == OperatorRequest.STOP:
-                self._driver.hold(t, Cause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
         for message in inbox.new("supervisor/state"):
             if message.releases != self._releases:
                 self._releases = message.releases
                 self._driver.release(t)
             if message.level == SupervisorState.LEVEL_EMERGENCY:
-                self._driver.hold(t, Cause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
 
     def _drive(self, t: int, inbox: Inbox) -> None:
         """Driver, then plant, up to `t`. The first tick is the state at the start."""
@@ -142,7 +142,7 @@ class RobotService(Service):
             torque = driver.update(t, plant.q, plant.v, gravity, self._external_force, command, lost=inbox.lost("control"))
             damping = driver.damping(plant.v, gravity)
             plant.step(gravity + torque, self._force_W if self._pressed else None, self._moment_W, damping)
-            self._applied = torque if driver.mode is Mode.ACTIVE else -damping * plant.v
+            self._applied = torque if driver.mode is DriverMode.ACTIVE else -damping * plant.v
 
     def _newest_command(self, inbox: Inbox) -> Command | None:
         message = inbox.latest("control/joint_torque")
@@ -166,7 +166,7 @@ class RobotService(Service):
         if self._pressed and received is not None and t - received > _CONTACT_AGE:
             age, limit = (t - received) / 1e6, _CONTACT_AGE / 1e6
             words = f"nothing on sim/contact_wrench for {age:.0f} ms, limit {limit:.0f} ms: tissue is late"
-            self._driver.hold(t, Cause.DEVICE, words)
+            self._driver.hold(t, HoldCause.DEVICE, words)
         f, m = message.wrench.force, message.wrench.torque
         self._pressed = bool(f.x or f.y or f.z or m.x or m.y or m.z)
         if self._pressed:

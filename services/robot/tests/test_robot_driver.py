@@ -5,7 +5,7 @@ import pytest
 
 from palpate_bus.messages.codec import message_type
 from palpate_models import lbr
-from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, Cause, Command, Driver, Mode
+from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, Command, Driver, DriverMode, HoldCause
 
 MS = 1_000_000
 STILL = np.zeros(7)
@@ -26,15 +26,15 @@ def _update(driver: Driver, t: int, command: Command | None, **changes: object) 
 def active() -> Driver:
     driver = Driver(EMERGENCY)
     _update(driver, MS, _command(0))
-    assert driver.mode is Mode.ACTIVE
+    assert driver.mode is DriverMode.ACTIVE
     return driver
 
 
 def test_numbers_are_those_of_the_message() -> None:
     status = message_type("palpation_msgs/msg/RobotStatus")
-    for mode in Mode:
+    for mode in DriverMode:
         assert getattr(status, f"MODE_{mode.name}") == mode
-    for cause in Cause:
+    for cause in HoldCause:
         assert getattr(status, f"CAUSE_{cause.name}") == cause
 
 
@@ -42,55 +42,55 @@ def test_idle_until_the_first_valid_command() -> None:
     driver = Driver(EMERGENCY)
     assert not _update(driver, 0, None).any()
     assert not _update(driver, 5 * MS, _command(MS, valid_ms=0)).any()
-    assert driver.mode is Mode.IDLE, "a command that is born expired is no command"
+    assert driver.mode is DriverMode.IDLE, "a command that is born expired is no command"
     np.testing.assert_array_equal(_update(driver, 6 * MS, _command(5 * MS)), np.full(7, 2.0))
-    assert driver.mode is Mode.ACTIVE
+    assert driver.mode is DriverMode.ACTIVE
 
 
 def test_obeys_to_the_last_valid_nanosecond_and_no_longer(active: Driver) -> None:
     last = _command(10 * MS)
     assert _update(active, last.expires, last).any()
     assert not _update(active, last.expires + 1, last).any()
-    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, Cause.COMMAND_EXPIRED)
+    assert (active.mode, active.cause) == (DriverMode.SAFE_HOLD, HoldCause.COMMAND_EXPIRED)
     assert "expired" in active.reason
 
 
 @pytest.mark.parametrize(
     ("changes", "cause", "words"),
     [
-        ({"lost": True}, Cause.COMMANDER_LOST, "control"),
-        ({"force": 40.5}, Cause.FORCE_LIMIT, "40.5 N"),
-        ({"q": lbr.HOME + np.eye(7)[3] * -0.5}, Cause.POSITION_LIMIT, "lbr_A4"),
-        ({"q": lbr.HOME * np.nan}, Cause.POSITION_LIMIT, "lbr_A1"),
-        ({"v": np.eye(7)[5] * 3.2}, Cause.VELOCITY_LIMIT, "lbr_A6"),
-        ({"v": np.eye(7)[1] * -1.8}, Cause.VELOCITY_LIMIT, "lbr_A2"),
+        ({"lost": True}, HoldCause.COMMANDER_LOST, "control"),
+        ({"force": 40.5}, HoldCause.FORCE_LIMIT, "40.5 N"),
+        ({"q": lbr.HOME + np.eye(7)[3] * -0.5}, HoldCause.POSITION_LIMIT, "lbr_A4"),
+        ({"q": lbr.HOME * np.nan}, HoldCause.POSITION_LIMIT, "lbr_A1"),
+        ({"v": np.eye(7)[5] * 3.2}, HoldCause.VELOCITY_LIMIT, "lbr_A6"),
+        ({"v": np.eye(7)[1] * -1.8}, HoldCause.VELOCITY_LIMIT, "lbr_A2"),
     ],
 )
-def test_broken_limits_hold(active: Driver, changes: dict, cause: Cause, words: str) -> None:
+def test_broken_limits_hold(active: Driver, changes: dict, cause: HoldCause, words: str) -> None:
     torque = _update(active, 2 * MS, _command(MS), **changes)
     assert not torque.any()
-    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, cause)
+    assert (active.mode, active.cause) == (DriverMode.SAFE_HOLD, cause)
     assert words in active.reason
 
 
 @pytest.mark.parametrize(
     ("torque", "cause", "words"),
     [
-        (np.array([0, 0, np.nan, 0, 0, 0, 0.0]), Cause.INVALID_COMMAND, "lbr_A3"),
-        (np.array([np.inf, 0, 0, 0, 0, 0, 0.0]), Cause.INVALID_COMMAND, "lbr_A1"),
-        (np.zeros(6), Cause.INVALID_COMMAND, "(6,)"),
-        (np.zeros((7, 1)), Cause.INVALID_COMMAND, "(7, 1)"),
-        (np.array([0, 0, 0, 0, 0, 0, 40.1]), Cause.TORQUE_LIMIT, "lbr_A7"),
-        (np.array([0, -140.0, 0, 0, 0, 0, 0]), Cause.TORQUE_LIMIT, "gravity"),
+        (np.array([0, 0, np.nan, 0, 0, 0, 0.0]), HoldCause.INVALID_COMMAND, "lbr_A3"),
+        (np.array([np.inf, 0, 0, 0, 0, 0, 0.0]), HoldCause.INVALID_COMMAND, "lbr_A1"),
+        (np.zeros(6), HoldCause.INVALID_COMMAND, "(6,)"),
+        (np.zeros((7, 1)), HoldCause.INVALID_COMMAND, "(7, 1)"),
+        (np.array([0, 0, 0, 0, 0, 0, 40.1]), HoldCause.TORQUE_LIMIT, "lbr_A7"),
+        (np.array([0, -140.0, 0, 0, 0, 0, 0]), HoldCause.TORQUE_LIMIT, "gravity"),
     ],
 )
 @pytest.mark.parametrize("first", [True, False])
-def test_bad_commands_hold_and_are_counted(torque: np.ndarray, cause: Cause, words: str, first: bool) -> None:
+def test_bad_commands_hold_and_are_counted(torque: np.ndarray, cause: HoldCause, words: str, first: bool) -> None:
     driver = Driver(EMERGENCY)
     if not first:
         _update(driver, MS, _command(0))
     assert not _update(driver, 2 * MS, _command(MS, torque)).any()
-    assert (driver.mode, driver.cause, driver.rejected) == (Mode.SAFE_HOLD, cause, 1)
+    assert (driver.mode, driver.cause, driver.rejected) == (DriverMode.SAFE_HOLD, cause, 1)
     assert words in driver.reason
 
 
@@ -105,48 +105,48 @@ def test_a_jump_of_the_torque_holds(active: Driver) -> None:
     for tick in range(1, 40):
         torque = np.full(7, 2.0) + np.eye(7)[3] * 0.9 * TORQUE_RATE * tick
         assert _update(active, (tick + 1) * MS, _command(tick * MS, torque)).any()
-    assert active.mode is Mode.ACTIVE
+    assert active.mode is DriverMode.ACTIVE
     assert not _update(active, 41 * MS, _command(40 * MS, torque - 2 * np.eye(7)[3] * torque)).any()
-    assert (active.mode, active.cause, active.rejected) == (Mode.SAFE_HOLD, Cause.INVALID_COMMAND, 1)
+    assert (active.mode, active.cause, active.rejected) == (DriverMode.SAFE_HOLD, HoldCause.INVALID_COMMAND, 1)
     assert "lbr_A4 -72.2 N m after 72.2 N m, 1 ms apart, limit 2 N m/ms" in active.reason
 
 
 def test_the_first_command_after_a_release_is_judged_against_nothing(active: Driver) -> None:
-    active.hold(2 * MS, Cause.STOP_REQUESTED, "operator")
+    active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")
     active.release(3 * MS)
     assert _update(active, 5 * MS, _command(4 * MS, np.full(7, 20.0))).any()
 
 
 def test_a_command_from_a_clock_that_is_ahead_is_refused(active: Driver) -> None:
     assert not _update(active, 2 * MS, _command(3600 * 1000 * MS)).any()
-    assert active.cause is Cause.INVALID_COMMAND
+    assert active.cause is HoldCause.INVALID_COMMAND
     assert "ahead" in active.reason
 
 
 def test_a_controller_that_gives_up_says_why(active: Driver) -> None:
     last = Command(STILL, MS, MS, "joint_states are 21 ms old, limit 20 ms")
     assert not _update(active, 2 * MS, last).any()
-    assert (active.cause, active.reason) == (Cause.COMMAND_EXPIRED, f"control gives up: {last.problem}")
+    assert (active.cause, active.reason) == (HoldCause.COMMAND_EXPIRED, f"control gives up: {last.problem}")
 
 
 def test_hold_is_latched_and_keeps_its_first_cause(active: Driver) -> None:
     _update(active, 2 * MS, _command(MS), force=50.0)
     for tick in range(3, 200):
         assert not _update(active, tick * MS, _command((tick - 1) * MS)).any()
-    active.hold(200 * MS, Cause.STOP_REQUESTED, "late")
-    assert active.cause is Cause.FORCE_LIMIT
+    active.hold(200 * MS, HoldCause.STOP_REQUESTED, "late")
+    assert active.cause is HoldCause.FORCE_LIMIT
     assert len(active.holds) == 1
 
 
 def test_release_waits_for_a_command_sent_after_it(active: Driver) -> None:
-    active.hold(2 * MS, Cause.STOP_REQUESTED, "operator")
+    active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")
     old = _command(2 * MS)
     active.release(3 * MS)
-    assert (active.mode, active.cause, active.reason) == (Mode.IDLE, Cause.NONE, "")
+    assert (active.mode, active.cause, active.reason) == (DriverMode.IDLE, HoldCause.NONE, "")
     assert not _update(active, 3 * MS, old).any()
-    assert active.mode is Mode.IDLE
+    assert active.mode is DriverMode.IDLE
     assert _update(active, 5 * MS, _command(4 * MS)).any()
-    assert active.mode is Mode.ACTIVE
+    assert active.mode is DriverMode.ACTIVE
 
 
 def test_release_does_not_help_while_the_limit_is_broken(active: Driver) -> None:
@@ -154,17 +154,17 @@ def test_release_does_not_help_while_the_limit_is_broken(active: Driver) -> None
     _update(active, 2 * MS, _command(MS), q=far)
     active.release(3 * MS)
     _update(active, 4 * MS, _command(3 * MS + 1), q=far)
-    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, Cause.POSITION_LIMIT)
+    assert (active.mode, active.cause) == (DriverMode.SAFE_HOLD, HoldCause.POSITION_LIMIT)
 
 
 def test_release_without_a_hold_changes_nothing(active: Driver) -> None:
     active.release(2 * MS)
-    assert active.mode is Mode.ACTIVE
+    assert active.mode is DriverMode.ACTIVE
 
 
 def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
     assert not active.damping(STILL, GRAVITY).any(), "an obeying driver adds no damping"
-    active.hold(2 * MS, Cause.STOP_REQUESTED, "operator")
+    active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")
     for _ in range(BRAKE_TICKS):
         np.testing.assert_array_equal(active.damping(STILL, GRAVITY), BRAKE * HOLD_DAMPING)
     np.testing.assert_array_equal(active.damping(STILL, GRAVITY), HOLD_DAMPING)
@@ -177,4 +177,4 @@ def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
 def test_a_command_stamped_before_all_others_is_not_obeyed_unjudged(active: Driver, torque: np.ndarray) -> None:
     """`palpate faults` found it: a sender whose stamps are an hour behind was obeyed, without expiry and without limits."""
     assert not _update(active, 10 * MS, _command(-3600 * 1000 * MS, torque)).any()
-    assert (active.mode, active.cause) == (Mode.SAFE_HOLD, Cause.COMMAND_EXPIRED)
+    assert (active.mode, active.cause) == (DriverMode.SAFE_HOLD, HoldCause.COMMAND_EXPIRED)

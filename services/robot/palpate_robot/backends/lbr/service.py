@@ -31,7 +31,7 @@ from palpate_models.scenario import ExamInput, Scenario
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, GravityModel
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort, ZenohPort
-from palpate_robot.driver import Cause, Command, Driver, Mode
+from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 
 STATUS_PERIOD = contract().topics["robot/status"].period
 DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
@@ -130,7 +130,7 @@ class LbrService(Service):
         """Takes what the ROS side sent; returns whether the joint state is new."""
         since = self._commanding_since
         if self._port.rivals() and since is not None and t - since > TAKE_OVER:
-            self._driver.hold(t, Cause.DEVICE, "another process, likely the watchdog, commands the arm")
+            self._driver.hold(t, HoldCause.DEVICE, "another process, likely the watchdog, commands the arm")
         fresh = False
         for state in self._port.states():
             fresh = self._arm.update(t, state) or fresh
@@ -138,7 +138,7 @@ class LbrService(Service):
             force, torque = reading.wrench.force, reading.wrench.torque
             values = np.array((force.x, force.y, force.z, torque.x, torque.y, torque.z))
             if not np.isfinite(values).all():
-                self._driver.hold(t, Cause.DEVICE, f"F/T reading {values}: must be finite")
+                self._driver.hold(t, HoldCause.DEVICE, f"F/T reading {values}: must be finite")
                 continue
             self._wrench = np.concatenate((self._R_ST @ values[:3], self._R_ST @ values[3:]))
             self._wrench_at = t
@@ -151,21 +151,21 @@ class LbrService(Service):
     def _obey(self, t: int, inbox: Inbox) -> None:
         for message in inbox.new("operator/request"):
             if message.request == OperatorRequest.STOP:
-                self._driver.hold(t, Cause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
         for message in inbox.new("supervisor/state"):
             if message.releases != self._releases:
                 self._releases = message.releases
                 self._driver.release(t)
             if message.level == SupervisorState.LEVEL_EMERGENCY:
-                self._driver.hold(t, Cause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
 
     def _judge_connection(self, t: int) -> str:
         """Latches a hold when the arm was active and does not take commands any more; returns why it does not."""
         trouble = self._arm.trouble(t)
         if not trouble and (self._wrench_at is None or t - self._wrench_at > FT_AGE):
             trouble = "no F/T reading" if self._wrench_at is None else f"no F/T reading for {(t - self._wrench_at) / 1e6:.0f} ms"
-        if trouble and self._driver.mode is Mode.ACTIVE:
-            self._driver.hold(t, Cause.DEVICE, trouble)
+        if trouble and self._driver.mode is DriverMode.ACTIVE:
+            self._driver.hold(t, HoldCause.DEVICE, trouble)
         return trouble
 
     def _drive(self, t: int, inbox: Inbox, joints: Message) -> None:
@@ -179,7 +179,7 @@ class LbrService(Service):
         command = None if trouble else self._newest_command(t, inbox, joints)
         lost = inbox.lost("control") and self._inner is None
         torque = self._driver.update(t, arm.q, arm.v, tool.gravity, self._force, command, lost=lost)
-        if self._driver.mode is not Mode.ACTIVE:
+        if self._driver.mode is not DriverMode.ACTIVE:
             torque = -np.minimum(self._driver.damping(arm.v, tool.gravity), DAMPING) * arm.v
         self._applied = np.asarray(torque, dtype=float)
         np.maximum(self._peak_torque, np.abs(self._applied), out=self._peak_torque)
