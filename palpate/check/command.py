@@ -25,7 +25,7 @@ LISTEN = "tcp/127.0.0.1:7447"
 _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED: "dim"}
 
 
-def check_command(
+def check_command(  # noqa: PLR0913 - the options of a command
     role: Annotated[str, typer.Argument(help=f"One of {', '.join(SUITES)}.")],
     connect: Connect = None,
     listen: Annotated[str, typer.Option(help="Where the check waits for the implementation, as a router.")] = LISTEN,

@@ -89,7 +89,7 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
 
 
 @app.command()
-def echo(
+def echo(  # noqa: PLR0913 - the options of a command
     name: Name,
     connect: Connect = None,
     run: ChosenRun = None,

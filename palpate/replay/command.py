@@ -24,7 +24,7 @@ from palpate_bus.settings import BusConfigError
 from palpate_models.load import ScenarioError
 
 
-def replay(
+def replay(  # noqa: PLR0913 - the options of a command
     file: Annotated[Path, typer.Argument(help="A run's folder, a rosbag2 folder or an .mcap file.")],
     service: Annotated[
         str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Run this service again: tissue, tissue=fmu, ...")

@@ -38,7 +38,7 @@ from palpate_models.scenario import Scenario
 NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
 
 
-def run(
+def run(  # noqa: PLR0913 - the options of a command
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")
     ] = "rlq_guarding",
