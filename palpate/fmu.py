@@ -19,8 +19,9 @@ from palpate_fmu.phantom_file import ExportError
 from palpate_fmu.probing import plot_probing, probe, write_csv
 from palpate_fmu.running import run_and_plot
 from palpate_models.load import ScenarioError, load_scenario
+from palpate_models.patient import Phantom
 from palpate_models.phantom import MeshError
-from palpate_models.scenario import Phantom, Scenario
+from palpate_models.scenario import Scenario
 
 EXIT_BAD_INPUT = 2
 NAMES_CHECKED = 1000

@@ -27,6 +27,7 @@ from palpate_conductor.collector import Collector
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
+from palpate_models.breathing import BreathingCurve
 from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
@@ -63,7 +64,7 @@ def path(surface: SkinSurface) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:
     scenario = load_scenario("rlq_guarding", settings)
     model = build_phantom(scenario.phantom, scenario.seed)
-    tissue = WinklerTissue(model, scenario.phantom.stiffness, scenario.phantom.breathing)
+    tissue = WinklerTissue(model, scenario.phantom.stiffness, BreathingCurve(scenario.phantom.breathing, scenario.seed))
     motions = path(SkinSurface(model))
     if "phantom.edge_m=0.0035" in settings:
         motions = motions[:1500]

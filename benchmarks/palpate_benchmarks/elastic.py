@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from palpate_bus.contract import contract
+from palpate_models.breathing import BreathingCurve
 from palpate_models.frames import Array
+from palpate_models.patient import Lesion, Phantom, Stiffness
 from palpate_models.phantom import PhantomModel, build_phantom, flat_phantom
-from palpate_models.scenario import Lesion, Phantom, Stiffness
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
@@ -43,7 +44,7 @@ def measure(steps: int = 4000) -> dict[str, float]:
     phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01), depth_m=0.01),))
     model = build_phantom(phantom, seed=0)
     begin = time.perf_counter()
-    tissue = ElasticTissue(model, compliance(model, phantom.lesions), phantom.stiffness, phantom.breathing)
+    tissue = ElasticTissue(model, compliance(model, phantom.lesions), phantom.stiffness, BreathingCurve(phantom.breathing, 0))
     load = time.perf_counter() - begin
     surface = SkinSurface(model)
     path = []

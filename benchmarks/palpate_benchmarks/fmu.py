@@ -15,8 +15,8 @@ from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuInstance
 from palpate_models.frames import Array
+from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.scenario import Lesion, Phantom
 
 RADIUS_M = 0.015
 DEPTH_M = 0.010

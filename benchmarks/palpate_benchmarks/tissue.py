@@ -7,8 +7,9 @@ import time
 
 import numpy as np
 
+from palpate_models.breathing import BreathingCurve
+from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Lesion, Phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.surface import SkinSurface
 
@@ -24,7 +25,7 @@ def measure(steps: int = 4000) -> dict[str, float]:
     """
     phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01)),))
     model = build_phantom(phantom, seed=0)
-    tissue = WinklerTissue(model, phantom.stiffness, phantom.breathing)
+    tissue = WinklerTissue(model, phantom.stiffness, BreathingCurve(phantom.breathing, 0))
     surface = SkinSurface(model)
     velocity, spin = np.array((SPEED_MPS, 0.0, 0.0)), np.zeros(3)
     costs, contacts = np.empty(steps), np.empty(steps)

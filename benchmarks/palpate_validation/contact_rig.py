@@ -24,7 +24,8 @@ from palpate_control.service import create as create_control
 from palpate_models import lbr
 from palpate_models.frames import Array, matrix
 from palpate_models.load import exam_input
-from palpate_models.scenario import Background, Phantom, Scenario, Stiffness
+from palpate_models.patient import Background, Phantom, Stiffness
+from palpate_models.scenario import Scenario
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.poses import least_twist, pose
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint

@@ -18,8 +18,8 @@ from scipy.signal import find_peaks
 
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
+from palpate_models.patient import Stiffness
 from palpate_models.phantom import flat_phantom
-from palpate_models.scenario import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
 from palpate_validation.dart_scene import DartScene, Flesh, SoftBox

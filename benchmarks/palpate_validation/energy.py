@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from palpate_models.frames import Array
+from palpate_models.patient import Lesion, Stiffness
 from palpate_models.phantom import PhantomModel, flat_phantom
-from palpate_models.scenario import Lesion, Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
 from palpate_validation.plots import COLOURS, INK

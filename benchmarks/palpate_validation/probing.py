@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from palpate_models.frames import Array
+from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate_models.frames import Array
+from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.dart_scene import Ellipsoid, Flesh, SoftBox
 
@@ -44,6 +44,8 @@ def twin(flesh: Flesh) -> WinklerTissue:
         lesion=np.full(n, -1, dtype=np.int32),
         fixed=np.zeros(n, dtype=np.bool_),
         breathing=np.zeros(n),
+        stiffening=np.zeros(n),
+        tension=np.zeros(n),
     )
     length = float(np.sqrt(flesh.k_e / k_w[0])) if len(edges) else Stiffness().length_m
     wall = Stiffness(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from palpate_models.scenario import Pose
+from palpate_models.section import Pose
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ import yaml
 from pydantic import ValidationError
 
 from palpate_models.frames import matrix, pose_of
-from palpate_models.scenario import ExamInput, Phantom, Registration, Scenario
+from palpate_models.patient import Phantom, Registration
+from palpate_models.scenario import ExamInput, Scenario
 
 _MERGE = "tag:yaml.org,2002:merge"
 

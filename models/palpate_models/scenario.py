@@ -11,119 +11,10 @@ from enum import StrEnum
 from math import dist
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Length = Annotated[float, Field(gt=0, le=1)]
-"""[m], of something about a patient: millimetres are refused."""
-Force = Annotated[float, Field(gt=0, le=100)]
-"""[N]."""
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
-
-
-class Pose(_Section):
-    """A pose as translation and roll-pitch-yaw (fixed axes x, y, z)."""
-
-    xyz_m: Vec3 = (0.0, 0.0, 0.0)
-    rpy_rad: Vec3 = (0.0, 0.0, 0.0)
-
-
-class Lesion(_Section):
-    """A stiff area of elliptic outline in the abdomen's xy plane."""
-
-    centre_m: Vec2
-    """Centre, x to the patient's left and y to the head, from the umbilicus."""
-    radii_m: tuple[Length, Length] = (0.03, 0.03)
-    """Half axes of the half-contrast outline."""
-    contrast: Annotated[float, Field(gt=1, le=20)] = 4.0
-    """Stiffness at its centre over the stiffness without it. What is looked for, and scored, is stiffer than its surroundings."""
-    edge_m: Positive = 0.008
-    """Width of the smooth edge."""
-    depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
-    """How far below the skin it begins (services.tissue: elastic): an ellipsoid whose vertical half axis is the smaller of
-    `radii_m`. None: it reaches from the skin inward. The surface tier knows no depth: there every lesion lies in the skin."""
-
-
-class Background(_Section):
-    """Natural variation of a healthy abdomen's stiffness: log-normal, with a Gaussian correlation."""
-
-    cv: Annotated[float, Field(ge=0, le=0.6)] = 0.2
-    """Coefficient of variation."""
-    correlation_m: Annotated[float, Field(ge=0.01, le=0.5)] = 0.05
-    """Correlation length."""
-    margins: Annotated[float, Field(ge=1, le=4)] = 1.5
-    """How much stiffer the wall is at the costal margin and at the pelvis."""
-
-
-class Stiffness(_Section):
-    """Mechanics of the healthy wall (k_w 1.7e5 N/m^3, l = 15 mm; Prony weights after liver)."""
-
-    k_w_n_per_m3: Annotated[float, Field(ge=1e3, le=1e8)] = 1.7e5
-    """Instantaneous Winkler foundation modulus."""
-    length_m: Annotated[float, Field(ge=0.002, le=0.1)] = 0.015
-    """Pasternak length l = sqrt(G / k_w)."""
-    prony_g: tuple[NonNegative, ...] = (0.3, 0.2)
-    """Relaxing fractions of the instantaneous modulus."""
-    prony_tau_s: tuple[Positive, ...] = (1.86, 51.3)
-    """Their time constants."""
-    dashpot_s: Annotated[float, Field(gt=0, le=1)] = 0.05
-    """Dashpot over foundation modulus, C = dashpot_s * k_w."""
-    friction: Annotated[float, Field(ge=0, le=2)] = 0.3
-    """Coulomb friction between indenter and skin."""
-
-    @model_validator(mode="after")
-    def _prony(self) -> Stiffness:
-        if len(self.prony_g) != len(self.prony_tau_s):
-            raise ValueError("prony_g and prony_tau_s need as many entries as each other")
-        if sum(self.prony_g) >= 1:
-            raise ValueError(f"prony_g must sum to less than 1, not {sum(self.prony_g)}")
-        return self
-
-
-class Breathing(_Section):
-    """Abdominal breathing: the wall rises and falls."""
-
-    amplitude_m: Annotated[float, Field(ge=0, le=0.02)] = 0.0
-    """Half of the peak-to-peak excursion; 0 switches it off."""
-    rate_per_min: Annotated[float, Field(ge=4, le=40)] = 15.0
-
-
-class Registration(_Section):
-    """Where the patient lies. Exam input is the true pose composed with the error."""
-
-    true: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
-    """X_WA: abdomen in world."""
-    error: Pose = Pose()
-    """What registration gets wrong, in A."""
-
-
-class Phantom(_Section):
-    """The abdomen. Reaches only tissue and scoring, but for `pose`."""
-
-    kind: Literal["parametric", "mesh"] = "parametric"
-    mesh: str | None = None
-    """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
-    size_m: tuple[Length, Length, Length] = (0.36, 0.46, 0.20)
-    """Width, length and height of the parametric abdomen."""
-    edge_m: Annotated[float, Field(ge=0.0025, le=0.02)] = 0.005
-    """Longest mesh edge in the examined region."""
-    stiffness: Stiffness = Stiffness()
-    background: Background = Background()
-    lesions: tuple[Lesion, ...] = ()
-    breathing: Breathing = Breathing()
-    pose: Registration = Registration()
-
-    @model_validator(mode="after")
-    def _mesh(self) -> Phantom:
-        if (self.kind == "mesh") != (self.mesh is not None):
-            raise ValueError("kind: mesh needs mesh: FILE, and mesh: FILE needs kind: mesh")
-        return self
+from palpate_models.patient import Phantom
+from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 
 
 class Pattern(StrEnum):
@@ -140,7 +31,7 @@ class Mode(StrEnum):
     POINT = "point"
 
 
-class Exam(_Section):
+class Exam(Section):
     """What is examined, and how."""
 
     pattern: Pattern = Pattern.SNAKE
@@ -157,7 +48,7 @@ class Exam(_Section):
     """Centre of the region in the abdomen frame."""
 
 
-class LbrConnection(_Section):
+class LbrConnection(Section):
     """Where a real LBR is and how it is commanded: the ROS side, lbr_fri_ros2_stack over rmw_zenoh."""
 
     router: str = "tcp/127.0.0.1:7447"
@@ -178,7 +69,7 @@ class LbrConnection(_Section):
     """Whether the arm is the emulator: then what only physics knows is exchanged with it, for simulated tissue and camera."""
 
 
-class RosCamera(_Section):
+class RosCamera(Section):
     """Where a depth camera of a ROS 2 system is, over rmw_zenoh."""
 
     router: str = "tcp/127.0.0.1:7447"
@@ -195,7 +86,7 @@ class RosCamera(_Section):
     """The ROS frame that is our world: on the floor under the robot, z up, x towards the table."""
 
 
-class Robot(_Section):
+class Robot(Section):
     """Robot, tool and its sensor."""
 
     lbr: LbrConnection = LbrConnection()
@@ -222,7 +113,7 @@ class Robot(_Section):
     """Viscous friction (the same)."""
 
 
-class Camera(_Section):
+class Camera(Section):
     """Kinect-like depth camera on a tripod (Nguyen 2012)."""
 
     ros: RosCamera = RosCamera()
@@ -250,7 +141,7 @@ class Camera(_Section):
         return self
 
 
-class Limits(_Section):
+class Limits(Section):
     """Operating limits that we set (no claim of compliance with ISO/TS 15066)."""
 
     force_working_n: Force = 15.0
@@ -286,7 +177,7 @@ class Limits(_Section):
         return self
 
 
-class TissueChoice(_Section):
+class TissueChoice(Section):
     """What the tissue is made from."""
 
     fmu: str | None = None
@@ -295,7 +186,7 @@ class TissueChoice(_Section):
     """File of the map of its variables to topic fields (YAML); that of the abdomen FMU when empty."""
 
 
-class Services(_Section):
+class Services(Section):
     """Which implementation plays each role: the name of an entry point in the group `palpate.<role>`, or the path of a Python
     file that has `create(scenario)`. A role that the contract has besides these is a field, too, by default `default`.
     """
@@ -318,7 +209,7 @@ class Services(_Section):
     recorder: str = "default"
 
 
-class Scenario(_Section):
+class Scenario(Section):
     """All of a run. `for_role` gives the part that a role may know."""
 
     name: str = "unnamed"
@@ -343,7 +234,7 @@ class Scenario(_Section):
         return services
 
 
-class ExamInput(_Section):
+class ExamInput(Section):
     """What every role but tissue and scoring may know: the scenario without its phantom, with the registered pose."""
 
     seed: int

@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 
 from palpate_models.frames import Array, matrix
-from palpate_models.scenario import Pose, Robot, Vec3
+from palpate_models.scenario import Robot
+from palpate_models.section import Pose, Vec3
 
 TABLE_TOP_M: Final = 0.73
 """Height of the table's top face [A]."""

@@ -7,10 +7,11 @@ import pytest
 import trimesh
 
 from palpate_models.frames import look_at
+from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.phantom.mesh import orient, refine
 from palpate_models.phantom.parametric import parametric_surface
-from palpate_models.scenario import Lesion, Limits, Phantom
+from palpate_models.scenario import Limits
 
 
 def dome(subdivisions=4):

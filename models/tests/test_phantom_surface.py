@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from palpate_models.patient import Phantom
 from palpate_models.phantom import build_phantom, quadrant
 from palpate_models.phantom.parametric import parametric_surface
-from palpate_models.scenario import Phantom
 
 
 def edges_of(triangles):

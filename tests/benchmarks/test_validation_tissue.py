@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from palpate_models.scenario import Stiffness
+from palpate_models.patient import Stiffness
 from palpate_validation import drop, energy, hertz, lumps, meshes, relaxation
 from palpate_validation.check import Check, Section
 from palpate_validation.foundation import lump, static_force, uniform

@@ -14,8 +14,9 @@ from palpate_fmu.description import MODEL, SOURCES, build_description, descripti
 from palpate_fmu.phantom_file import encode_phantom, sample_vertices, sizes_of, start_values
 from palpate_fmu.structure import couplings
 from palpate_fmu.variables import c_table
+from palpate_models.patient import Phantom
 from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.scenario import Phantom, Scenario
+from palpate_models.scenario import Scenario
 
 _NAMESPACE = uuid.UUID("6f1f5a0e-6a0c-5c7e-9a39-0d9b5c1f4a11")
 _EPOCH = (2020, 1, 1, 0, 0, 0)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from palpate_fmu.variables import BRANCHES, LESIONS, Sizes, parameters
 from palpate_models.frames import Array
+from palpate_models.patient import Phantom
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Phantom
 
 SAMPLES = 64
 """Vertices whose displacement an FMI 2.0 master sees."""

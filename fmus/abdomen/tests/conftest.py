@@ -8,7 +8,8 @@ import pytest
 
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
-from palpate_models.scenario import Breathing, Lesion, Phantom
+from palpate_models.breathing import Breathing
+from palpate_models.patient import Lesion, Phantom
 
 PHANTOM = Phantom(lesions=(Lesion(centre_m=(-0.05, -0.05)),), breathing=Breathing(amplitude_m=0.002), edge_m=0.008)
 

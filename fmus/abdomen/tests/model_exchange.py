@@ -14,7 +14,7 @@ from fmpy import fmi2, fmi3
 from numpy.typing import ArrayLike
 
 from palpate_fmu.instance import read_variables
-from palpate_models.scenario import Lesion, Phantom
+from palpate_models.patient import Lesion, Phantom
 
 Array = np.ndarray
 

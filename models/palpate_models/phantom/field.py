@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.frames import Array
-from palpate_models.scenario import Background, Lesion
+from palpate_models.patient import Background, Lesion
 
 _FEATURES = 512
 """Random Fourier features of the background field: its covariance is within 1/sqrt(512) = 4 % of the Gaussian one."""

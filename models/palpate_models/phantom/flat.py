@@ -9,11 +9,11 @@ import robust_laplacian
 from scipy import sparse
 from scipy.spatial import Delaunay
 
+from palpate_models.patient import Lesion
 from palpate_models.phantom.field import lesion_field
 from palpate_models.phantom.mesh import boundary_vertices
 from palpate_models.phantom.model import PhantomModel
 from palpate_models.phantom.parametric import lattice
-from palpate_models.scenario import Lesion
 
 
 def flat_phantom(
@@ -42,6 +42,8 @@ def flat_phantom(
         laplacian=sparse.csr_array(laplacian),
         stiffness=k_w_n_per_m3 * contrast,
         background=np.full(n, k_w_n_per_m3),
+        stiffening=np.zeros(n),
+        tension=np.zeros(n),
         lesion=lesion,
         fixed=fixed,
         breathing=np.where(fixed, 0.0, 1.0),

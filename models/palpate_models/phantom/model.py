@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate_models.frames import Array
+from palpate_models.patient import Phantom
 from palpate_models.phantom.field import background_factor, lesion_field
 from palpate_models.phantom.mesh import MeshError, boundary_vertices, load_mesh, vertex_normals
 from palpate_models.phantom.parametric import parametric_surface
-from palpate_models.scenario import Phantom
 
 IntArray = NDArray[np.int32]
 
@@ -40,6 +40,10 @@ class PhantomModel:
     """Instantaneous foundation modulus k_w [N/m^3], shape (n,), with lesions."""
     background: Array
     """The same without lesions, shape (n,)."""
+    stiffening: Array
+    """How fast the modulus rises with depth [1/m], shape (n,): see `Stiffness.stiffening_per_m`."""
+    tension: Array
+    """What a contracted muscle adds to the modulus, over k_w [1], shape (n,); 0 where nothing is guarded."""
     lesion: IntArray
     """Index of the lesion in whose half-contrast outline the vertex lies, -1 elsewhere, shape (n,)."""
     fixed: NDArray[np.bool_]
@@ -90,6 +94,8 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         laplacian=laplacian,
         stiffness=background * contrast,
         background=background,
+        stiffening=np.full(len(vertices), phantom.stiffness.stiffening_per_m),
+        tension=np.zeros(len(vertices)),
         lesion=lesion,
         fixed=fixed,
         breathing=_breathing_profile(vertices, normals, half_length, fixed),

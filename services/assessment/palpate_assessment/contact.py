@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from scipy.special import k0, k0e, k1, k1e
 
 from palpate_models.frames import Array
-from palpate_models.scenario import Stiffness
+from palpate_models.patient import Stiffness
 
 _PIXEL = 0.0005
 """Raster on which footprints and overlaps are integrated [m]; halving it changes them by less than 0.5 %."""

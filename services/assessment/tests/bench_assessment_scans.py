@@ -22,9 +22,10 @@ from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.stamps import header
 from palpate_models.frames import Array, apply, matrix
 from palpate_models.load import exam_input
+from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.field import gaussian_field
-from palpate_models.scenario import Lesion, Mode, Phantom, Scenario
+from palpate_models.scenario import Mode, Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue as Tissue
 
 SURFACE_SD, SURFACE_LENGTH = 0.0001, 0.012

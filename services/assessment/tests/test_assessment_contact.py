@@ -7,8 +7,8 @@ import pytest
 
 from palpate_assessment.contact import REACH, ReferenceContact, static_contact
 from palpate_assessment.memory import PathMemory
+from palpate_models.patient import Lesion, Stiffness
 from palpate_models.phantom.flat import flat_phantom
-from palpate_models.scenario import Lesion, Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue as Tissue
 
 K_W = 1.7e5

@@ -15,7 +15,8 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.codec import encode
 from palpate_models.load import exam_input
-from palpate_models.scenario import Exam, Lesion, Phantom, Scenario
+from palpate_models.patient import Lesion, Phantom
+from palpate_models.scenario import Exam, Scenario
 
 REGION = (0.11, 0.10)
 Examined = tuple[Any, Any, list[Any]]

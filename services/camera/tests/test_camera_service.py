@@ -15,7 +15,8 @@ from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform
 from palpate_models.frames import look_at
 from palpate_models.load import exam_input
-from palpate_models.scenario import Pose, Scenario
+from palpate_models.scenario import Scenario
+from palpate_models.section import Pose
 
 
 def scenario(**camera: Any) -> Scenario:

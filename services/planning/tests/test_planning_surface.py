@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from planning_fakes import grid_mesh
 
 from palpate_models.frames import apply, matrix
-from palpate_models.scenario import Pose
+from palpate_models.section import Pose
 from palpate_planning.surface import PerceivedSurface
 
 X_WA = matrix(Pose(xyz_m=(0.56, 0.05, 0.93), rpy_rad=(0.05, -0.08, 0.3)))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models.breathing import BreathingCurve
 from palpate_models.frames import Array
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Breathing
 
 
 class TissueBackend(ABC):
@@ -19,13 +18,13 @@ class TissueBackend(ABC):
     touching: bool = False
     """Whether the sphere holds a vertex after the step."""
 
-    def __init__(self, model: PhantomModel, breathing: Breathing, dt: float) -> None:
+    def __init__(self, model: PhantomModel, breathing: BreathingCurve, dt: float) -> None:
         self.model = model
         """The body at rest."""
         self.dt = dt
         """Period of a step [s]."""
-        self._amplitude = breathing.amplitude_m
-        self._pulse = 2 * math.pi * breathing.rate_per_min / 60
+        self.breathing = breathing
+        """How the body breathes."""
 
     @abstractmethod
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
@@ -57,4 +56,4 @@ class TissueBackend(ABC):
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
-        return self._amplitude * math.sin(self._pulse * t_s) if self._amplitude else 0.0
+        return self.breathing.excursion(t_s)

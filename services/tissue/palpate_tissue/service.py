@@ -21,7 +21,7 @@ from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import Array, apply, inverse, matrix
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Pose
+from palpate_models.section import Pose
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.surface import SkinSurface
 

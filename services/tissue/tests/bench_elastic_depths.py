@@ -16,8 +16,8 @@ import bench_assessment_scans as scans
 import numpy as np
 
 from palpate_models.load import load_scenario
+from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.scenario import Stiffness
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.equivalent import with_equivalent_stiffness
 from palpate_tissue.backends.elastic.tissue import ElasticTissue

@@ -11,8 +11,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import nnls
 
+from palpate_models.breathing import Breathing, BreathingCurve
+from palpate_models.patient import Lesion, Stiffness
 from palpate_models.phantom import PhantomModel, flat_phantom
-from palpate_models.scenario import Breathing, Lesion, Stiffness
 from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, compliance
 from palpate_tissue.backends.elastic.contact import ContactSolver
 from palpate_tissue.backends.elastic.kernel import LayerKernel, layer_factor
@@ -242,7 +243,7 @@ def test_no_closed_cycle_yields_work(seed: int) -> None:
 
 
 def test_breathing_lifts_the_skin_into_the_sphere() -> None:
-    tissue = ElasticTissue(flat(), solid(), ELASTIC, Breathing(amplitude_m=0.006, rate_per_min=15))
+    tissue = ElasticTissue(flat(), solid(), ELASTIC, BreathingCurve(Breathing(amplitude_m=0.006, rate_per_min=15), 0))
     forces = [tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.015)), STILL, 0.015)[0][2] for k in range(4000)]
     assert max(forces) > 0.5
     assert forces[1000] == pytest.approx(max(forces), rel=0.05)  # a quarter of the period

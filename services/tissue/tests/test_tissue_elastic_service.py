@@ -11,8 +11,8 @@ from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vect
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
 from palpate_models.load import load_scenario
+from palpate_models.patient import Lesion
 from palpate_models.phantom import flat_phantom
-from palpate_models.scenario import Lesion
 from palpate_tissue.backends.elastic import cache
 from palpate_tissue.backends.elastic.cache import content_key, remembered
 from palpate_tissue.backends.elastic.compliance import compliance

@@ -11,8 +11,9 @@ import pytest
 from scipy.sparse import csr_array
 
 from palpate_models import phantom as phantoms
+from palpate_models.breathing import Breathing, BreathingCurve
+from palpate_models.patient import Lesion, Phantom, Stiffness
 from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Breathing, Lesion, Phantom, Stiffness
 from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, StabilityError, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
@@ -205,7 +206,7 @@ def test_force_ripple_while_sliding_is_small():
 
 
 def test_breathing_swings_the_force_of_a_sphere_held_still():
-    breathing = Breathing(amplitude_m=0.005, rate_per_min=15)
+    breathing = BreathingCurve(Breathing(amplitude_m=0.005, rate_per_min=15), 0)
     tissue = WinklerTissue(flat_phantom(), ELASTIC, breathing)
     p = np.array((0.0, 0.0, 0.005))
     force = np.array([tissue.step(k * 1e-3, p, STILL, 0.015)[0][2] for k in range(4300)])[300:]
@@ -218,7 +219,7 @@ def test_breathing_swings_the_force_of_a_sphere_held_still():
 
 def test_breathing_moves_the_surface_and_not_its_border():
     model = build_phantom(Phantom(), 0)
-    tissue = WinklerTissue(model, Stiffness(), Breathing(amplitude_m=0.006, rate_per_min=20))
+    tissue = WinklerTissue(model, Stiffness(), BreathingCurve(Breathing(amplitude_m=0.006, rate_per_min=20), 0))
     tissue.idle(0.75)
     moved = ((tissue.deformed_vertices - model.vertices) * model.normals).sum(axis=1)
     assert moved.max() == pytest.approx(0.006, rel=0.02)
@@ -283,7 +284,7 @@ def test_a_sharp_contrast_does_not_cost_stability():
 def test_runs_repeat_bit_by_bit():
     def run():
         model = build_phantom(Phantom(lesions=(Lesion(centre_m=(-0.03, 0.0)),)), 4)
-        tissue = WinklerTissue(model, Stiffness(), Breathing(amplitude_m=0.003))
+        tissue = WinklerTissue(model, Stiffness(), BreathingCurve(Breathing(amplitude_m=0.003), 0))
         forces = []
         for k in range(600):
             p = np.array((-0.05 + 6e-5 * k, 0.01, 0.006))
@@ -352,7 +353,7 @@ def reference_step(wall, patch, motion, radius, excursion):
 
 def test_the_compiled_step_is_the_reference_step():
     model = build_phantom(Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0), contrast=6),)), 2)
-    tissue = WinklerTissue(model, Stiffness(friction=0.0), Breathing(amplitude_m=0.004))
+    tissue = WinklerTissue(model, Stiffness(friction=0.0), BreathingCurve(Breathing(amplitude_m=0.004), 0))
     touched = 0
     for k in range(400):
         p = np.array((-0.03 + 5e-5 * k, 0.004, 0.016 - 6e-5 * min(k, 200)))

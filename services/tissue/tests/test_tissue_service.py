@@ -10,10 +10,12 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_models.breathing import Breathing
 from palpate_models.frames import matrix
+from palpate_models.patient import Lesion, Phantom, Registration
 from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Breathing, Lesion, Phantom, Registration, Scenario
-from palpate_models.scenario import Pose as TruePose
+from palpate_models.scenario import Scenario
+from palpate_models.section import Pose as TruePose
 from palpate_tissue.backends.winkler.service import create
 from palpate_tissue.surface import SkinSurface, nearest_on_triangle
 

@@ -22,8 +22,8 @@ from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from palpate_models.frames import Array
+from palpate_models.patient import Lesion
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Lesion
 from palpate_tissue.backends.elastic.cache import content_key, remembered
 from palpate_tissue.backends.elastic.kernel import LayerKernel
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W, ModulusField

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate_models.frames import Array
+from palpate_models.patient import Lesion
 from palpate_models.phantom import PhantomModel
 from palpate_models.phantom.field import edge_distance
-from palpate_models.scenario import Lesion
 from palpate_tissue.backends.elastic.cache import content_key, remembered
 from palpate_tissue.backends.elastic.compliance import Compliance, uniform_compliance
 from palpate_tissue.backends.elastic.contact import ContactSolver

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
+from palpate_models.breathing import BreathingCurve
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
@@ -23,7 +24,13 @@ def create(scenario: Scenario, pitch_m: float = PITCH_M) -> TissueService:
     model = build_phantom(phantom, scenario.seed)
     body = compliance(model, phantom.lesions, pitch_m=pitch_m)
     healthy = compliance(model, pitch_m=pitch_m)
-    tissue = ElasticTissue(model, body, phantom.stiffness, phantom.breathing, contract().roles[TissueService.role].period / NS)
+    tissue = ElasticTissue(
+        model,
+        body,
+        phantom.stiffness,
+        BreathingCurve(phantom.breathing, scenario.seed),
+        contract().roles[TissueService.role].period / NS,
+    )
     shown = with_equivalent_stiffness(
         model, phantom.lesions, body, healthy, scenario.robot.indenter_radius_m, scenario.exam.depth_m
     )

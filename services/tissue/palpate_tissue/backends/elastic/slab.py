@@ -16,9 +16,10 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import brentq
 
+from palpate_models.breathing import STILL, BreathingCurve
 from palpate_models.frames import Array
+from palpate_models.patient import Lesion, Stiffness
 from palpate_models.phantom import PhantomModel, flat_phantom
-from palpate_models.scenario import Breathing, Lesion, Stiffness
 from palpate_tissue.backends.elastic.compliance import POISSON, Compliance, compliance
 from palpate_tissue.backends.elastic.contact import ContactSolver
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
@@ -121,6 +122,6 @@ class FlatSlab:
         """How far from the origin the slab can be touched."""
         return float(np.abs(self.vertices[self.compliance.free, :2]).max(axis=0).min())
 
-    def tissue(self, stiffness: Stiffness | None = None, breathing: Breathing | None = None, dt: float = 1e-3) -> ElasticTissue:
+    def tissue(self, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3) -> ElasticTissue:
         """The same slab as a tissue that steps in time: `tissue.step(t_s, p_A, v_A, radius)` gives force and torque."""
         return ElasticTissue(self.model, self.compliance, stiffness, breathing, dt)

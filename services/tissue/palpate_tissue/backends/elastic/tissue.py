@@ -17,9 +17,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models.breathing import STILL, BreathingCurve
 from palpate_models.frames import Array
+from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Breathing, Stiffness
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance
@@ -59,11 +60,11 @@ class ElasticTissue(TissueBackend):
         model: PhantomModel,
         compliance: Compliance,
         stiffness: Stiffness | None = None,
-        breathing: Breathing | None = None,
+        breathing: BreathingCurve = STILL,
         dt: float = 1e-3,
     ) -> None:
         stiffness = stiffness or Stiffness()
-        super().__init__(model, breathing or Breathing(), dt)
+        super().__init__(model, breathing, dt)
         self.compliance = compliance
         self.friction = friction.skin(stiffness.friction, model.background)
         self.disturbed = False
@@ -73,7 +74,7 @@ class ElasticTissue(TissueBackend):
         self._excursion = 0.0
         free = compliance.free
         self._breathing = model.breathing[free]
-        self._search = Search(model.vertices[free], model.normals[free], self._amplitude, _MARGIN_M)
+        self._search = Search(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M)
         self._state = np.zeros((len(self._feed), len(free)))
         """u and y_k of the free vertices as they were `_behind` steps ago."""
         self._behind = 0

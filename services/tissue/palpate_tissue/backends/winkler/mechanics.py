@@ -10,8 +10,8 @@ from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from palpate_models.frames import Array
+from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Stiffness
 
 STEP_LIMIT = 1.8
 """Largest dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps and more."""

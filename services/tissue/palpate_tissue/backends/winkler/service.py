@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
+from palpate_models.breathing import BreathingCurve
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
@@ -14,7 +15,12 @@ def create(scenario: Scenario) -> TissueService:
     """The tissue of a scenario; with scoring, the one role that may look at its phantom."""
     phantom = scenario.phantom
     model = build_phantom(phantom, scenario.seed)
-    tissue = WinklerTissue(model, phantom.stiffness, phantom.breathing, contract().roles[TissueService.role].period / NS)
+    tissue = WinklerTissue(
+        model,
+        phantom.stiffness,
+        BreathingCurve(phantom.breathing, scenario.seed),
+        contract().roles[TissueService.role].period / NS,
+    )
     facts = {
         "stability_dt_rate": round(tissue.dt * tissue.mechanics.rate, 4),  # passive below 2
         "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),

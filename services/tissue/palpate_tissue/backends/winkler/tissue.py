@@ -14,9 +14,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models.breathing import STILL, BreathingCurve
 from palpate_models.frames import Array
+from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Breathing, Stiffness
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler import kernel
@@ -36,11 +37,11 @@ class WinklerTissue(TissueBackend):
         self,
         model: PhantomModel,
         stiffness: Stiffness | None = None,
-        breathing: Breathing | None = None,
+        breathing: BreathingCurve = STILL,
         dt: float = 1e-3,
     ) -> None:
         stiffness = stiffness or Stiffness()
-        super().__init__(model, breathing or Breathing(), dt)
+        super().__init__(model, breathing, dt)
         self.mechanics = assemble(model, stiffness)
         self.substeps = self.mechanics.substeps(dt)
         self.friction = friction.skin(stiffness.friction, model.background)
@@ -56,7 +57,7 @@ class WinklerTissue(TissueBackend):
         self._gain = self.mechanics.damping / h
         self._excursion = 0.0
         self._free = np.flatnonzero(~model.fixed)
-        self._search = Search(model.vertices[self._free], model.normals[self._free], self._amplitude, _MARGIN_M)
+        self._search = Search(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._near: Near | None = None
         self._patch = self._nothing = self._patch_of(_NONE)
         self._motion: Array = np.zeros((3, 3))

@@ -1,0 +1,96 @@
+"""The patient of a scenario: shape, wall, lesions, breathing. Reaches only the tissue and scoring."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from palpate_models.breathing import Breathing
+from palpate_models.section import Length, NonNegative, Pose, Positive, Section, Vec2
+
+
+class Lesion(Section):
+    """A stiff area of elliptic outline in the abdomen's xy plane."""
+
+    centre_m: Vec2
+    """Centre, x to the patient's left and y to the head, from the umbilicus."""
+    radii_m: tuple[Length, Length] = (0.03, 0.03)
+    """Half axes of the half-contrast outline."""
+    contrast: Annotated[float, Field(gt=1, le=20)] = 4.0
+    """Stiffness at its centre over the stiffness without it. What is looked for, and scored, is stiffer than its surroundings."""
+    edge_m: Positive = 0.008
+    """Width of the smooth edge."""
+    depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
+    """How far below the skin it begins (services.tissue: elastic): an ellipsoid whose vertical half axis is the smaller of
+    `radii_m`. None: it reaches from the skin inward. The surface tier knows no depth: there every lesion lies in the skin."""
+
+
+class Background(Section):
+    """Natural variation of a healthy abdomen's stiffness: log-normal, with a Gaussian correlation."""
+
+    cv: Annotated[float, Field(ge=0, le=0.6)] = 0.2
+    """Coefficient of variation."""
+    correlation_m: Annotated[float, Field(ge=0.01, le=0.5)] = 0.05
+    """Correlation length."""
+    margins: Annotated[float, Field(ge=1, le=4)] = 1.5
+    """How much stiffer the wall is at the costal margin and at the pelvis."""
+
+
+class Stiffness(Section):
+    """Mechanics of the healthy wall (k_w 1.7e5 N/m^3, l = 15 mm; Prony weights after liver)."""
+
+    k_w_n_per_m3: Annotated[float, Field(ge=1e3, le=1e8)] = 1.7e5
+    """Instantaneous Winkler foundation modulus."""
+    length_m: Annotated[float, Field(ge=0.002, le=0.1)] = 0.015
+    """Pasternak length l = sqrt(G / k_w)."""
+    stiffening_per_m: NonNegative = 0.0
+    """How fast the modulus rises with depth: at displacement u it is k_w (1 + stiffening_per_m u), see `palpate_models.wall`."""
+    prony_g: tuple[NonNegative, ...] = (0.3, 0.2)
+    """Relaxing fractions of the instantaneous modulus."""
+    prony_tau_s: tuple[Positive, ...] = (1.86, 51.3)
+    """Their time constants."""
+    dashpot_s: Annotated[float, Field(gt=0, le=1)] = 0.05
+    """Dashpot over foundation modulus, C = dashpot_s * k_w."""
+    friction: Annotated[float, Field(ge=0, le=2)] = 0.3
+    """Coulomb friction between indenter and skin."""
+
+    @model_validator(mode="after")
+    def _prony(self) -> Stiffness:
+        if len(self.prony_g) != len(self.prony_tau_s):
+            raise ValueError("prony_g and prony_tau_s need as many entries as each other")
+        if sum(self.prony_g) >= 1:
+            raise ValueError(f"prony_g must sum to less than 1, not {sum(self.prony_g)}")
+        return self
+
+
+class Registration(Section):
+    """Where the patient lies. Exam input is the true pose composed with the error."""
+
+    true: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
+    """X_WA: abdomen in world."""
+    error: Pose = Pose()
+    """What registration gets wrong, in A."""
+
+
+class Phantom(Section):
+    """The abdomen. Reaches only tissue and scoring, but for `pose`."""
+
+    kind: Literal["parametric", "mesh"] = "parametric"
+    mesh: str | None = None
+    """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
+    size_m: tuple[Length, Length, Length] = (0.36, 0.46, 0.20)
+    """Width, length and height of the parametric abdomen."""
+    edge_m: Annotated[float, Field(ge=0.0025, le=0.02)] = 0.005
+    """Longest mesh edge in the examined region."""
+    stiffness: Stiffness = Stiffness()
+    background: Background = Background()
+    lesions: tuple[Lesion, ...] = ()
+    breathing: Breathing = Breathing()
+    pose: Registration = Registration()
+
+    @model_validator(mode="after")
+    def _mesh(self) -> Phantom:
+        if (self.kind == "mesh") != (self.mesh is not None):
+            raise ValueError("kind: mesh needs mesh: FILE, and mesh: FILE needs kind: mesh")
+        return self
