@@ -108,9 +108,9 @@ class Reaction:
     """What was measured; times in ms of simulated time, forces true."""
 
     causes: list[int]
-    """Of the supervisor's stops, one after the other."""
+    """Causes of the supervisor's stops, one after the other."""
     reason: str
-    """Of the first."""
+    """Reason of the first stop."""
     to_stop: float
     """From the first true breach (or the event) to the supervisor's first stop."""
     to_hold: float
@@ -118,7 +118,7 @@ class Reaction:
     force_at_stop: float
     peak_force: float
     speed_after: float
-    """Of the tool, 1.5 s later [m/s]."""
+    """Speed of the tool 1.5 s later [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,9 @@ class Case:
     """What goes wrong in contact, and from when on the reaction is counted."""
 
     cause: int
-    """Of the first stop."""
+    """Cause of the first stop."""
     velocity: Callable[[np.ndarray], np.ndarray] = lambda n: np.zeros(3)
-    """Of the set-point [m/s], given the outward normal n."""
+    """Velocity of the set-point [m/s], given the outward normal n."""
     settings: tuple[str, ...] = ()
     tamper: tuple[str, Callable[[dict[str, Any]], bool]] | None = None
     """A role, and what happens to its messages once."""

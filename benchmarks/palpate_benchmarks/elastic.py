@@ -33,7 +33,7 @@ SIZES = (1_000, 3_000, 10_000, 50_000)
 SURFACE_EVERY = contract().topics["sim/surface"].period // contract().roles["tissue"].period
 """Steps between two messages of the deformed surface."""
 _HALF_M = 0.13
-"""Of the flat patch of the size sweep, as large as an abdomen's front."""
+"""Half width of the flat patch of the size sweep [m], as large as an abdomen's front."""
 
 
 def measure(steps: int = 4000) -> dict[str, float]:

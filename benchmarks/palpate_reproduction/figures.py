@@ -24,7 +24,7 @@ from palpate_validation.check import Section
 
 DPI: Final = 100
 COLOURS: Final = 192
-"""Of the palette that large pictures are reduced to, to keep them small."""
+"""Colours of the palette that large pictures are reduced to, to keep them small."""
 ROOM: Final = Viewpoint((1.60, -1.50, 1.95), (0.36, 0.02, 1.22), 40.0)
 CLOSE: Final = Viewpoint((1.10, -0.62, 1.32), (0.54, -0.02, 0.96), 30.0)
 

@@ -33,7 +33,7 @@ class ReproductionCase:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         return f"{self.pattern}_{self.mode}"
 
 

@@ -55,6 +55,6 @@ class Section:
     checks: tuple[Check, ...]
     draw: Draw | None = None
     size_in: tuple[float, float] = (7.0, 3.2)
-    """Of the figure [inch]."""
+    """Width and height of the figure [inch]."""
     data: Mapping[str, Any] = field(default_factory=dict)
     """The numbers behind the figure, for validate.json: anything that JSON takes, and arrays."""

@@ -73,7 +73,7 @@ class Ringing:
     time: Array
     """[s]"""
     force: Array
-    """Of the tissue on the indenter, along the vertical [N]."""
+    """Force of the tissue on the indenter, along the vertical [N]."""
     held: bool
     """Whether the driver gave up into its safe hold."""
 

@@ -80,9 +80,9 @@ class Flesh:
     k_e: float
     """Stiffness against displacement differences along an edge [N/m]."""
     damping: float
-    """Of a vertex [N s/m]."""
+    """Damping of a vertex [N s/m]."""
     mass: float
-    """Of a vertex [kg]."""
+    """Mass of a vertex [kg]."""
 
     def at_rest(self, dt: float) -> float:
         """Part of a static contact force that DART reports at the step `dt` [s]."""

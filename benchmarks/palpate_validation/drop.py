@@ -46,7 +46,7 @@ class Drop:
     time: Array
     """Since the first contact [s]."""
     depth: Array
-    """Of its lowest point below the rest surface [m]; negative in the air."""
+    """Depth of its lowest point below the rest surface [m]; negative in the air."""
     force: Array
     """Normal force on it [N]."""
 

@@ -31,7 +31,7 @@ class Cycle:
     stored: Array
     """In springs, branches and friction."""
     depth: Array
-    """Of the sphere's lowest point below z = 0 [m]."""
+    """Depth of the sphere's lowest point below z = 0 [m]."""
     touched: int
     """Steps in contact."""
 

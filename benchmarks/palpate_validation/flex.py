@@ -65,7 +65,7 @@ class FlexBlock:
         self.data = mujoco.MjData(self.model)
         self._top = radius + SKIN_M
         self.depth = 0.0
-        """Of the sphere below the block's top [m]."""
+        """Depth of the sphere below the block's top [m]."""
 
     @property
     def vertices(self) -> int:

@@ -62,7 +62,7 @@ class Loop:
     J: Array
     """Jacobian of the contact point, x, y and z of world, shape (3, 7)."""
     shear: float
-    """Of the sticking skin [N/m]."""
+    """Shear stiffness of the sticking skin [N/m]."""
     response: Array
     """Force over a step of depth [N/m], a value a millisecond, shape (n,)."""
 

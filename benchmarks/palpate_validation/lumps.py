@@ -33,9 +33,9 @@ class LumpRatios:
 
     tissue: Array
     continuum: Array
-    """Of the same equations and edge, converged."""
+    """Result of the same equations and edge, converged."""
     sharp: Array
-    """Of the continuum with a sharp edge at the same outline."""
+    """Result of the continuum with a sharp edge at the same outline."""
     design_radius: Array
     """Radius [m] of the sharp lump that gives the design table's ratio."""
 

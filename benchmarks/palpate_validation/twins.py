@@ -20,7 +20,7 @@ from palpate_validation.dart_scene import Ellipsoid, Flesh, SoftBox
 IntArray = NDArray[np.int32]
 
 AREA_M2 = 2.5e-5
-"""Of a vertex; any value gives the same tissue."""
+"""Area of a vertex [m^2]; any value gives the same tissue."""
 
 
 def twin(flesh: Flesh) -> WinklerTissue:

@@ -26,7 +26,7 @@ RAISED_M = 0.035
 CLEARANCE_M = 0.05
 """Between base and table [A]."""
 BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
-"""Of the base placement: x, y, height [m], yaw [rad]."""
+"""Least and largest x, y and height [m] and yaw [rad] of the base."""
 STARTS: tuple[tuple[float, float, float, float], ...] = (
     (0.0, 0.0, 0.6, 0.0),
     (0.0, 0.0, 1.1, 0.0),
@@ -48,7 +48,7 @@ class Placement:
     cost: float
     """Objective before rounding [1]."""
     postures: PostureSequence
-    """Of the grid's targets, contact first, then raised."""
+    """Postures at the grid's targets, in contact first, then raised."""
 
 
 def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised: float = 0.0) -> tuple[Array, Array]:

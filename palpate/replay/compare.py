@@ -72,7 +72,7 @@ class TopicResult:
     messages: int = 0
     """Compared."""
     identical: int = 0
-    """Of these, equal byte for byte."""
+    """How many of the compared messages are equal byte for byte."""
     missing: int = 0
     """Recorded, but not sent now."""
     extra: int = 0

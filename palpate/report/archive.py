@@ -52,7 +52,7 @@ class Evidence:
     """A run as its report sees it; n exam states and m true contacts, in order of time."""
 
     time: Array
-    """Of the exam states [s], shape (n,)."""
+    """Times of the exam states [s], shape (n,)."""
     phase: NDArray[np.uint8]
     """ExamState.PHASE_*, shape (n,)."""
     depth: Array
@@ -70,7 +70,7 @@ class Evidence:
     """Targets given up so far."""
     target_count: int
     true_time: Array
-    """Of the true contact [s], shape (m,)."""
+    """Times of the true contact [s], shape (m,)."""
     true_depth: Array
     """[m]"""
     true_force: Array

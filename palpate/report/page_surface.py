@@ -27,7 +27,7 @@ class Layer:
 
     name: str
     colors: tuple[str, ...]
-    """Of its scale, from low to high, as #rrggbb."""
+    """Colours of its scale, from low to high, as #rrggbb."""
     ticks: tuple[str, ...]
     """Words of the scale, evenly spaced from low to high."""
 

@@ -20,7 +20,7 @@ from palpate_models.scenario import Scenario
 
 _NAMESPACE = uuid.UUID("6f1f5a0e-6a0c-5c7e-9a39-0d9b5c1f4a11")
 _EPOCH = (2020, 1, 1, 0, 0, 0)
-"""Of every file in the archive, so that the same phantom gives the same bytes."""
+"""Date of every file in the archive, so that the same phantom gives the same bytes."""
 
 
 def source_folder() -> Path:

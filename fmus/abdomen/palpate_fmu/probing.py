@@ -22,7 +22,7 @@ class Probing:
     time: Array
     """[s]"""
     depth: Array
-    """Of the sphere's lowest point below the rest surface [m]."""
+    """Depth of the sphere's lowest point below the rest surface [m]."""
     force: Array
     """On the sphere, along the surface normal [N]."""
     contacts: NDArray[np.int32]

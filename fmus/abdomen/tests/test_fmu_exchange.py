@@ -77,7 +77,7 @@ def test_cvode_agrees_with_the_co_simulation(coarse: Path) -> None:
 
 @pytest.mark.parametrize("sliding", [False, True], ids=["sticking", "sliding"])
 def test_directional_derivatives_are_those_of_finite_differences(fmu: Path, sliding: bool) -> None:
-    """Of all outputs and rates by all inputs, states and time, in contact, breathing."""
+    """All outputs and rates are differentiated by all inputs, states and time, in contact, while the body breathes."""
     inputs = {
         "indenter_position": np.array([-0.049, -0.051, 0.0065]),
         "indenter_velocity": np.array([0.02, -0.01, -0.02]),

@@ -19,7 +19,7 @@ from palpate_models.phantom.field import smoothstep
 from palpate_models.phantom.mesh import orient, vertex_normals
 
 EXPONENT = 2.4
-"""Of the superellipse: flatter in front than an ellipse, as a relaxed supine belly is."""
+"""Exponent of the superellipse: flatter in front than an ellipse, as a relaxed supine belly is."""
 DOME_M = 0.014
 """The crown line's fall at both ends."""
 UMBILICUS_M = (0.0015, 0.009)

@@ -12,7 +12,7 @@ from palpate_bus.contract import MS, Topic
 from palpate_bus.contract.conformance import Checker
 
 RATE_TOLERANCE = 0.2
-"""Of a live implementation, over the whole check."""
+"""Largest relative error of a live implementation's rate, over the whole check."""
 STAMP_TOLERANCE_MS = 100.0
 """Beyond the slack."""
 LOST = 0.05

@@ -21,7 +21,7 @@ class CubicPieces(NamedTuple):
     knots: Array
     """[s], shape (n,)."""
     coefficients: Array
-    """Of (s - knot)^3, (s - knot)^2, s - knot and 1 between the knots, shape (4, n - 1, m)."""
+    """Coefficients of (s - knot)^3, (s - knot)^2, s - knot and 1 between the knots, shape (4, n - 1, m)."""
 
 
 class BicubicSpline(NamedTuple):

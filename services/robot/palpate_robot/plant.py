@@ -49,14 +49,14 @@ class Plant(Protocol):
         ...
 
     def tool_motion(self) -> Array:
-        """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
+        """The indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
         The linear velocity is that of the sphere's centre.
         """
         ...
 
     def link_poses(self) -> Array:
-        """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
         ...
 
     def contacts(self) -> int:

@@ -22,7 +22,7 @@ def _settle(plant: DartPlant, force: np.ndarray = NOTHING, moment: np.ndarray = 
 
 
 def _centre_of_mass(robot: Robot) -> np.ndarray:
-    """Of what is below the sensor, in its frame [m]."""
+    """Centre of mass of what is below the sensor, in its frame [m]."""
     inertias = lbr.inertias(robot)
     standoff, sphere = inertias["ft_sensor"], inertias["indenter"]
     at = np.array([0.0, 0.0, lbr.FT_TO_INDENTER_M])

@@ -22,7 +22,7 @@ class Tool(NamedTuple):
     p_W: Array
     """Centre of the sphere [m], shape (3,)."""
     speed: float
-    """Of the centre [m/s]."""
+    """Speed of the centre [m/s]."""
     force: float
     """Magnitude of the external force [N]: the reading less the tool's weight, untared, so the sensor's bias is in it."""
 

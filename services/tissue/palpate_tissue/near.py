@@ -25,7 +25,7 @@ class Near(NamedTuple):
     reach: float
     """How far the centre may go from there [m]."""
     radius: float
-    """Of the sphere [m]."""
+    """Radius of the sphere [m]."""
     vertex: NDArray[np.intp]
     """Which of the vertices searched, ascending, shape (m,)."""
     n: Array

@@ -139,7 +139,7 @@ class Kinematics:
 
 
 def _masses(robot: Robot) -> tuple[Array, Array]:
-    """Of each moving link its mass [kg], shape (7,), and its centre in the link [m], shape (7, 3), with what is fixed to it."""
+    """Mass [kg], shape (7,), and centre in the link [m], shape (7, 3), of each moving link with what is fixed to it."""
     links = list(lbr.inertias(robot).values())[1:]  # the first does not move
     mass, centre = np.array([link.mass for link in links]), np.array([link.com for link in links])
     centre[7:, 2] += _MOUNTS

@@ -215,14 +215,14 @@ class DartPlant:
         return -fx, -fy, -fz, -mx, -my, -mz
 
     def tool_motion(self) -> Array:
-        """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
+        """The indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
         The linear velocity is that of the sphere's centre.
         """
         return self._state()[:13]
 
     def link_poses(self) -> Array:
-        """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
         return self._kinematics.links(self.q)
 
     def link_pose(self, link: str) -> tuple[Array, Any]:

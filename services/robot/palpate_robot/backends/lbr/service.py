@@ -39,7 +39,8 @@ DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
 arm's own viscous friction (10) that is stable with any delay; more is for the joints with inertia for it."""
 LINKS_PERIOD = contract().topics["sim/link_poses"].period
 FT_AGE = 50_000_000
-"""An F/T reading older than this is none [ns]."""
+"""An F/T reading older than this [ns] counts as none. Longer than the contract's age of ft/wrench, which is what a reader of the
+bus may rely on: a sensor's driver on another computer may send no more than 50 readings a second."""
 TAKE_OVER = 100_000_000
 """For so long after its first command [ns] the driver lets others finish: the watchdog commands until it hears a new driver."""
 _NAMES = list(lbr.JOINT_NAMES)

@@ -20,6 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from palpate_bus.contract import MS, contract
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.frames import Array
@@ -29,8 +30,8 @@ from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueComma
 
 log = logging.getLogger("watchdog")
 
-TIMEOUT_NS: Final = 50_000_000
-"""Without a command for so long the watchdog takes over: the contract's expiry of control/joint_torque."""
+TIMEOUT_NS: Final = (contract().topics["control/joint_torque"].expiry_ms or 0) * MS
+"""Without a command for so long [ns] the watchdog takes over."""
 DAMPING: Final = np.full(7, 8.0)
 """[N m s/rad], below the arm's own friction: stable with any delay."""
 PERIOD_S: Final = 0.002

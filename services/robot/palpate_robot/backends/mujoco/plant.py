@@ -111,7 +111,7 @@ class MujocoPlant:
         return -fx, -fy, -fz, -mx, -my, -mz
 
     def tool_motion(self) -> Array:
-        """Of the indenter in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
+        """The indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
         The linear velocity is that of the sphere's centre.
         """
@@ -121,7 +121,7 @@ class MujocoPlant:
         return np.concatenate((self._xpos[body], quaternion[1:], quaternion[:1], twist[3:], twist[:3]))
 
     def link_poses(self) -> Array:
-        """Of each link of `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
         quaternions = self._xquat[self._bodies]  # w first
         return np.column_stack((self._xpos[self._bodies], quaternions[:, 1:], quaternions[:, :1]))
 

@@ -32,7 +32,7 @@ from palpate_tissue.backends.elastic.solid import Grid, graded_grid, skin_compli
 Array32 = NDArray[np.float32]
 
 PITCH_M = 0.0125
-"""Of the finite elements for the healthy body; those for a lesion near the skin are finer."""
+"""Edge of the finite elements of the healthy body [m]; those of a lesion near the skin are finer."""
 GRID_HALF_M = 0.13
 """They are even over at most this half width and length: 0.1 m of region, and a margin."""
 POISSON = 0.49

@@ -56,11 +56,11 @@ class Pressed:
     force_n: float
     """Along the slab's outward normal, on the indenter."""
     displacement_m: Array
-    """Of every vertex, inward, shape (n,)."""
+    """Inward displacement of every vertex, shape (n,)."""
     vertex_force_n: Array
     """On every vertex, inward, shape (n,)."""
     contact_radius_m: float
-    """Of the circle that is as large as the area of the vertices in contact."""
+    """Radius of the circle that is as large as the area of the vertices in contact."""
 
 
 class FlatSlab:

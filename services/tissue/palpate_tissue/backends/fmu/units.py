@@ -27,7 +27,7 @@ class Unit:
     """value [SI] = factor * value + offset."""
 
     exponents: tuple[int, ...]
-    """Of BASES."""
+    """The exponent of each unit in `BASES`."""
     factor: float = 1.0
     offset: float = 0.0
 
