@@ -7,7 +7,6 @@ may go (grants), which roles were lost, and when to stop. A node never hangs: it
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
 from time import perf_counter_ns
 from typing import Any
 
@@ -15,31 +14,22 @@ import numpy as np
 
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.messages import Advance, RunControl, ServiceReport, codec
-from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
-from palpate_bus.runtime.failure import described
-from palpate_bus.runtime.lockstep import NEVER, InputBuffer, Received, Sent, Stepper
+from palpate_bus.runtime.lockstep import NEVER, InputBuffer, Received, Sent
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.output import ServiceOutput
+from palpate_bus.runtime.node import POLL_S, Node
 from palpate_bus.service import Service
 from palpate_bus.wire.transport import ReceivedSample
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.05
-"""How often a waiting node looks for control messages."""
 
-
-class LockstepNode:
+class LockstepNode(Node):
     """One service in distributed lockstep."""
 
     def __init__(self, service: Service, member: Member) -> None:
+        super().__init__(service, member, strict=True)
         rules = member.rules
-        self._service = service
-        self._stepper = Stepper(service, rules)
         self._role = self._stepper.role
-        self._now = member.transport.now
-        self._link = ConductorLink(member)
-        self._output = ServiceOutput(member)
         self._data = {name: member.subscription(buffer.topic) for name, buffer in self._stepper.buffers.items()}
         advance_type = "palpation_msgs/msg/Advance"
         producers = sorted({b.topic.producer for b in self._stepper.buffers.values() if b.edge.blocking and not b.topic.periodic})
@@ -58,30 +48,8 @@ class LockstepNode:
         self._observed = tuple(b for b in self._stepper.buffers.values() if b.edge is Edge.OBSERVE)
         self._horizon = NEVER
         self._last = False
-        self._tick = NEVER
 
-    def run(self) -> None:
-        """Runs the service to the end of the run. Raises what the service raises, after reporting it, or RunAborted."""
-        try:
-            self._handshake()
-            latched = self._stepper.start()
-            self._output.send(latched)
-            self._output.record(latched, 0)
-            self._loop()
-            self._report_end()
-        except RunAborted:
-            self._service.finish()
-            raise
-        except Exception as error:
-            with suppress(Exception):
-                self._output.flush(self._tick)  # what others have heard belongs in the recording
-            words = described(error, self._stepper.buffers.values())
-            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
-            with suppress(Exception):
-                self._service.finish()  # what it has open is closed
-            raise
-
-    def _handshake(self) -> None:
+    def _join(self) -> None:
         """Answers the conductor's hellos until it grants the first tick."""
         inputs = [self._data[b.topic.name] for b in self._blocking] + list(self._advances.values())
         while self._horizon < 0:
@@ -192,23 +160,13 @@ class LockstepNode:
         while (sample := data.get(0)) is not None:
             buffer.deliver(Received(sample.payload, t, sample.sequence))
 
-    def _report_end(self) -> None:
-        """Reports digests, blame and the service's own facts, and waits for the conductor's receipt."""
-        self._output.flush(self._tick)
-        facts = dict(self._service.finish())
+    def _counts(self) -> dict[str, Any]:
         subscriptions = (*self._data.values(), *self._advances.values())
-        detail = {
+        return {
             "digests": self._stepper.digests(),
-            "blame": self._stepper.blame.per_step_us(),
             "garbage": sum(s.garbage for s in subscriptions) + self._link.garbage,
             "foreign": sum(s.foreign for s in subscriptions),
-            "facts": facts,
         }
-        self._link.report(ServiceReport.FINISHED, self._tick, detail=detail)
-        while True:
-            message = self._link.poll(POLL_S)
-            if message is not None and message.command == RunControl.END:
-                return
 
 
 def _event_topics(rules: Contract, role: str) -> tuple[str, ...]:

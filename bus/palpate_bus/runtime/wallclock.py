@@ -10,19 +10,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import suppress
 from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
 
 from palpate_bus.contract import MS, Edge
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
-from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
-from palpate_bus.runtime.failure import described
+from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.latency import LatencyHistogram
-from palpate_bus.runtime.lockstep import NEVER, Received, Sent, Stepper
+from palpate_bus.runtime.lockstep import NEVER, Received, Sent
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.output import ServiceOutput
+from palpate_bus.runtime.node import Node
 from palpate_bus.runtime.priority import by_period, give_way
 from palpate_bus.service import Service
 
@@ -46,15 +44,11 @@ def _on_monotonic_clock(wall: int, now: Callable[[], int]) -> int:
             return (before + after) // 2 + wall - read
 
 
-class WallClockNode:
+class WallClockNode(Node):
     """One service on its own timer."""
 
     def __init__(self, service: Service, member: Member) -> None:
-        self._service = service
-        self._stepper = Stepper(service, member.rules, strict=False)
-        self._now = member.transport.now
-        self._link = ConductorLink(member)
-        self._output = ServiceOutput(member)
+        super().__init__(service, member, strict=False)
         self._data = {
             name: member.subscription(buffer.topic, history=buffer.topic.latched)
             for name, buffer in self._stepper.buffers.items()
@@ -66,29 +60,12 @@ class WallClockNode:
         self.skips = 0
         self._ages = {name: LatencyHistogram() for name in self._data}
         self._end: int | None = None
-        self._tick = NEVER
+        self._epoch = 0
+        """The common start of the run on this process's monotonic clock [ns]."""
 
-    def run(self) -> None:
-        """Runs until the conductor ends the run."""
-        try:
-            give_way(by_period(self._stepper.role.period))
-            epoch = self._await_start()
-            latched = self._stepper.start()
-            self._output.send(latched)
-            self._output.record(latched, 0)
-            self._loop(epoch)
-            self._finish()
-        except RunAborted:
-            self._service.finish()
-            raise
-        except Exception as error:
-            with suppress(Exception):
-                self._output.flush(self._tick)  # what others have heard belongs in the recording
-            words = described(error, self._stepper.buffers.values())
-            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
-            with suppress(Exception):
-                self._service.finish()  # what it has open is closed
-            raise
+    def _join(self) -> None:
+        give_way(by_period(self._stepper.role.period))
+        self._epoch = self._await_start()
 
     def _await_start(self) -> int:
         """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns].
@@ -124,7 +101,8 @@ class WallClockNode:
         elif message.command == RunControl.GRANT and message.last:
             self._end = int(message.tick)
 
-    def _loop(self, epoch: int) -> None:
+    def _loop(self) -> None:
+        epoch = self._epoch
         period = self._stepper.role.period
         catch_up = CATCH_UP if self._stepper.role.critical and self._service.catches_up else period
         t = self._await_inputs(epoch)
@@ -188,12 +166,9 @@ class WallClockNode:
                     continue
                 buffer.deliver(received)
 
-    def _finish(self) -> None:
-        self._output.flush(self._tick)
-        facts = dict(self._service.finish())
-        detail = {
+    def _counts(self) -> dict[str, Any]:
+        return {
             "digests": {},
-            "blame": self._stepper.blame.per_step_us(),
             "garbage": sum(s.garbage for s in self._data.values()) + self._link.garbage,
             "foreign": sum(s.foreign for s in self._data.values()),
             "gaps": self.gaps,
@@ -201,10 +176,4 @@ class WallClockNode:
             "overruns": self.overruns,
             "skips": self.skips,
             "age_ms": {name: ages.as_ms() for name, ages in self._ages.items() if ages.count},
-            "facts": facts,
         }
-        self._link.report(ServiceReport.FINISHED, self._tick, detail=detail)
-        while True:
-            message = self._link.poll(0.05)
-            if message is not None and message.command == RunControl.END:
-                return
