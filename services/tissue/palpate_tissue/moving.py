@@ -50,6 +50,7 @@ class MovingBody(Service):
             "sim/contact_wrench": self._wrench,
             "sim/surface": self._surface,
             "truth/indentation": self._indentation,
+            "truth/patient": self._patient,
         }
 
     def start(self) -> Outbox:
@@ -100,6 +101,10 @@ class MovingBody(Service):
     def _indentation(self, message: Any) -> Message:
         p_W = self._X_WV[:3, :3] @ vector(message.surface_point) + self._X_WV[:3, 3]
         return replace(message, surface_point=Point(*p_W.tolist()))
+
+    def _patient(self, message: Any) -> Message:
+        X_WA = self._X_WV @ pose_matrix(message.pose)
+        return replace(message, pose=pose_message(X_WA[:3, :3], X_WA[:3, 3]))
 
 
 class _AlongInbox:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from test_tissue_service import OneTopic, tool_state, vector
 
 from palpate_bus.contract import MS
 from palpate_bus.messages.geometry import pose_matrix
+from palpate_bus.service import Service
 from palpate_models.frames import apply, matrix
 from palpate_models.motion import BodyMotion, Motion
 from palpate_models.patient import Lesion, Phantom, Registration
 from palpate_models.scenario import Scenario
 from palpate_models.section import Pose
+from palpate_tissue.backends.fmu.service import create as create_fmu
 from palpate_tissue.backends.winkler.service import create
 from palpate_tissue.moving import MovingBody
 
@@ -32,9 +37,9 @@ def body_poses(case: Scenario) -> tuple[np.ndarray, np.ndarray]:
     return X_WA, X_WA @ BodyMotion(case.phantom.motion, case.seed).pose(10.0)
 
 
-def pressed(case: Scenario, X_WA: np.ndarray, start: int = AFTER) -> dict[str, object]:
+def pressed(case: Scenario, X_WA: np.ndarray, make: Callable[[Scenario], Service] = create) -> dict[str, Any]:
     """What is sent when the indenter presses and slides, along a path in A, on a body that is at X_WA."""
-    service, inbox, out = create(case), OneTopic(), {}
+    service, inbox, out, start = make(case), OneTopic(), {}, AFTER
     service.start()
     for k in range(start + 151):
         share = np.clip((k - start) / 100, 0, 1)
@@ -57,10 +62,22 @@ def test_the_moved_body_pressed_at_the_moved_place_feels_as_before(motion):
     assert after["truth/indentation"].depth == pytest.approx(before["truth/indentation"].depth, abs=1e-12)
     points = [vector(out["truth/indentation"].surface_point) for out in (before, after)]
     np.testing.assert_allclose(points[1], apply(X_WM @ np.linalg.inv(X_WA), points[0][None])[0], atol=1e-12)
+    np.testing.assert_allclose(pose_matrix(after["truth/patient"].pose), X_WM, atol=1e-12)
+    np.testing.assert_allclose(pose_matrix(before["truth/patient"].pose), X_WA, atol=1e-12)
     skins = [out["sim/surface"].vertices.reshape(-1, 3) for out in (before, after)]
     np.testing.assert_allclose(skins[1], apply(X_WM @ np.linalg.inv(X_WA), skins[0]), atol=3e-7)
     normals = [out["sim/surface"].normals.reshape(-1, 3) @ X[:3, :3] for X, out in ((X_WA, before), (X_WM, after))]
     np.testing.assert_allclose(normals[1], normals[0], atol=1e-6)
+
+
+def test_an_fmu_is_carried_along_as_well():
+    case = scenario(MOVED[1])
+    _, X_WM = body_poses(case)
+    native, hosted = pressed(case, X_WM), pressed(case, X_WM, create_fmu)
+    force = vector(native["sim/contact_wrench"].wrench.force)
+    np.testing.assert_allclose(vector(hosted["sim/contact_wrench"].wrench.force), force, atol=1e-9 * np.linalg.norm(force))
+    np.testing.assert_allclose(hosted["sim/surface"].vertices, native["sim/surface"].vertices, atol=3e-7)
+    assert hosted["truth/patient"] == native["truth/patient"]
 
 
 @pytest.mark.parametrize("motion", MOVED, ids=lambda motion: motion.kind)
