@@ -58,7 +58,7 @@ def path(surface: SkinSurface) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @pytest.mark.parametrize(
     "settings",
-    [(), ("phantom.breathing.amplitude_m=0.004",), ("phantom.edge_m=0.0035",)],
+    [(), ("phantom.breathing.kind=quiet",), ("phantom.edge_m=0.0035",)],
     ids=["default", "breathing", "fine mesh"],
 )
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
         "pasternak_length": material.length_m,
         "dashpot": material.dashpot_s,
         "friction": material.friction,
-        "breathing_amplitude": breathing.amplitude_m,
+        "breathing_amplitude": 0.0 if breathing.kind == "none" else breathing.peak_to_peak_m / 2,
         "breathing_rate": breathing.rate_per_min,
         "lesion_count": len(lesions),
         "prony_g": [*material.prony_g, *[0.0] * (BRANCHES - len(material.prony_g))],

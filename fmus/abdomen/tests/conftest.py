@@ -11,7 +11,9 @@ from palpate_fmu.export import build_fmu
 from palpate_models.breathing import Breathing
 from palpate_models.patient import Lesion, Phantom
 
-PHANTOM = Phantom(lesions=(Lesion(centre_m=(-0.05, -0.05)),), breathing=Breathing(amplitude_m=0.002), edge_m=0.008)
+PHANTOM = Phantom(
+    lesions=(Lesion(centre_m=(-0.05, -0.05)),), breathing=Breathing(kind="quiet", peak_to_peak_m=0.004), edge_m=0.008
+)
 
 
 @pytest.fixture(scope="session")

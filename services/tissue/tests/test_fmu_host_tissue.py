@@ -23,7 +23,7 @@ from palpate_tissue.backends.fmu.mapping import MapError, load_map
 from palpate_tissue.backends.fmu.service import create, hosted
 from palpate_tissue.backends.winkler.service import create as create_winkler
 
-SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.amplitude_m=0.003", "phantom.pose.true.rpy_rad=[0.05, -0.1, 0.3]")
+SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.kind=quiet", "phantom.pose.true.rpy_rad=[0.05, -0.1, 0.3]")
 
 
 @pytest.fixture(scope="module")

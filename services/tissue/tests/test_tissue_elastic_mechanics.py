@@ -243,11 +243,14 @@ def test_no_closed_cycle_yields_work(seed: int) -> None:
 
 
 def test_breathing_lifts_the_skin_into_the_sphere() -> None:
-    tissue = ElasticTissue(flat(), solid(), ELASTIC, BreathingCurve(Breathing(amplitude_m=0.006, rate_per_min=15), 0))
-    forces = [tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.015)), STILL, 0.015)[0][2] for k in range(4000)]
-    assert max(forces) > 0.5
-    assert forces[1000] == pytest.approx(max(forces), rel=0.05)  # a quarter of the period
-    assert min(forces[2100:3900]) == 0
+    breathing = BreathingCurve(Breathing(kind="quiet", peak_to_peak_m=0.008, depth_cv=0, pause=0.2), 0)
+    tissue = ElasticTissue(flat(), solid(), ELASTIC, breathing)
+    start, inspiration, expiration, pause, _ = breathing.table[1]
+    steps = round(1000 * (start + inspiration + expiration + pause))
+    forces = [tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.015)), STILL, 0.015)[0][2] for k in range(steps)]
+    assert max(forces[500:]) > 0.5  # at the first step somebody is in the middle of a breath: that is a jump
+    assert forces[round(1000 * (start + inspiration))] == pytest.approx(max(forces[500:]), rel=0.05)
+    assert forces[-1] == 0
 
 
 def test_sliding_friction_is_coulombs() -> None:

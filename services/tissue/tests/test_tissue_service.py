@@ -10,7 +10,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models.breathing import Breathing
+from palpate_models.breathing import Breathing, BreathingCurve
 from palpate_models.frames import matrix
 from palpate_models.patient import Lesion, Phantom, Registration
 from palpate_models.phantom import build_phantom
@@ -142,14 +142,17 @@ def test_surface_shows_the_dent():
 
 
 def test_without_a_tool_the_abdomen_breathes_and_exerts_nothing():
-    service = create(scenario(breathing=Breathing(amplitude_m=0.006, rate_per_min=15)))
+    breathing = Breathing(kind="quiet", peak_to_peak_m=0.012, depth_cv=0, duration_cv=0)
+    service, curve = create(scenario(breathing=breathing)), BreathingCurve(breathing, 0)
     inbox, tops = OneTopic(), []
-    for k in range(0, 4001):
+    for k in range(0, 4301):
         out = service.step(k * MS, inbox)
         assert not vector(out["sim/contact_wrench"].wrench.force).any()
+        if "truth/patient" in out:
+            assert out["truth/patient"].excursion == curve.excursion(k / 1000)
         if "sim/surface" in out:
             tops.append(out["sim/surface"].vertices.reshape(-1, 3)[:, 2].max())
-    assert 0.010 < max(tops) - min(tops) <= 0.0121
+    assert 0.0115 < max(tops) - min(tops) <= 0.0121
 
 
 def test_report_counts_contact():
