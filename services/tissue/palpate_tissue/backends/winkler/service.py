@@ -5,6 +5,7 @@ from __future__ import annotations
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_models.breathing import BreathingCurve
+from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
@@ -26,4 +27,4 @@ def create(scenario: Scenario) -> TissueService:
         "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),
         "substeps": tissue.substeps,
     }
-    return TissueService(tissue, model, phantom.pose.true, facts)
+    return TissueService(tissue, model, true_pose(scenario), facts)
