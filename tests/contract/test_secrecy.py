@@ -135,7 +135,9 @@ def leaking_environment(scenario: Scenario, out: Path) -> Any:
 def test_two_patients_who_differ_in_seed_alone_are_the_same_to_who_may_not_know(hand: Hand, tmp_path: Path) -> None:
     found = told_apart(hand, tmp_path)
     assert {role: found[role] for role in UNKNOWING} == {role: [] for role in UNKNOWING}
-    assert all(found[role] for role in ROLES if role not in UNKNOWING), "these are told who the patient is, or what the errors are"
+    assert all(found[role] for role in ROLES if role not in UNKNOWING), (
+        "these are told who the patient is, or what the errors are"
+    )
 
 
 @pytest.mark.parametrize("hand", [leaking_file, leaking_seed, leaking_folder, leaking_environment])
