@@ -74,7 +74,10 @@ def _add_shape(body: Any, capsule: lbr.Capsule) -> None:
 
 
 def build(robot: Robot, drawn: DrawnArm = NOMINAL_ARM) -> Any:
-    """The compiled model of the nominal robot with an arm that differs as `drawn` says: bodies named as in `lbr.LINK_NAMES`, seven joints, force and torque sensors at the measuring face."""
+    """The compiled model of the nominal `robot` with an arm that differs from it as `drawn` says.
+
+    Bodies are named as in `lbr.LINK_NAMES`; it has seven joints, and force and torque sensors at the measuring face.
+    """
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.compiler.balanceinertia = False
