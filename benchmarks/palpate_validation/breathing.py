@@ -82,8 +82,9 @@ def read(excursion: Array) -> Breaths:
     rest = rest[rest > rise[0]][: len(rise) - 1]
     pairs = list(zip(rise[:-1], rest, strict=True))
     top = np.array([a + int(np.argmax(excursion[a : b + 1])) for a, b in pairs])
-    depth = excursion[top]
-    return Breaths(STEP_S * (top - rise[:-1]), STEP_S * (rest - top), STEP_S * (rise[1:] - rest), depth)
+    steps = (top - rise[:-1], rest - top, rise[1:] - rest)
+    up, down, still = (STEP_S * count.astype(np.float64) for count in steps)
+    return Breaths(up, down, still, excursion[top])
 
 
 def measure(patients: int = PATIENTS) -> Measured:
@@ -133,16 +134,12 @@ def section(found: Measured | None = None) -> Section:
     rate, slow = (60 / float(_pooled(breaths, "duration").mean()) for breaths in (quiet, deep))
     ratio = float((_pooled(quiet, "expiration") / _pooled(quiet, "inspiration")).mean())
     share = depth_mm / (1e3 * float(_pooled(deep, "depth").mean()))
+    pause = 100 * float((_pooled(quiet, "pause") / _pooled(quiet, "duration")).mean())
     checks = (
         Check("breaths a minute, quiet", rate, "", 13.5, 14.5, "14, n = 100 (Ragnarsdottir 2006)"),
         Check("breaths a minute, deep", slow, "", 7.1, 7.7, "7.4 (the same)"),
         Check("expiration over inspiration", ratio, "", 1.14, 1.26, "1.21 men, 1.14 women (the same)"),
-        Check(
-            "pause, of a breath",
-            100 * float((_pooled(quiet, "pause") / _pooled(quiet, "duration")).mean()),
-            "%",
-            against="assumed",
-        ),
+        Check("pause, of a breath", pause, "%", against="assumed"),
         Check("depth at the navel, quiet", depth_mm, "mm", 5, 12, "5 to 12 mm, assumed"),
         Check("quiet over deep", share, "", None, 1 / 3, "less than a third, n = 100 (Kaneko 2012)"),
         Check("variation of duration from breath to breath", _cv(quiet, "duration"), "%", 18, 24, "20.8 % (Tobin 1988)"),
