@@ -315,7 +315,7 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(FileNotFoundError, match=r"exam\.yaml"):
         replay.main(tmp_path)
-    (tmp_path / "exam.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
+    (tmp_path / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
     again = Recording(replay.main(tmp_path))
     live = Recording(tmp_path / "live.rrd")
     pace = "/plots/pace/real_time_factor"  # of wall time, which a replay does not have

@@ -13,27 +13,28 @@ from palpate_bus.contract import MS
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Service
 from palpate_models.frames import apply, matrix
+from palpate_models.load import true_pose
 from palpate_models.motion import BodyMotion, Motion
-from palpate_models.patient import Lesion, Phantom, Registration
-from palpate_models.scenario import Scenario
+from palpate_models.patient import Lesion, Phantom
+from palpate_models.scenario import Exam, Scenario
 from palpate_models.section import Pose
 from palpate_tissue.backends.fmu.service import create as create_fmu
 from palpate_tissue.backends.winkler.service import create
 from palpate_tissue.moving import MovingBody
 
 MOVED = (Motion(kind="shift", at_s=0.02, over_s=0.1), Motion(kind="turn", at_s=0.02, over_s=0.1))
-LYING = Registration(true=Pose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.1, -0.05, 0.4)))
+LYING = Exam(pose=Pose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.1, -0.05, 0.4)))
 AFTER = 150
 """Tick at which the body lies still again."""
 
 
 def scenario(motion: Motion) -> Scenario:
-    return Scenario(seed=5, phantom=Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), pose=LYING, motion=motion, edge_m=0.008))
+    return Scenario(seed=5, exam=LYING, phantom=Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), motion=motion, edge_m=0.008))
 
 
 def body_poses(case: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """X_WA before, X_WA' after."""
-    X_WA = matrix(case.phantom.pose.true)
+    X_WA = matrix(true_pose(case))
     return X_WA, X_WA @ BodyMotion(case.phantom.motion, case.seed).pose(10.0)
 
 
@@ -93,7 +94,7 @@ def test_pressed_at_the_old_place_it_feels_otherwise(motion):
 def test_an_indenter_that_the_body_takes_along_is_not_rubbed(motion):
     """Held in the body's frame while that moves, it feels what an indenter feels that is held on a body at rest."""
     case = scenario(motion.model_copy(update={"at_s": 0.2}))
-    body, X_WA = BodyMotion(case.phantom.motion, case.seed), matrix(case.phantom.pose.true)
+    body, X_WA = BodyMotion(case.phantom.motion, case.seed), matrix(true_pose(case))
     p_A, forces = np.array((0.01, 0.02, 0.005)), []
     for moves in (False, True):
         service, inbox, felt = create(case if moves else scenario(Motion())), OneTopic(), []
