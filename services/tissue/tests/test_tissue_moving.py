@@ -29,8 +29,7 @@ AFTER = 150
 
 
 def scenario(motion: Motion) -> Scenario:
-    phantom = Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), motion=motion, edge_m=0.008)
-    return Scenario(seed=5, phantom=phantom, exam=LYING)
+    return Scenario(seed=5, exam=LYING, phantom=Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), motion=motion, edge_m=0.008))
 
 
 def body_poses(case: Scenario) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,6 @@ from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
 from palpate_models.frames import Array, matrix
 from palpate_models.load import true_pose
-from palpate_models.motion import BodyMotion
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
@@ -135,8 +134,7 @@ def create(scenario: Scenario) -> Service:
     else:
         with tempfile.TemporaryDirectory() as folder:
             service = hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
-    phantom = scenario.phantom
-    return carried(service, BodyMotion(phantom.motion, scenario.seed), true_pose(scenario))
+    return carried(service, scenario)
 
 
 def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
