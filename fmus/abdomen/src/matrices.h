@@ -16,7 +16,8 @@ typedef struct {
     int32_t *column;
     double *value;    /* K [N/m] */
     double *relative; /* C^-1 K [1/s] */
-    double rate;      /* largest eigenvalue of C^-1 K [1/s] */
+    double *most;     /* (n) what stiffening and tensed muscle add at most to the diagonal of K [N/m] */
+    double rate;      /* largest eigenvalue of C^-1 K with that added [1/s] */
     double *work;     /* (4 n) */
 } Matrices;
 

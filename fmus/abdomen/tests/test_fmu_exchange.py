@@ -13,7 +13,7 @@ from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 
 STEP_S = 1e-3
-STILL = {"breathing_amplitude": 0.0}
+STILL = {"breathing_scale": 0.0}
 OUTPUTS = ["contact_force", "contact_torque", "contacts", "surface_displacement"]
 
 
@@ -104,7 +104,7 @@ def test_directional_derivatives_are_those_of_finite_differences(fmu: Path, slid
         du["indenter_angular_velocity"], dt, h = rng.normal(size=3), 2.0, 1e-8
         low, high = (at(s * h * dx, {k: s * h * v for k, v in du.items()}, s * h * dt) for s in (-1, 1))
         at(0 * dx, {k: 0 * v for k, v in du.items()}, 0.0)
-        states = ("displacement", "relaxation", "skin_stretch")
+        states = ("displacement", "relaxation", "skin_stretch", "activation")
         parts = np.split(dx, np.cumsum([exchange.variables[name].size for name in states])[:-1])
         known = {"time": np.array([dt]), **du, **dict(zip(states, parts, strict=True))}
         found = exchange.derivative(names, known)
@@ -129,7 +129,7 @@ def test_at_rest_the_sphere_holds_its_vertices_exactly(coarse: Path) -> None:
 def test_bad_states_and_calls_are_refused(coarse: Path) -> None:
     with Exchange(coarse) as exchange:
         x = exchange.euler(np.zeros(exchange.states), 3)
-        for bad in (np.nan, np.inf, 2.0):
+        for bad in (np.nan, np.inf, 3.0):
             wrong = x.copy()
             wrong[5] = bad
             with pytest.raises(Exception, match="SetContinuousStates"):
