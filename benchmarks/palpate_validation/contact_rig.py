@@ -19,6 +19,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
+from palpate_bus.service import Service
 from palpate_bus.setpoint import TOPIC
 from palpate_control.service import create as create_control
 from palpate_models import lbr
@@ -32,7 +33,6 @@ from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.service import RobotService
 from palpate_tissue.backends.winkler.service import create as create_tissue
-from palpate_tissue.service import TissueService
 from palpate_validation.delays import BusDelay, Delayed
 
 DEPTH_M = 0.010
@@ -108,7 +108,7 @@ def scenario(contrast: float) -> Scenario:
 
 
 @cache
-def _tissue(contrast: float) -> TissueService:
+def _tissue(contrast: float) -> Service:
     """A tissue that has not been touched; a run takes a copy of it."""
     return create_tissue(scenario(contrast))
 

@@ -32,8 +32,8 @@ class Breathing(Section):
     """Breathing of the abdominal type. The wall's place at rest is that at the end of expiration."""
 
     kind: Literal["none", "quiet", "deep", "held"] = "none"
-    """`deep` has other values where none are given: 20 mm, 7.4 a minute, `depth_cv` 0.1. `held`: quiet breathing with stretches in
-    which the breath is held at the end of expiration."""
+    """`deep` has other values where none are given: 20 mm, 7.4 a minute, `depth_cv` 0.1. `held`: quiet, but now and then the
+    breath is held at the end of expiration."""
     peak_to_peak_m: Annotated[float, Field(gt=0, le=MOST_M)] = 0.008
     """Mean depth of a breath at the navel: 5 to 12 mm quiet, to 25 mm deep [A]; 7.5 mm follow from a tidal volume of 0.5 l."""
     rate_per_min: Annotated[float, Field(ge=4, le=40)] = 14.0

@@ -1,4 +1,4 @@
-"""The patient of a scenario: shape, wall, lesions, breathing. Reaches only the tissue and scoring."""
+"""The patient of a scenario: shape, wall, lesions, breathing, motion. Reaches only the tissue and scoring."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from palpate_models.breathing import Breathing
+from palpate_models.motion import Motion
 from palpate_models.section import Length, NonNegative, Pose, Positive, Section, Vec2
 
 
@@ -87,6 +88,7 @@ class Phantom(Section):
     background: Background = Background()
     lesions: tuple[Lesion, ...] = ()
     breathing: Breathing = Breathing()
+    motion: Motion = Motion()
     pose: Registration = Registration()
 
     @model_validator(mode="after")

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
+from palpate_bus.service import Service
 from palpate_models.breathing import BreathingCurve
+from palpate_models.motion import BodyMotion
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
 from palpate_tissue.backends.elastic.equivalent import with_equivalent_stiffness
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
+from palpate_tissue.moving import carried
 from palpate_tissue.service import TissueService
 
 
-def create(scenario: Scenario, pitch_m: float = PITCH_M) -> TissueService:
+def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
     """The elastic tissue of a scenario. The first time takes half a minute; the result is kept in the user's cache folder.
 
     `pitch_m` is that of the finite elements.
@@ -40,4 +43,5 @@ def create(scenario: Scenario, pitch_m: float = PITCH_M) -> TissueService:
         "lesion_depths_m": [lesion.depth_m for lesion in phantom.lesions],
         "equivalent_stiffness_ratio": round(float((shown.stiffness / shown.background).max()), 3),
     }
-    return TissueService(tissue, shown, phantom.pose.true, facts)
+    service = TissueService(tissue, shown, phantom.pose.true, facts)
+    return carried(service, BodyMotion(phantom.motion, scenario.seed), phantom.pose.true)

@@ -20,10 +20,12 @@ from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
 from palpate_models.frames import Array, matrix
+from palpate_models.motion import BodyMotion
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.wiring import Wiring
+from palpate_tissue.moving import carried
 
 _log = logging.getLogger("palpate.tissue")
 
@@ -115,7 +117,7 @@ def packaged_map(name: str) -> FmuMap:
         return load_map(path)
 
 
-def create(scenario: Scenario) -> FmuService:
+def create(scenario: Scenario) -> Service:
     """The FMU `tissue.fmu` of a scenario, tied to the tissue's topics by the map `tissue.fmu_map`.
 
     By default the abdomen of the scenario, built here. Raises MapError for a map of another role: see `hosted`.
@@ -128,9 +130,12 @@ def create(scenario: Scenario) -> FmuService:
             "for another role use `hosted` in a file of your own (--service ROLE=FILE.py)"
         )
     if chosen.fmu:
-        return hosted(Path(chosen.fmu), table, scenario)
-    with tempfile.TemporaryDirectory() as folder:
-        return hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
+        service = hosted(Path(chosen.fmu), table, scenario)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            service = hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
+    phantom = scenario.phantom
+    return carried(service, BodyMotion(phantom.motion, scenario.seed), phantom.pose.true)
 
 
 def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
+from palpate_bus.service import Service
 from palpate_models.breathing import BreathingCurve
+from palpate_models.motion import BodyMotion
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_tissue.moving import carried
 from palpate_tissue.service import TissueService
 
 
-def create(scenario: Scenario) -> TissueService:
+def create(scenario: Scenario) -> Service:
     """The tissue of a scenario; with scoring, the one role that may look at its phantom."""
     phantom = scenario.phantom
     model = build_phantom(phantom, scenario.seed)
@@ -26,4 +29,5 @@ def create(scenario: Scenario) -> TissueService:
         "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),
         "substeps": tissue.substeps,
     }
-    return TissueService(tissue, model, phantom.pose.true, facts)
+    service = TissueService(tissue, model, phantom.pose.true, facts)
+    return carried(service, BodyMotion(phantom.motion, scenario.seed), phantom.pose.true)

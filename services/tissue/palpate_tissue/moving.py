@@ -1,0 +1,128 @@
+"""A patient who moves on the table: any tissue service, carried along by the body.
+
+The tissue goes on as if the body lay still, in a world W' that the body takes with it: X_WW' = X_WA X_AA' X_AW. What the tissue
+reads is brought from W to W', what it sends from W' to W.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_bus.messages import Point, ToolState, WrenchStamped
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import pose_matrix, pose_message, twist, twist_message, vector, wrench, wrench_message
+from palpate_bus.messages.stamps import NS
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.frames import Array, inverse, matrix
+from palpate_models.motion import BodyMotion
+from palpate_models.section import Pose
+
+TOOL = "sim/tool_state"
+
+
+def carried(tissue: Service, motion: BodyMotion, pose: Pose) -> Service:
+    """The tissue, on a body that is at the true `pose` in world until it moves. One that never moves is left as it is."""
+    return MovingBody(tissue, motion, matrix(pose)) if motion.moves else tissue
+
+
+class MovingBody(Service):
+    """A tissue service on a body that moves."""
+
+    role: ClassVar[str] = "tissue"
+
+    def __init__(self, tissue: Service, motion: BodyMotion, X_WA: Array) -> None:
+        """`X_WA`, shape (4, 4): the true pose of the body before it moves, which `tissue` takes it to keep."""
+        self._tissue = tissue
+        self._motion = motion
+        self._X_WA, self._X_AW = X_WA, inverse(X_WA)
+        self._X_WV = np.eye(4)
+        """V stands for W', the world as the body takes it along."""
+        self._v_A, self._w_A = np.zeros(3), np.zeros(3)
+        """The body's twist: see `BodyMotion.twist`."""
+        self._known_s = -np.inf
+        """The time [s] to which these belong."""
+        self._sent: Mapping[str, Callable[[Any], Message]] = {
+            "sim/contact_wrench": self._wrench,
+            "sim/surface": self._surface,
+            "truth/indentation": self._indentation,
+        }
+
+    def start(self) -> Outbox:
+        """What the tissue says of itself: its pose is the one before the motion."""
+        return self._tissue.start()
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """One millisecond of tissue."""
+        return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
+
+    def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
+        """The tissue's parts."""
+        t_s = t / NS
+        if t_s <= self._motion.at_s:
+            yield from self._tissue.parts(t, inbox)
+            return
+        if self._known_s < self._motion.until_s:
+            self._X_WV = self._X_WA @ self._motion.pose(t_s) @ self._X_AW
+            self._v_A, self._w_A = self._motion.twist(t_s)
+            self._known_s = t_s
+        for part in self._tissue.parts(t, _AlongInbox(inbox, self._seen_from_body)):
+            yield {topic: self._sent[topic](message) if topic in self._sent else message for topic, message in part.items()}
+
+    def finish(self) -> Mapping[str, Any]:
+        """The tissue's facts, and when the body moved and where its origin went."""
+        moved_m = self._X_WV[:3, :3] @ self._X_WA[:3, 3] + self._X_WV[:3, 3] - self._X_WA[:3, 3]
+        return {**self._tissue.finish(), "moved_at_s": round(self._motion.at_s, 3), "moved_m": moved_m.round(4).tolist()}
+
+    def _seen_from_body(self, message: Any) -> Message:
+        """A tool state in W as one in V: its velocity there is that against the body."""
+        X_WI, V_WI_W = pose_matrix(message.pose), twist(message.twist)
+        X_VW = inverse(self._X_WV)
+        X_VI = X_VW @ X_WI
+        p_AI = self._X_AW[:3, :3] @ X_WI[:3, 3] + self._X_AW[:3, 3]
+        V_A = np.stack((self._v_A + np.cross(self._w_A, p_AI), self._w_A))  # of the body's point at the indenter's centre
+        V_VI = (V_WI_W.reshape(2, 3) - V_A @ self._X_WA[:3, :3].T) @ X_VW[:3, :3].T
+        pose = pose_message(X_VI[:3, :3], X_VI[:3, 3])
+        return ToolState(message.header, pose, twist_message(V_VI.ravel()), message.radius)
+
+    def _wrench(self, message: Any) -> Message:
+        F_V = wrench(message.wrench).reshape(2, 3)
+        return WrenchStamped(message.header, wrench_message((F_V @ self._X_WV[:3, :3].T).ravel()))
+
+    def _surface(self, message: Any) -> Message:
+        R, p = self._X_WV[:3, :3], self._X_WV[:3, 3]
+        return replace(message, vertices=_turned(message.vertices, R, p), normals=_turned(message.normals, R))
+
+    def _indentation(self, message: Any) -> Message:
+        p_W = self._X_WV[:3, :3] @ vector(message.surface_point) + self._X_WV[:3, 3]
+        return replace(message, surface_point=Point(*p_W.tolist()))
+
+
+class _AlongInbox:
+    """An inbox whose tool states are changed as they are read."""
+
+    def __init__(self, inbox: Inbox, change: Callable[[Message], Message]) -> None:
+        self._inbox, self._change = inbox, change
+
+    def latest(self, topic: str) -> Message | None:
+        message = self._inbox.latest(topic)
+        return self._change(message) if topic == TOOL and message is not None else message
+
+    def new(self, topic: str) -> Iterable[Message]:
+        messages = self._inbox.new(topic)
+        return [self._change(message) for message in messages] if topic == TOOL else messages
+
+    def stamp(self, topic: str) -> int | None:
+        return self._inbox.stamp(topic)
+
+    def lost(self, role: str) -> bool:
+        return self._inbox.lost(role)
+
+
+def _turned(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:
+    """Triples one after the other, shape (3 n,), turned by R and moved by p [m]."""
+    return np.asarray(values.reshape(-1, 3) @ R.T + p, dtype=np.float32).ravel()
