@@ -39,6 +39,7 @@ def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
         "pasternak_length": material.length_m,
         "dashpot": material.dashpot_s,
         "friction": material.friction,
+        "voluntary": any(area.kind == "voluntary" for area in phantom.guarding),
         "lesion_count": len(lesions),
         "prony_g": [*material.prony_g, *[0.0] * (BRANCHES - len(material.prony_g))],
         "prony_tau": [*material.prony_tau_s, *[1.0] * (BRANCHES - len(material.prony_tau_s))],

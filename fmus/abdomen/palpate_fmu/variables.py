@@ -149,7 +149,7 @@ TABLE: tuple[Variable, ...] = (
     _parameter(33, "dashpot", "s", (1e-4, 1), "Dashpot over foundation modulus"),
     _parameter(34, "friction", "1", (0, 2), "Coulomb friction between indenter and skin"),
     _parameter(35, "breathing_scale", "1", (0, 10), "Factor on all breaths; 0 holds them", start=1.0, member="breathing"),
-    _parameter(36, "voluntary", None, (0, 1), "Whether guarding fades under gentle pressure (1)", integer=True, start=0),
+    _parameter(36, "voluntary", None, (0, 1), "Whether guarding fades under gentle pressure (1)", integer=True),
     _parameter(37, "breathing_offset", "s", (-1e6, 1e6), "How far the breaths are ahead of time", start=0.0),
     _parameter(38, "lesion_count", None, (0, LESIONS), "How many entries of the lesion list count", integer=True),
     _parameter(

@@ -64,7 +64,7 @@ double tissue_largest_excursion(const Tissue *t) { return t->parameters.breathin
 double tissue_stiffening(const Tissue *t, int32_t i) {
     const double u = t->field[i];
     if (u <= 0 || t->phantom->fixed[i]) return 0;
-    return wall_stiffening(t->phantom->stiffening[i], u) + t->state.activation * t->phantom->tension[i] * u;
+    return wall_stress(t->phantom->stiffening[i], u) + t->state.activation * t->phantom->tension[i] * u;
 }
 
 double tissue_stiffening_slope(const Tissue *t, int32_t i) {
@@ -240,7 +240,7 @@ static double stiffening_energy(const Tissue *t) {
         const double u = t->field[i];
         if (u <= 0 || p->fixed[i]) continue;
         sum += t->matrices->k_w[i] * p->areas[i] *
-               (wall_work(p->stiffening[i], u) + 0.5 * t->state.activation * p->tension[i] * u * u);
+               (wall_stored(p->stiffening[i], u) + 0.5 * t->state.activation * p->tension[i] * u * u);
     }
     return sum;
 }

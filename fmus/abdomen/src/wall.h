@@ -1,32 +1,32 @@
-/* The wall stiffens with depth, and a contracted muscle tenses it. The same law as palpate_models.wall. */
+/* The wall stiffens with depth. The same law as palpate_models.wall, of which it is the one place here. */
 #ifndef PALPATE_WALL_H
 #define PALPATE_WALL_H
 
-#define MOST_STIFFENING 30.0 /* the modulus rises to 1 + this times that at rest, and no further */
+#include <math.h>
 
-/* Beyond this displacement [m] the modulus does not rise. */
-static inline double wall_knee(double stiffening) { return MOST_STIFFENING / stiffening; }
+#define MOST_STIFFENING 15.0 /* the modulus rises to 1 + this times that at rest, and no further */
 
-/* sigma [m]: what stiffening adds to the displacement u [m] of a linear wall of equal pressure; `stiffening` in 1/m. */
-static inline double wall_stiffening(double stiffening, double u) {
-    if (u <= 0 || stiffening <= 0) return 0;
-    if (u <= wall_knee(stiffening)) return 0.5 * stiffening * u * u;
-    return MOST_STIFFENING * (u - 0.5 * wall_knee(stiffening));
+/* The displacement u [m], or that from which the modulus rises no further; `stiffening` in 1/m. */
+static inline double wall_bent(double stiffening, double u) {
+    return stiffening * u > sqrt(MOST_STIFFENING) ? sqrt(MOST_STIFFENING) / stiffening : u;
 }
 
-/* d sigma / du [1]. */
+/* sigma [m]: what stiffening adds to the displacement that a linear wall of equal pressure would have. */
+static inline double wall_stress(double stiffening, double u) {
+    const double bent = wall_bent(stiffening, u), rise = stiffening * bent;
+    return u > 0 ? rise * rise * (u - 2 * bent / 3) : 0;
+}
+
+/* d sigma / du = min((stiffening u)^2, MOST_STIFFENING) [1]. */
 static inline double wall_slope(double stiffening, double u) {
-    if (u <= 0 || stiffening <= 0) return 0;
-    return u <= wall_knee(stiffening) ? stiffening * u : MOST_STIFFENING;
+    const double rise = stiffening * wall_bent(stiffening, u);
+    return u > 0 ? rise * rise : 0;
 }
 
 /* The integral of sigma over u from 0 [m^2]. */
-static inline double wall_work(double stiffening, double u) {
-    double beyond;
-    if (u <= 0 || stiffening <= 0) return 0;
-    if (u <= wall_knee(stiffening)) return stiffening * u * u * u / 6;
-    beyond = u - wall_knee(stiffening);
-    return MOST_STIFFENING * (wall_knee(stiffening) * (wall_knee(stiffening) / 6 + beyond / 2) + beyond * beyond / 2);
+static inline double wall_stored(double stiffening, double u) {
+    const double bent = wall_bent(stiffening, u), rise = stiffening * bent;
+    return u > 0 ? rise * rise * (u * u / 2 - 2 * bent * u / 3 + bent * bent / 4) : 0;
 }
 
 /* The largest slope there is. */

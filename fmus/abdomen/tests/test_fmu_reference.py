@@ -27,10 +27,8 @@ def test_probing_gives_the_reference_results(fmu: Path) -> None:
 
 
 def test_a_lesion_is_stiffer_and_force_relaxes_while_held(fmu3: Path) -> None:
-    with (
-        FmuInstance(fmu3, values={"breathing_scale": 0.0}) as on,
-        FmuInstance(fmu3, values={"breathing_scale": 0.0}) as off,
-    ):
+    relaxed = {"breathing_scale": 0.0, "voluntary": 0, "activation": 0.0}
+    with FmuInstance(fmu3, values=relaxed) as on, FmuInstance(fmu3, values=relaxed) as off:
         stiff, soft = probe(on, at_m=(-0.05, -0.05)), probe(off, at_m=(0.05, -0.05))
     assert stiff.force.max() > 2 * soft.force.max()
     held = (stiff.time > 0.61) & (stiff.time < 1.6)
