@@ -71,7 +71,7 @@ static double energy_along(const Component *c, const Component *s) {
         change += g * sum;
     }
     for (int32_t i = 0; i < n; i++) {
-        const double by_muscle = 0.5 * tissue_tension(c->tissue, i) * u[i] * s->arrays.activation[0];
+        const double by_muscle = u[i] > 0 ? c->matrices->tension[i] * u[i] * u[i] / 2 * s->arrays.activation[0] : 0;
         change += c->matrices->k_w[i] * c->phantom->areas[i] * (tissue_stiffening(c->tissue, i) * du[i] + by_muscle);
     }
     return change + contact_skin_stiffness(c->phantom, &c->parameters) * dot(c->arrays.stretch, s->arrays.stretch);

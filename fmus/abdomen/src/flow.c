@@ -207,7 +207,7 @@ void flow_derive(const Flow *f, const Inputs *in, const Direction *along, Change
     }
     relax(t, along->field, f->strain, change->rate);
     for (int32_t i = 0; i < n; i++) {
-        change->rate[i] -= (tissue_stiffening_slope(t, i) * along->field[i] + tissue_tension(t, i) * along->activation) / par->dashpot;
+        change->rate[i] -= tissue_stiffening_along(t, i, along->field[i], along->activation) / par->dashpot;
     }
     for (int32_t k = 0; k < f->near.count; k++) {
         const int32_t i = f->near.index[k];

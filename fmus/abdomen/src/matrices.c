@@ -56,12 +56,21 @@ Matrices *matrices_new(const Phantom *phantom) {
     s->column = calloc(nnz, sizeof(int32_t));
     s->value = calloc(nnz, sizeof(double));
     s->relative = calloc(nnz, sizeof(double));
+    s->stiffening = calloc(n, sizeof(double));
+    s->straight = calloc(n, sizeof(double));
+    s->tension = calloc(n, sizeof(double));
     s->most = calloc(n, sizeof(double));
     s->work = calloc(4 * n, sizeof(double));
-    if (!s->k_w || !s->plain || !s->lesion || !s->damping || !s->first || !s->column || !s->value || !s->relative || !s->most ||
-        !s->work) {
+    if (!s->k_w || !s->plain || !s->lesion || !s->damping || !s->first || !s->column || !s->value || !s->relative || !s->stiffening ||
+        !s->straight || !s->tension || !s->most || !s->work) {
         matrices_free(s);
         return NULL;
+    }
+    for (size_t i = 0; i < n; i++) {
+        s->stiffening[i] = phantom->fixed[i] ? 0 : phantom->stiffening[i];
+        s->straight[i] = wall_straight(s->stiffening[i]);
+        s->tension[i] = phantom->fixed[i] ? 0 : phantom->tension[i];
+        s->stiffens |= s->stiffening[i] > 0 || s->tension[i] > 0;
     }
     return s;
 }
@@ -76,6 +85,9 @@ void matrices_free(Matrices *s) {
     free(s->column);
     free(s->value);
     free(s->relative);
+    free(s->stiffening);
+    free(s->straight);
+    free(s->tension);
     free(s->most);
     free(s->work);
     free(s);
@@ -181,7 +193,7 @@ void matrices_assemble(Matrices *s, const Phantom *phantom, const Parameters *pa
     assemble(s, phantom, par->length);
     for (int32_t i = 0; i < phantom->n; i++) {
         s->damping[i] = par->dashpot * s->k_w[i] * phantom->areas[i];
-        s->most[i] = s->k_w[i] * phantom->areas[i] * (wall_largest_slope(phantom->stiffening[i]) + phantom->tension[i]);
+        s->most[i] = s->k_w[i] * phantom->areas[i] * (wall_largest_slope(s->stiffening[i]) + s->tension[i]);
         for (int32_t e = s->first[i]; e < s->first[i + 1]; e++) s->relative[e] = s->value[e] / s->damping[i];
     }
     s->rate = largest_rate(s, phantom->n);

@@ -62,20 +62,15 @@ double tissue_excursion_rate(const Tissue *t, double time) {
 double tissue_largest_excursion(const Tissue *t) { return t->parameters.breathing * breath_largest(t->phantom); }
 
 double tissue_stiffening(const Tissue *t, int32_t i) {
+    const Matrices *m = t->matrices;
     const double u = t->field[i];
-    if (u <= 0 || t->phantom->fixed[i]) return 0;
-    return wall_stress(t->phantom->stiffening[i], u) + t->state.activation * t->phantom->tension[i] * u;
+    return wall_stress(u, m->stiffening[i], m->straight[i]) + t->state.activation * m->tension[i] * wall_pressed(u);
 }
 
-double tissue_stiffening_slope(const Tissue *t, int32_t i) {
-    const double u = t->field[i];
-    if (u <= 0 || t->phantom->fixed[i]) return 0;
-    return wall_slope(t->phantom->stiffening[i], u) + t->state.activation * t->phantom->tension[i];
-}
-
-double tissue_tension(const Tissue *t, int32_t i) {
-    const double u = t->field[i];
-    return u <= 0 || t->phantom->fixed[i] ? 0 : t->phantom->tension[i] * u;
+double tissue_stiffening_along(const Tissue *t, int32_t i, double du, double dactivation) {
+    const Matrices *m = t->matrices;
+    const double u = t->field[i], slope = wall_slope(u, m->stiffening[i], m->straight[i]);
+    return u > 0 ? (slope + t->state.activation * m->tension[i]) * du + m->tension[i] * u * dactivation : 0;
 }
 
 Press tissue_press(const Tissue *t, const Inputs *in, int32_t i) {
@@ -130,12 +125,14 @@ void tissue_strain(const Tissue *t, double *strain) {
 /* The field as it moves by itself: u += -h C^-1 [K (u - sum y) + k_w A (sigma + tension a u)]. */
 static void relax(Tissue *t, double h) {
     const Matrices *m = t->matrices;
+    const double by_stiffening = h / t->parameters.dashpot;
     double *u = t->field, *strain = t->strain;
     if (!t->state.disturbed) return;
     tissue_strain(t, strain);
-    for (int32_t i = 0; i < t->phantom->n; i++) {
-        u[i] -= h * (matrices_row(m, m->relative, strain, i) + tissue_stiffening(t, i) / t->parameters.dashpot);
+    if (m->stiffens) {
+        for (int32_t i = 0; i < t->phantom->n; i++) u[i] -= by_stiffening * tissue_stiffening(t, i);
     }
+    for (int32_t i = 0; i < t->phantom->n; i++) u[i] -= h * matrices_row(m, m->relative, strain, i);
 }
 
 /* The Prony branches: exact for a displacement that is held over the step. */
@@ -234,13 +231,12 @@ static double spring_energy(const Tissue *t, const double *y, double g) {
 
 /* What the springs store that stiffen, and those of tensed muscle. */
 static double stiffening_energy(const Tissue *t) {
-    const Phantom *p = t->phantom;
+    const Matrices *m = t->matrices;
     double sum = 0;
-    for (int32_t i = 0; i < p->n; i++) {
-        const double u = t->field[i];
-        if (u <= 0 || p->fixed[i]) continue;
-        sum += t->matrices->k_w[i] * p->areas[i] *
-               (wall_stored(p->stiffening[i], u) + 0.5 * t->state.activation * p->tension[i] * u * u);
+    for (int32_t i = 0; i < t->phantom->n; i++) {
+        const double u = t->field[i], pressed = wall_pressed(u), tension = t->state.activation * m->tension[i];
+        sum += m->k_w[i] * t->phantom->areas[i] *
+               (wall_stored(u, m->stiffening[i], m->straight[i]) + tension * pressed * pressed / 2);
     }
     return sum;
 }

@@ -69,9 +69,8 @@ double tissue_largest_excursion(const Tissue *tissue);
 /* What stiffening and tensed muscle add to the displacement that the foundation of vertex i answers [m]. */
 double tissue_stiffening(const Tissue *tissue, int32_t i);
 
-/* How it changes with the displacement [1], and with the activation [m]. */
-double tissue_stiffening_slope(const Tissue *tissue, int32_t i);
-double tissue_tension(const Tissue *tissue, int32_t i);
+/* How it changes when the displacement changes by `du` [m] and the activation by `dactivation`. */
+double tissue_stiffening_along(const Tissue *tissue, int32_t i, double du, double dactivation);
 
 /* How the sphere presses a vertex that it holds. */
 Press tissue_press(const Tissue *tissue, const Inputs *inputs, int32_t i);

@@ -1,4 +1,6 @@
-/* The wall stiffens with depth. The same law as palpate_models.wall, of which it is the one place here. */
+/* The wall stiffens with depth. The same law as palpate_models.wall, of which this is the one place here.
+ *
+ * `stiffening` is beta [1/m], `straight` the displacement u_c [m] from which the spring that stiffens is straight. */
 #ifndef PALPATE_WALL_H
 #define PALPATE_WALL_H
 
@@ -6,30 +8,31 @@
 
 #define MOST_STIFFENING 15.0 /* the modulus rises to 1 + this times that at rest, and no further */
 
-/* The displacement u [m], or that from which the modulus rises no further; `stiffening` in 1/m. */
-static inline double wall_bent(double stiffening, double u) {
-    return stiffening * u > sqrt(MOST_STIFFENING) ? sqrt(MOST_STIFFENING) / stiffening : u;
+static inline double wall_straight(double stiffening) { return stiffening > 0 ? sqrt(MOST_STIFFENING) / stiffening : HUGE_VAL; }
+
+static inline double wall_pressed(double u) { return u > 0 ? u : 0; }
+
+static inline double wall_bent(double u, double straight) { return wall_pressed(u) < straight ? wall_pressed(u) : straight; }
+
+/* sigma(u) [m]: what stiffening adds to the displacement that a linear wall of equal pressure would have. */
+static inline double wall_stress(double u, double stiffening, double straight) {
+    const double bent = wall_bent(u, straight), rise = stiffening * bent;
+    return rise * rise * (wall_pressed(u) - 2.0 / 3 * bent);
 }
 
-/* sigma [m]: what stiffening adds to the displacement that a linear wall of equal pressure would have. */
-static inline double wall_stress(double stiffening, double u) {
-    const double bent = wall_bent(stiffening, u), rise = stiffening * bent;
-    return u > 0 ? rise * rise * (u - 2 * bent / 3) : 0;
-}
-
-/* d sigma / du = min((stiffening u)^2, MOST_STIFFENING) [1]. */
-static inline double wall_slope(double stiffening, double u) {
-    const double rise = stiffening * wall_bent(stiffening, u);
-    return u > 0 ? rise * rise : 0;
+/* sigma'(u) = min((beta u)^2, MOST_STIFFENING) [1]. */
+static inline double wall_slope(double u, double stiffening, double straight) {
+    const double rise = stiffening * wall_bent(u, straight);
+    return rise * rise;
 }
 
 /* The integral of sigma over u from 0 [m^2]. */
-static inline double wall_stored(double stiffening, double u) {
-    const double bent = wall_bent(stiffening, u), rise = stiffening * bent;
-    return u > 0 ? rise * rise * (u * u / 2 - 2 * bent * u / 3 + bent * bent / 4) : 0;
+static inline double wall_stored(double u, double stiffening, double straight) {
+    const double bent = wall_bent(u, straight), rise = stiffening * bent, pressed = wall_pressed(u);
+    return rise * rise * (pressed * pressed / 2 - 2.0 / 3 * bent * pressed + bent * bent / 4);
 }
 
-/* The largest slope there is. */
+/* The largest slope there is [1]. */
 static inline double wall_largest_slope(double stiffening) { return stiffening > 0 ? MOST_STIFFENING : 0; }
 
 #endif
