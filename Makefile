@@ -39,8 +39,10 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: install  ## docs/topics.md, from the contract
+docs: install  ## docs/topics.md from the contract, settings.md and errors.md from their tables
 	$(BIN)/python -m palpate_bus.contract.doc
+	$(BIN)/python -m palpate_bus.settings --doc
+	$(BIN)/python -m palpate_models.errors_page
 
 install: $(VENV)/.installed
 

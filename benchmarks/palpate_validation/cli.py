@@ -21,6 +21,7 @@ SECTIONS = {
     "mesh": "meshes",
     "relaxation": "relaxation",
     "energy": "energy",
+    "breathing": "breathing",
     "drop": "drop",
     "dart": "dart_bodies",
     "mujoco": "flex",

@@ -23,8 +23,9 @@ from palpate_bus.service import Service
 from palpate_bus.setpoint import TOPIC
 from palpate_control.service import create as create_control
 from palpate_models import lbr
+from palpate_models.errors import ArmErrors, Errors
 from palpate_models.frames import Array, matrix
-from palpate_models.load import exam_input
+from palpate_models.load import plant_input, true_pose
 from palpate_models.patient import Background, Phantom, Stiffness
 from palpate_models.scenario import Scenario
 from palpate_planning.kinematics import ArmKinematics
@@ -102,9 +103,9 @@ def scenario(contrast: float) -> Scenario:
     """A uniform abdomen `contrast` times as stiff as the default, on the default robot without sensor noise."""
     wall = Stiffness(k_w_n_per_m3=1.7e5 * contrast)
     plain = Scenario()
-    robot = plain.robot.model_copy(update={"position_noise_rad": 0.0, "velocity_noise_radps": 0.0})
+    still = Errors(arm=ArmErrors(position_noise_rad=0.0, velocity_noise_radps=0.0))
     phantom = Phantom(stiffness=wall, background=Background(cv=0.0, margins=1.0), edge_m=0.006)
-    return plain.model_copy(update={"phantom": phantom, "robot": robot})
+    return plain.model_copy(update={"phantom": phantom, "errors": still})
 
 
 @cache
@@ -128,7 +129,7 @@ class _Script:
         chosen = scenario(self.contrast)
         kinematics = ArmKinematics(chosen.robot, chosen.limits)
         self.R = least_twist(np.array((0.0, 0.0, -1.0)), kinematics.pose(lbr.HOME)[:3, :3])
-        self.top = matrix(chosen.phantom.pose.true)[:3, 3] + (0.0, 0.0, chosen.robot.indenter_radius_m)
+        self.top = matrix(true_pose(chosen))[:3, 3] + (0.0, 0.0, chosen.robot.indenter_radius_m)
         self.ready = kinematics.solve(self._at(-ABOVE_M), lbr.HOME).q
 
     def _at(self, depth: float) -> Array:
@@ -177,7 +178,7 @@ def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
             modes.append(outbox["robot/status"].mode)
 
     script = _Script(contrast, stiffness)
-    robot = RobotService(exam_input(chosen), lambda robot: DartPlant(robot, script.ready))
+    robot = RobotService(plant_input(chosen), lambda robot, *, drawn: DartPlant(robot, script.ready, drawn))
     run = Composed(
         [
             Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_status),

@@ -23,6 +23,7 @@ from palpate_bus.messages import (
     JointState,
     JointTorqueCommand,
     PalpationSample,
+    PatientTruth,
     PhantomTruth,
     Point,
     Pose,
@@ -114,6 +115,7 @@ class Tissue(Service):
         if t % (10 * MS) == 0:
             out["truth/indentation"] = IndentationTruth(h, 0.0, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
         if t % (50 * MS) == 0:
+            out["truth/patient"] = PatientTruth(h, 0.0, pose())
             vertices = np.full(9000, x, np.float32)
             out["sim/surface"] = SurfaceMesh(h, vertices, np.zeros(0, np.float32), np.zeros(18000, np.uint32))
         return out

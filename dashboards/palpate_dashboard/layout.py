@@ -30,6 +30,7 @@ def _scene() -> Any:
             "/world/tool/travelled": rrb.VisibleTimeRanges([_whole_past()]),
             "/world/perception/normals": hidden,
             "/world/perception/surface": hidden,
+            "/world/truth/axes": hidden,
         },
     )
 
@@ -105,6 +106,7 @@ def blueprint(
             _plot("Real-time factor [1]", "/plots/pace", 0.0, 4.0),
             _plot("Blame [%]", "/plots/blame", 0.0, 100.0),
             _plot("Progress [%]", "/plots/progress", 0.0, 100.0),
+            _plot("TRUTH: patient [mm]", "/plots/truth", -2.0, 30.0),
         ),
         row_shares=[1.6, 0.85, 1.2, 1.2, 1.2],
     )

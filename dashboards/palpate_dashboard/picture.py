@@ -72,10 +72,10 @@ def take(folder: Path, target: Path, at_s: float, port: int, width: int, height:
 
     Raises NoPicture, also when the run was not recorded, and OSError.
     """
-    recording, exam = recording_of(folder), folder / "exam.yaml"
+    recording, scenario = recording_of(folder), folder / "scenario.yaml"
     if not recording:
         raise NoPicture(f"{folder}: no recording there; give the folder of a run that was recorded")
-    service = DashboardService(load_scenario(str(exam)), None, Live(serve_port=port), paced=False)
+    service = DashboardService(load_scenario(str(scenario)), None, Live(serve_port=port), paced=False)
     try:
         tell(f"drawing {folder} up to {at_s:g} s")
         draw(takewhile(lambda item: item[0] <= at_s * 1e9, messages(recording)), service)

@@ -71,6 +71,8 @@ class Plots:
         self._series("plots/depth/measured", [("measured [mm]", (255, 170, 40))])
         self._series("plots/depth/setpoint", [("set-point [mm]", (230, 230, 230))], width=1.0)
         self._series("plots/depth/true", [("true [mm]", (150, 110, 240))])
+        self._series("plots/truth/breath", [("true breath [mm]", (150, 110, 240))])
+        self._series("plots/truth/moved", [("true motion of the umbilicus [mm]", (240, 200, 60))])
         names = [f"A{i + 1} [% of limit]" for i in range(7)]
         self._series("plots/torque/joints", list(zip(names, JOINT_COLORS, strict=True)))
         self._series("plots/pace/real_time_factor", [("real-time factor [1]", (70, 180, 200))])
@@ -99,6 +101,11 @@ class Plots:
         """What the simulation knows of the contact."""
         self._add("plots/force/true", t, force_n)
         self._add("plots/depth/true", t, 1e3 * depth_m if depth_m > DEPTH_FLOOR_M else np.nan)
+
+    def true_patient(self, t: int, excursion_m: float, moved_m: float) -> None:
+        """How far the breath has lifted the wall, and how far the umbilicus is from where the patient lay first."""
+        self._add("plots/truth/breath", t, 1e3 * excursion_m)
+        self._add("plots/truth/moved", t, 1e3 * moved_m)
 
     def depth(self, t: int, measured_m: float, setpoint_m: float) -> None:
         """Measured depth and its set-point, along the inward normal from the perceived surface."""

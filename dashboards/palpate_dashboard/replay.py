@@ -1,6 +1,6 @@
 """Draws a run again from the recorder's MCAP file, without simulating it again.
 
-python -m palpate_dashboard.replay DIR            # writes DIR/recording.rrd from DIR/recording_mcap and DIR/exam.yaml
+python -m palpate_dashboard.replay DIR            # writes DIR/recording.rrd from DIR/recording_mcap and DIR/scenario.yaml
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def replay(files: Sequence[Path], service: DashboardService, tell: Callable[[int
 
 def main(folder: Path, tell: Callable[[int], None] | None = None) -> Path:
     """Draws the run in `folder` again; returns the file. Raises FileNotFoundError naming what is missing."""
-    files, scenario = recording_of(folder), folder / "exam.yaml"
+    files, scenario = recording_of(folder), folder / "scenario.yaml"
     if not files or not scenario.is_file():
         needed = scenario if files else folder / "recording_mcap"
         raise FileNotFoundError(f"{needed}: not there; give the folder of a run that was recorded")

@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from palpate_bus.messages.geometry import quaternion
 from palpate_dashboard import palette
 from palpate_dashboard.columns import TIMELINE, Columns, arrows, deformations, transforms
 from palpate_dashboard.geometry import Array, Carry, Indices, VertexNormals
@@ -24,6 +25,8 @@ CLOUD_POINTS: Final = 6000
 """At most so many points of the perceived cloud are drawn."""
 CARRY_M: Final = 0.012
 """A vertex of the abdomen takes its colour from a vertex of the map within this distance [m]."""
+AXES_M: Final = 0.15
+"""Length of the axes of the patient's true pose."""
 TRAIL_STEP_M: Final = 0.001
 """The travelled path gets a new point when the tool has moved so far."""
 
@@ -50,6 +53,7 @@ class SceneView:
         self._map_vertices: NDArray[np.float32] | None = None
         self._carry: Carry | None = None
         self._force_shown = False
+        self._lifted: Array | None = None
         self._trail: list[Array] = []
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         red = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004])
@@ -130,8 +134,17 @@ class SceneView:
         self.at(t)
         self._recording.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)))
 
+    def body(self, t: int, X_WA: NDArray[np.float64], excursion: float) -> None:
+        """The patient's true pose, shape (4, 4), and how far the breath has lifted the skin [m]; `world/truth` goes along."""
+        lifted = np.concatenate((X_WA[:3, 3] + excursion * X_WA[:3, 2], quaternion(X_WA[:3, :3])))
+        if self._lifted is None or np.abs(lifted - self._lifted).max() > RESOLUTION_M:
+            self._lifted = lifted
+            self._columns.add("world/truth", transforms, t, lifted)
+
     def lesions(self, segments: Iterable[Array]) -> None:
-        """True outlines of the lesions, one (k, 2, 3) array of segments each. They stand still."""
+        """True outlines of the lesions in A, one (k, 2, 3) array of segments each; with A's axes, hidden at first."""
+        axes = rr.Arrows3D(vectors=AXES_M * np.eye(3), colors=[palette.TRUTH], labels=list("xyz"), radii=[0.001])
+        self._recording.log("world/truth/axes", axes, static=True)
         strips = [segment for outline in segments for segment in outline]
         shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
         self._recording.log("world/truth/lesions", shape, static=True)

@@ -12,6 +12,7 @@ from time import perf_counter
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import RobotStatus
@@ -104,6 +105,8 @@ class DashboardService(Service):
         self._seen: dict[str, Message] = {}
         self._due: dict[str, int] = {}
         self._in_contact = False
+        self._lay: NDArray[np.float64] | None = None
+        """True pose of the patient before any motion, shape (4, 4)."""
         self._pressed_n = 0.0
         self._found: list[str] = []
         self._robot = "no status yet"
@@ -124,6 +127,7 @@ class DashboardService(Service):
             ("planning/path", 0, self._path_planned),
             ("exam/state", PLOT_PERIOD, self._exam),
             ("truth/indentation", PLOT_PERIOD, self._indentation),
+            ("truth/patient", PLOT_PERIOD, self._patient),
             ("sim/link_poses", PLOT_PERIOD, self._link_poses),
             ("robot/status", PLOT_PERIOD, self._robot_status),
             ("assessment/map", MAP_PERIOD, self._stiffness),
@@ -200,7 +204,7 @@ class DashboardService(Service):
             self._scene.patient(self._X_WA, patient.parts(in_A, bed, *self._region))
         self._scene.abdomen(t, vertices, arrays.triples(message.triangles))
 
-    def _phantom(self, _t: int, message: Message) -> None:
+    def _phantom(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.surface.vertices)
         triangles = arrays.triples(message.surface.triangles)
         raised = vertices + ABOVE_SKIN_M * VertexNormals(triangles, len(vertices))(vertices)
@@ -212,9 +216,17 @@ class DashboardService(Service):
             if inside.any():  # half contrast, on the part of the field that is not another lesion's
                 own = np.where(inside | (lesion < 0), ratio, 1.0)
                 outlines.append(level_lines(raised, triangles, own, (1.0 + float(own[inside].max())) / 2.0))
-        X_WA = pose_matrix(message.pose)
         self._map.lesions(outlines)
-        self._scene.lesions([apply(X_WA, outline.reshape(-1, 3)).reshape(-1, 2, 3) for outline in outlines])
+        self._scene.lesions(outlines)
+        self._lay = pose_matrix(message.pose)
+        self._scene.body(t, self._lay, 0.0)
+
+    def _patient(self, t: int, message: Message) -> None:
+        X_WA = pose_matrix(message.pose)
+        if self._lay is None:
+            self._lay = X_WA
+        self._scene.body(t, X_WA, message.excursion)
+        self._plots.true_patient(t, message.excursion, float(np.linalg.norm(X_WA[:3, 3] - self._lay[:3, 3])))
 
     def _tf_static(self, _t: int, message: Message) -> None:
         for item in message.transforms:

@@ -22,7 +22,7 @@ LEGEND = """
 | blue line | planned path of the indenter |
 | green, brown line | travelled path, free and in contact |
 | red arrow beside the tool | true normal force, 5 N are 15 cm |
-| violet outline | true lesion at half contrast: switch it off under `world/truth` |
+| violet outline | true lesion at half contrast, on the patient's true pose (its axes are hidden at first): see `world/truth` |
 | white points | palpation targets; light blue: perceived points |
 | pyramid | view of the depth camera, on its tripod |
 | head, pillow, drape | for the eye alone: neither arm nor camera meets them; switch them off under `world/patient` |
@@ -32,6 +32,7 @@ LEGEND = """
 | stiffness map | stiffness over that of the background, seen from the front: the patient's right is on the left |
 | uncertainty | half width of the 90 % band over the mean |
 | force over depth | red: the last second; blue: all before; grey line: wanted depth |
+| TRUTH: patient | what no sensor tells: how far the breath lifts the wall, and how far the patient has moved |
 | joint torque | applied, gravity excluded, in percent of each joint's limit |
 | health | a line each for every service, and for every topic as the contract's monitor sees it; why is in the log |
 | blame | of the waits seen since the start of the run, the part that each service was waited for |

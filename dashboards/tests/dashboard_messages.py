@@ -23,6 +23,7 @@ from palpate_bus.messages import (
     KeyValue,
     PalpationTargets,
     Path,
+    PatientTruth,
     PhantomTruth,
     Point,
     PointCloud2,
@@ -229,6 +230,11 @@ def exam(t: int, phase: int, message: str, depth: float, force: float, visited: 
     )  # fmt: skip
 
 
+def patient(s: float) -> tuple[float, Any]:
+    """Excursion [m] and pose of a patient who breathes three times and shifts by 10 mm in the middle."""
+    return 0.004 * (1 - float(np.cos(6 * np.pi * s))), pose(X_WA + np.array((0.010 if s > 0.5 else 0.0, 0.0, 0.0)))
+
+
 def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, Messages]]:
     """(time [ns], messages that arrived since the step before)."""
     rest, triangles = dome()
@@ -253,6 +259,7 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
             "sim/surface": surface(t, moved.astype(np.float32), triangles, "world"),
             "exam/state": exam(t, phase, "scanning line 3" if pressing else "", depth, force, int(200 * s)),
             "truth/indentation": IndentationTruth(header(t, "world"), depth, force, 0.3, force, 9, Point(0.0, 0.0, 0.0), 1.7e5),
+            "truth/patient": PatientTruth(header(t, "world"), *patient(s)),
             "robot/status": robot_status(t, 20.0 * np.sin(6 * s + np.arange(7.0))),
             "clock": Clock(time_message(t)),
         }

@@ -18,6 +18,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import KeyValue, codec
 from palpate_dashboard import replay
 from palpate_dashboard.columns import TIMELINE
+from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import BLAMED
 from palpate_dashboard.service import FILE, DashboardService, create
 from palpate_dashboard.sinks import Live
@@ -89,6 +90,7 @@ def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
         "/world/perception/points", "/world/perception/surface", "/world/perception/targets",
         "/world/perception/normals", "/world/plan/path", "/plots/force/measured", "/plots/force/true",
         "/plots/force/limit", "/plots/depth/measured", "/plots/depth/setpoint", "/plots/depth/true",
+        "/plots/truth/breath", "/plots/truth/moved", "/world/truth",
         "/plots/torque/joints", "/plots/pace/real_time_factor", "/plots/progress/targets", "/state/phase",
         "/state/driver", "/text/status", "/text/services", "/log/robot", "/log/exam", "/log/findings",
         "/log/perception", "/force_depth/past", "/force_depth/now", "/plots/blame/roles",
@@ -98,7 +100,13 @@ def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
     assert {"/world/patient/drape", "/world/patient/head", "/world/furniture/tripod"} <= recording.static
     for box in ("table_top", "table_column", "robot_base"):
         assert f"/world/furniture/{box}" in recording.static
-    assert {"/world/truth/lesions", "/map/mean/truth", "/map/mean/legend", "/world/camera"} <= recording.static
+    assert {
+        "/world/truth/lesions",
+        "/world/truth/axes",
+        "/map/mean/truth",
+        "/map/mean/legend",
+        "/world/camera",
+    } <= recording.static
 
 
 def test_the_only_timeline_is_simulated_time(whole: tuple[Recording, dict[str, Any]]) -> None:
@@ -122,6 +130,21 @@ def test_a_pose_is_where_the_message_had_it(whole: tuple[Recording, dict[str, An
         sent = messages[round(time * 1e9)]["sim/link_poses"].transforms
         p = next(item for item in sent if item.child_frame_id == "indenter").transform.translation
         assert value.as_py()[0] == pytest.approx((p.x, p.y, p.z), abs=1e-6)
+
+
+def test_the_truth_goes_with_the_patient(whole: tuple[Recording, dict[str, Any]]) -> None:
+    recording, _ = whole
+    messages = dict(run(SECONDS, Scenario().robot))
+    breath = recording.cells("/plots/truth/breath", "Scalars:scalars")
+    assert len(breath) == SECONDS * 20
+    for time, value in breath[::20]:
+        assert value.as_py()[0] == pytest.approx(1e3 * messages[round(time * 1e9)]["truth/patient"].excursion)
+    moved = [value.as_py()[0] for _, value in recording.cells("/plots/truth/moved", "Scalars:scalars")]
+    assert (moved[0], moved[-1]) == (pytest.approx(0), pytest.approx(10))
+    for time, value in recording.cells("/world/truth", "Transform3D:translation")[1::10]:
+        sent = messages[round(time * 1e9)]["truth/patient"]
+        p = sent.pose.position
+        assert value.as_py()[0] == pytest.approx((p.x, p.y, p.z + sent.excursion), abs=1e-6)
 
 
 def test_curves_have_twenty_points_a_second(whole: tuple[Recording, dict[str, Any]]) -> None:
@@ -203,6 +226,24 @@ def test_the_file_has_the_layout(whole: tuple[Recording, dict[str, Any]]) -> Non
         assert any(path == origin or path.startswith(origin + "/") for path in logged), origin
 
 
+def _parts(part: Any) -> list[Any]:
+    """A part of the layout and all within it, outermost first."""
+    inner = [item for item in getattr(part, "contents", ()) if not isinstance(item, str)]
+    return [part, *(found for item in inner for found in _parts(item))]
+
+
+def test_the_truth_about_the_patient_is_not_shown_at_first() -> None:
+    parts = _parts(blueprint((0.2, 0.2), (0.0, 0.0), 0.01, 15.0, ((0.0, 1.0), (0.0, 1.0))).root_container)
+    tabs = [part for part in parts if type(part).__name__ == "Tabs"]
+    secret = [part for part in parts if getattr(part, "origin", "") in ("/plots/truth", "/text/truth")]
+    assert len(secret) == 2
+    for view in secret:
+        (holder,) = [tab for tab in tabs if view in tab.contents]
+        assert holder.contents[0] is not view  # the first tab is in front
+    (scene,) = [part for part in parts if getattr(part, "origin", "") == "/world"]
+    assert "/world/truth/axes" in scene.visualizer_overrides
+
+
 OBSERVED = sorted(topic.name for topic, _ in contract().inputs("dashboard"))
 
 
@@ -274,7 +315,7 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(FileNotFoundError, match=r"exam\.yaml"):
         replay.main(tmp_path)
-    (tmp_path / "exam.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
+    (tmp_path / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
     again = Recording(replay.main(tmp_path))
     live = Recording(tmp_path / "live.rrd")
     pace = "/plots/pace/real_time_factor"  # of wall time, which a replay does not have

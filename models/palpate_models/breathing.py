@@ -20,8 +20,9 @@ TABLE_S = 600.0
 """The breaths are drawn for at least so long [s]; then they repeat."""
 MOST_M = 0.04
 """No breath or cough lifts the wall further [m]."""
-_DEEP = {"peak_to_peak_m": 0.020, "rate_per_min": 7.4, "depth_cv": 0.1}
-"""What a deep breather has unless the scenario says otherwise. Rate: Ragnarsdottir 2006 [V]; the rest [A]."""
+_DEEP = {"peak_to_peak_m": 0.025, "rate_per_min": 7.4, "depth_cv": 0.1}
+"""What a deep breather has unless the scenario says otherwise. Rate: Ragnarsdottir 2006 [V]; depth: more than three
+times the quiet one (Kaneko and Horie 2012) [V]; its variation [A]."""
 _COUGH_S = (0.15, 0.25, 0.10)
 """A cough's rise, fall, and rest until the next one of its burst [s] [A]."""
 
@@ -32,10 +33,10 @@ class Breathing(Section):
     """Breathing of the abdominal type. The wall's place at rest is that at the end of expiration."""
 
     kind: Literal["none", "quiet", "deep", "held"] = "none"
-    """`deep` has other values where none are given: 20 mm, 7.4 a minute, `depth_cv` 0.1. `held`: quiet, but now and then the
+    """`deep` has other values where none are given: 25 mm, 7.4 a minute, `depth_cv` 0.1. `held`: quiet, but now and then the
     breath is held at the end of expiration."""
     peak_to_peak_m: Annotated[float, Field(gt=0, le=MOST_M)] = 0.008
-    """Mean depth of a breath at the navel: 5 to 12 mm quiet, to 25 mm deep [A]; 7.5 mm follow from a tidal volume of 0.5 l."""
+    """Mean depth of a breath at the navel: 5 to 12 mm quiet, 25 mm deep [A]; 7.5 mm follow from a tidal volume of 0.5 l."""
     rate_per_min: Annotated[float, Field(ge=4, le=40)] = 14.0
     """Breaths a minute, where the breath is not held: 14 at rest, n = 100 (Ragnarsdottir and Kristinsdottir 2006) [V]."""
     expiration_ratio: Annotated[float, Field(ge=0.5, le=4)] = 1.2

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
 import yaml
 from pydantic import ValidationError
 
+from palpate_models.errors import draw_errors
 from palpate_models.frames import matrix, pose_of
-from palpate_models.patient import Phantom, Registration
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.scenario import ExamInput, PlantInput, Scenario
+from palpate_models.section import Pose
 
+View = Literal["scenario", "plant", "exam"]
+"""How much of a scenario somebody is given; a run's folder has a file of each."""
+_PATIENT: dict[str, Any] = {"name": True, "description": True, "phantom": True, "tissue": True, "services": {"tissue"}}
+HIDDEN: Mapping[View, dict[str, Any]] = {
+    "scenario": {},
+    "plant": _PATIENT,
+    "exam": {**_PATIENT, "seed": True, "errors": True},
+}
+"""What is left out: of the plant's view what tells of the patient, of the exam's also what the truth could be drawn from."""
+_VIEWS: Mapping[str, View] = dict.fromkeys(("tissue", "dashboard", "recorder"), "scenario") | dict.fromkeys(
+    ("robot", "camera"), "plant"
+)
 _MERGE = "tag:yaml.org,2002:merge"
 
 
@@ -112,6 +124,8 @@ def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = 
         raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)
     for setting in settings:
+        if isinstance(raw.get("errors"), str):  # a level's name is short for a mapping with it alone
+            raw["errors"] = {"level": raw["errors"]}
         _override(raw, setting)
     if seed is not None:
         raw["seed"] = seed
@@ -121,28 +135,45 @@ def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = 
         raise ScenarioError(_explain(name, error)) from error
 
 
-def redacted(scenario: Scenario) -> Scenario:
-    """The scenario without its phantom: all that roles other than tissue and scoring are given.
-
-    Of the phantom only the registered pose is left, with the registration error already in it.
-    """
-    registered = Registration(true=pose_of(np.asarray(exam_input(scenario).X_WA)))
-    return scenario.model_copy(update={"phantom": Phantom(pose=registered)})
+def view_of(role: str) -> View:
+    """What a role is given: observers and the tissue all, what stands for equipment its errors, everybody else the exam."""
+    return _VIEWS.get(role, "exam")
 
 
-def dump_scenario(scenario: Scenario) -> str:
-    """The scenario as YAML with every field, which `load_scenario` reads back to an equal one."""
-    return str(yaml.safe_dump(scenario.model_dump(mode="json"), sort_keys=False, allow_unicode=True))
+def seen(scenario: Scenario, view: View) -> Scenario:
+    """The scenario as that view has it: what is hidden is as in a scenario that does not mention it."""
+    return Scenario.model_validate(scenario.model_dump(exclude=HIDDEN[view]))
+
+
+def dump_scenario(scenario: Scenario, view: View = "scenario") -> str:
+    """A view of the scenario as YAML, which `load_scenario` reads back to what `seen` returns, but for the name."""
+    given = scenario.model_dump(mode="json", exclude=HIDDEN[view])
+    return str(yaml.safe_dump(given, sort_keys=False, allow_unicode=True))
 
 
 def exam_input(scenario: Scenario) -> ExamInput:
-    """What roles that must not know the phantom get."""
-    X_WA = matrix(scenario.phantom.pose.true) @ matrix(scenario.phantom.pose.error)
-    return ExamInput(
-        seed=scenario.seed,
-        X_WA=tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in X_WA),
-        exam=scenario.exam,
-        robot=scenario.robot,
-        camera=scenario.camera,
-        limits=scenario.limits,
-    )
+    """What every role may know."""
+    return ExamInput(**_exam(scenario))
+
+
+def plant_input(scenario: Scenario) -> PlantInput:
+    """What the simulated robot and camera may know."""
+    return PlantInput(**_exam(scenario), seed=scenario.seed, errors=scenario.errors)
+
+
+def _exam(scenario: Scenario) -> dict[str, Any]:
+    return {
+        "X_WA": tuple(tuple(row) for row in matrix(scenario.exam.pose).tolist()),
+        "exam": scenario.exam,
+        "robot": scenario.robot,
+        "camera": scenario.camera,
+        "limits": scenario.limits,
+    }
+
+
+def true_pose(scenario: Scenario) -> Pose:
+    """X_WA: where the patient truly is, the registered pose composed with what registration got wrong.
+
+    For the tissue and scoring; a scenario of which the errors are hidden does not know it.
+    """
+    return pose_of(matrix(scenario.exam.pose) @ draw_errors(scenario.errors, scenario.seed).X_AAt)

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from palpate_models.breathing import Breathing
 from palpate_models.guarding import Guarding
 from palpate_models.motion import Motion
-from palpate_models.section import Length, NonNegative, Pose, Positive, Section, Vec2
+from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
 
 
 class Lesion(Section):
@@ -66,17 +66,8 @@ class Stiffness(Section):
         return self
 
 
-class Registration(Section):
-    """Where the patient lies. Exam input is the true pose composed with the error."""
-
-    true: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
-    """X_WA: abdomen in world."""
-    error: Pose = Pose()
-    """What registration gets wrong, in A."""
-
-
 class Phantom(Section):
-    """The abdomen. Reaches only tissue and scoring, but for `pose`."""
+    """The abdomen. Reaches only tissue and scoring."""
 
     kind: Literal["parametric", "mesh"] = "parametric"
     mesh: str | None = None
@@ -91,7 +82,6 @@ class Phantom(Section):
     guarding: tuple[Guarding, ...] = ()
     breathing: Breathing = Breathing()
     motion: Motion = Motion()
-    pose: Registration = Registration()
 
     @model_validator(mode="after")
     def _guarding(self) -> Phantom:

@@ -12,6 +12,7 @@ import numpy as np
 
 from palpate_models.frames import Array, apply, matrix
 from palpate_models.lbr import HOME, POSITION_LIMIT
+from palpate_models.load import true_pose
 from palpate_models.phantom.model import build_phantom
 from palpate_models.placement import PRESSING_FORCE_N, PostureSequence, plan_redundancy
 from palpate_models.placement_batch import Mask
@@ -59,7 +60,7 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
     """
     exam: Exam = scenario.exam
     model = build_phantom(scenario.phantom, scenario.seed)
-    X_WA = matrix(scenario.phantom.pose.true)
+    X_WA = matrix(true_pose(scenario))
     front = model.normals[:, 2] > 0.2
     vertices, normals = model.vertices[front], model.normals[front]
     half = np.asarray(exam.region_m) / 2 + border

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from palpate_models.errors import Errors
 from palpate_models.patient import Phantom
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 
@@ -34,6 +35,10 @@ class Mode(StrEnum):
 class Exam(Section):
     """What is examined, and how."""
 
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
+    pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
+    """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Pattern = Pattern.SNAKE
     mode: Mode = Mode.CONTINUOUS
     depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
@@ -92,25 +97,17 @@ class Robot(Section):
     lbr: LbrConnection = LbrConnection()
     indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
-    """Mass below the F/T sensor: stand-off and indenter."""
+    """Nominal mass below the F/T sensor: stand-off and indenter."""
     base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 1.17
     """Height of the base. The three defaults of its placement are what `python -m palpate_models.placement_base` finds best."""
     base_xy_m: Vec2 = (0.03, 0.02)
     """Where the base stands in world."""
     base_yaw_rad: float = 0.0
     """How it is turned about the vertical."""
-    ft_noise_n: NonNegative = 0.05
-    """Standard deviation of the force noise, each axis, each millisecond."""
-    ft_noise_nm: NonNegative = 0.002
-    ft_bias_n: NonNegative = 1.0
-    """Scale of the seeded constant force bias."""
-    ft_bias_nm: NonNegative = 0.05
-    position_noise_rad: NonNegative = 1e-6
-    velocity_noise_radps: NonNegative = 1e-4
     joint_friction_nm: NonNegative = 0.1
-    """Coulomb friction (lbr_fri_ros2_stack's URDF)."""
+    """Nominal Coulomb friction (lbr_fri_ros2_stack's URDF)."""
     joint_damping_nms: NonNegative = 10.0
-    """Viscous friction (the same)."""
+    """Nominal viscous friction (the same)."""
 
 
 class Camera(Section):
@@ -120,15 +117,11 @@ class Camera(Section):
     recording: str | None = None
     """A run's folder, a rosbag2 folder or an MCAP file whose frames `services.camera: replay` shows."""
     position_m: Vec3 = (0.95, -0.45, 1.85)
-    """Optical centre in world."""
+    """Optical centre in world, as calibrated. The true pose differs by `errors.hand_eye`."""
     look_at_m: Vec3 = (0.56, 0.0, 0.90)
     width_px: Annotated[int, Field(ge=64, le=1920)] = 640
     height_px: Annotated[int, Field(ge=48, le=1080)] = 480
     focal_px: Positive = 585.0
-    noise_scale: NonNegative = 1.0
-    """Multiplies the published noise model; 0 is an ideal camera."""
-    extrinsic_error: Pose = Pose()
-    """Error of the calibrated camera pose, in the camera frame."""
     frames: Annotated[int, Field(ge=1, le=200)] = 20
     """Frames fused for a perceived surface."""
 
@@ -210,12 +203,13 @@ class Services(Section):
 
 
 class Scenario(Section):
-    """All of a run. `for_role` gives the part that a role may know."""
+    """All of a run. `palpate_models.load.seen_by` gives the part that a role may know."""
 
     name: str = "unnamed"
     description: str = ""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     phantom: Phantom = Phantom()
+    errors: Errors = Errors()
     exam: Exam = Exam()
     robot: Robot = Robot()
     camera: Camera = Camera()
@@ -235,12 +229,18 @@ class Scenario(Section):
 
 
 class ExamInput(Section):
-    """What every role but tissue and scoring may know: the scenario without its phantom, with the registered pose."""
+    """What every role may know: how the examination is to be, with the nominal equipment and the registered pose."""
 
-    seed: int
     X_WA: tuple[tuple[float, float, float, float], ...]
-    """Registered pose of the abdomen in world, homogeneous 4 x 4, registration error included."""
+    """Registered pose of the abdomen in world, homogeneous 4 x 4."""
     exam: Exam
     robot: Robot
     camera: Camera
     limits: Limits
+
+
+class PlantInput(ExamInput):
+    """What the simulated robot and camera may know besides: their own errors, which `draw_errors` draws from the seed."""
+
+    seed: int
+    errors: Errors

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from palpate.check.rig import RigSettings
 from palpate_bus.runs.joining import NoBus
-from palpate_models.load import dump_scenario, redacted
+from palpate_models.load import dump_scenario, view_of
 
 
 @contextmanager
@@ -23,9 +23,9 @@ def started(words: str | None, role: str, settings: RigSettings, endpoint: str, 
         yield
         return
     with tempfile.TemporaryDirectory(prefix="palpate-check-") as folder:
-        file = Path(folder) / "scenario.yaml"
-        shown = settings.scenario if role == "tissue" else redacted(settings.scenario)
-        file.write_text(dump_scenario(shown), encoding="utf-8")
+        view = view_of(role)
+        file = Path(folder) / f"{view}.yaml"
+        file.write_text(dump_scenario(settings.scenario, view), encoding="utf-8")
         environment = {
             **os.environ, "PALPATE_ROUTER": endpoint, "PALPATE_RUNTIME": "wallclock", "PALPATE_SCENARIO": str(file),
             "PALPATE_OUT": folder, "PALPATE_RECORD": "0", "ROS_DOMAIN_ID": str(domain),

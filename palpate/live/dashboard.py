@@ -90,10 +90,10 @@ def _the_run(chosen: str | None) -> Run:
 
 def _watch(run: Run, port: int, native: bool, show: bool, leave: bool, console: Console) -> None:
     """Follows a run to its end and, unless told to leave, keeps its picture afterwards."""
-    exam = Path(run.out) / "exam.yaml"
-    if not exam.is_file():
-        raise NothingToShow(f"{exam} is not there: the folder of the run {run.name} is not on this machine")
-    service = DashboardService(load_scenario(str(exam)), None, Live(serve_port=port))
+    scenario = Path(run.out) / "scenario.yaml"
+    if not scenario.is_file():
+        raise NothingToShow(f"{scenario} is not there: the folder of the run {run.name} is not on this machine")
+    service = DashboardService(load_scenario(str(scenario)), None, Live(serve_port=port))
     viewer = subprocess.Popen(_rerun(f"rerun+http://127.0.0.1:{port}/proxy")) if native else None
     console.print(f"{run.name} (process {run.pid}): {address(port)}", highlight=False, soft_wrap=True)
     if show:
@@ -120,11 +120,11 @@ def _recording(source: Path, console: Console) -> Path:
     if (source / FILE).is_file():
         return source / FILE
     if source.suffix == ".mcap" and source.is_file():
-        exam = source.parent.parent / "exam.yaml"
-        if not exam.is_file():
-            raise NothingToShow(f"{exam} is not there: a recording is drawn with its run's exam.yaml, two folders up")
+        scenario = source.parent.parent / "scenario.yaml"
+        if not scenario.is_file():
+            raise NothingToShow(f"{scenario} is not there: a recording is drawn with its run's scenario.yaml, two folders up")
         target = Path(tempfile.mkdtemp(prefix="palpate-dashboard-")) / FILE
-        drawn = DashboardService(load_scenario(str(exam)), target, Live(), paced=False)
+        drawn = DashboardService(load_scenario(str(scenario)), target, Live(), paced=False)
         with _drawing(console) as status:
             replay.replay((source,), drawn, _teller(status))
         return target

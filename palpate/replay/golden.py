@@ -16,11 +16,8 @@ from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Service
-from palpate_models.load import load_scenario
+from palpate_models.load import load_scenario, view_of
 from palpate_models.scenario import Scenario
-
-KNOWS_PHANTOM = "tissue"
-"""The one role that is given the whole scenario; the others get exam.yaml, as in a run."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ def load_text(text: str) -> Scenario:
 
 
 def _beside(path: Path, role: str) -> str:
-    name = "scenario.yaml" if role == KNOWS_PHANTOM else "exam.yaml"
+    name = f"{view_of(role)}.yaml"  # as in a run
     for folder in (path, *path.resolve().parents[:2]):
         if (folder / name).is_file():
             return (folder / name).read_text(encoding="utf-8")

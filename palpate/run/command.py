@@ -149,7 +149,8 @@ def prepare(
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     settings: Settings = None,
 ) -> None:
-    """Write scenario.yaml (for tissue and scoring) and exam.yaml (for everybody else): the first step of a run in containers."""
+    """Write scenario.yaml (for tissue, observers and scoring), plant.yaml (for robot and camera) and exam.yaml (for everybody
+    else): the first step of a run in containers."""
     write_scenario_files(usable(scenario, settings, seed, elsewhere=True), out)
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
-from contextlib import nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from time import perf_counter
 
-from palpate.run.roles import KNOWS_PHANTOM, OBSERVERS, WORKERS, choice, write_scenario_files
+from palpate.run.roles import OBSERVERS, WORKERS, choice, write_scenario_files
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed, ServiceFailed
@@ -18,7 +19,7 @@ from palpate_conductor.collector import Collector
 from palpate_conductor.result import RunProgress, RunResult, Tell, given_up
 from palpate_conductor.timing import SIM_LIMIT
 from palpate_conductor.tree import FrameTree
-from palpate_models.load import exam_input, redacted
+from palpate_models.load import exam_input, seen, view_of
 from palpate_models.scenario import Scenario
 
 
@@ -27,17 +28,26 @@ def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
 
     Raises ChoiceError for one that there is not, or that lacks its libraries.
     """
-    exam = redacted(scenario)
-    return [create(role, choice(scenario, role), scenario if role in KNOWS_PHANTOM else exam) for role in roles]
+    return [create(role, choice(scenario, role), seen(scenario, view_of(role))) for role in roles]
+
+
+@contextmanager
+def _writing_to(out: Path) -> Iterator[None]:
+    """Tells services that are made meanwhile the results folder, and no others: its name may tell of the patient."""
+    os.environ["PALPATE_OUT"] = str(out)
+    try:
+        yield
+    finally:
+        del os.environ["PALPATE_OUT"]
 
 
 def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
     """Runs all services in this process. Raises ChoiceError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
-    os.environ["PALPATE_OUT"] = str(out)
     collector = Collector(tree=FrameTree(exam_input(scenario)))
-    observing = load_services(scenario, observers)
+    with _writing_to(out):
+        observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
     run = Composed([*load_services(scenario, WORKERS), *viewers, collector], taps=[recorder.record for recorder in recorders])

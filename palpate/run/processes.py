@@ -21,12 +21,16 @@ import yaml
 from palpate.environment import FIXED
 from palpate.run.forks import Child, Forks
 from palpate.run.secure import SecureBus
+from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Announcement, Run
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import mesh
 from palpate_conductor.timing import Timing
+from palpate_models.load import view_of
 
 COMPOSE = "docker-compose.yml"
+OBSERVERS = frozenset(name for name, role in contract().roles.items() if role.observer)
+"""Roles that write into the results folder."""
 BARRIER = ("robot", "control", "tissue")
 """The roles of the 1 kHz loop: they talk over zenoh's low-latency transport (see palpate_bus.wire.zenoh_config)."""
 
@@ -134,11 +138,13 @@ class LocalProcesses:
         `record` says that the run has a recorder; `forks` starts the processes in place of a fresh interpreter each.
         """
         settings = Settings.read()
-        self._given = {"runtime": timing.runtime, "record": record, "out": out}
+        self._given = {"runtime": timing.runtime, "record": record}
         self._forks = forks
         self._out = out
-        self._scenario_files = scenario_files
         self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
+        self._scenario_files = {
+            role: file if view_of(role) == "scenario" else self._apart(file) for role, file in scenario_files.items()
+        }
         router = secure.endpoint if secure else settings.router
         bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
         self.bus = {role: replace(options, router=router) for role, options in bus.items()}
@@ -163,13 +169,23 @@ class LocalProcesses:
         self.running: dict[str, Child] = {}
         self._ends: dict[str, str] = {}
 
+    def _apart(self, file: Path) -> Path:
+        """A copy of a scenario file, alone in a folder whose name says nothing: that of the results may tell of the patient."""
+        folder = self._folder / file.stem
+        folder.mkdir(exist_ok=True)
+        return Path(shutil.copy(file, folder))
+
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """What a service is given beyond the environment of this process."""
         settings = Settings.read({**os.environ, **process.environment})
         return {
             **process.environment,
             **FIXED,
-            **settings.replaced(scenario=self._scenario_files[process.role], **self._given).to_env(),
+            **settings.replaced(
+                scenario=self._scenario_files[process.role],
+                out=self._out if process.role in OBSERVERS else None,
+                **self._given,
+            ).to_env(),
             **self.bus[process.role].to_env(),
         }
 

@@ -12,13 +12,12 @@ import typer
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
-from palpate_models.load import dump_scenario, redacted
+from palpate_models.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario import Scenario, Services
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
 WORKERS = tuple(name for name, role in _ROLES.items() if not role.observer)
 OBSERVERS = tuple(name for name, role in _ROLES.items() if role.observer)
-KNOWS_PHANTOM = frozenset({"tissue"})
 NONE = "none"
 """`services.tissue: none`: nothing plays the tissue, since what is examined is real."""
 RESULTS = ("report.json", "report.html", "map.png", "samples.csv", "evidence.npz", "bus.json", "recording.rrd")
@@ -78,11 +77,10 @@ def checked(scenario: Scenario) -> Scenario:
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
-    """Makes the results folder and the scenario files; returns the file that each role may see."""
+    """Makes the results folder and in it a scenario file of each view; returns the file that each role may see."""
     (out / "logs").mkdir(parents=True, exist_ok=True)
     for name in RESULTS:  # of an earlier run in the same folder: nobody is to take them for this one's
         (out / name).unlink(missing_ok=True)
-    full, exam = out / "scenario.yaml", out / "exam.yaml"
-    full.write_text(dump_scenario(scenario), encoding="utf-8")
-    exam.write_text(dump_scenario(redacted(scenario)), encoding="utf-8")
-    return {role: full if role in KNOWS_PHANTOM else exam for role in (*WORKERS, *OBSERVERS)}
+    for view in HIDDEN:
+        (out / f"{view}.yaml").write_text(dump_scenario(scenario, view), encoding="utf-8")
+    return {role: out / f"{view_of(role)}.yaml" for role in (*WORKERS, *OBSERVERS)}

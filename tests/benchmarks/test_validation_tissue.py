@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from palpate_models.patient import Stiffness
-from palpate_validation import drop, energy, hertz, lumps, meshes, relaxation
+from palpate_validation import breathing, drop, energy, hertz, lumps, meshes, relaxation
 from palpate_validation.check import Check, Section
 from palpate_validation.foundation import lump, static_force, uniform
 
@@ -52,6 +52,20 @@ def test_the_continuum_is_winklers_without_shear() -> None:
 
 def test_mesh_halving_and_superposition() -> None:
     assert_bounds(meshes.section())
+
+
+def test_breathing_is_that_of_people() -> None:
+    assert_bounds(breathing.section())
+
+
+def test_breaths_are_read_from_a_curve() -> None:
+    t = np.arange(0, 30, breathing.STEP_S) % 5
+    curve = np.where(t < 2, np.sin(np.pi * t / 4), np.where(t < 4, np.cos(np.pi * (t - 2) / 4), 0.0)) ** 2 * 0.007
+    found = breathing.read(curve)
+    for values, expected in ((found.inspiration, 2), (found.expiration, 2), (found.pause, 1)):
+        np.testing.assert_allclose(values, expected, atol=0.06)
+    np.testing.assert_allclose(found.depth, 0.007)
+    assert len(found.depth) == 5
 
 
 def test_relaxation_is_read_back_from_the_force() -> None:

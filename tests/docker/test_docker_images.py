@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from palpate_bus.contract import contract
+from palpate_models.load import view_of
 
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "compose/Dockerfile").read_text(encoding="utf-8")
@@ -63,10 +64,10 @@ def test_every_role_has_a_service_an_image_and_shared_memory_by_override() -> No
         assert IPC[role]["ipc"] == "service:router"
 
 
-def test_the_phantom_reaches_the_tissue_alone() -> None:
-    knowing = {
-        name
-        for name, service in COMPOSE.items()
-        if (service.get("environment") or {}).get("PALPATE_SCENARIO") == "/results/scenario.yaml"
-    }
-    assert knowing == {"tissue"}
+def test_each_container_has_the_scenario_file_of_its_role_and_no_other() -> None:
+    folders = {"scenario": "/results", "plant": "/plant", "exam": "/exam"}
+    for role in contract().roles:
+        if role != "conductor":
+            view = view_of(role)
+            assert COMPOSE[role]["environment"]["PALPATE_SCENARIO"] == f"{folders[view]}/{view}.yaml"
+            assert [volume.split(":")[-1 if view == "scenario" else -2] for volume in COMPOSE[role]["volumes"]] == [folders[view]]

@@ -249,6 +249,13 @@ class PalpationTargets:
     message: str
 
 @dataclass
+class PatientTruth:
+    __msgtype__: ClassVar[str]
+    header: Header
+    excursion: float
+    pose: Pose
+
+@dataclass
 class PhantomTruth:
     __msgtype__: ClassVar[str]
     surface: SurfaceMesh

@@ -12,8 +12,9 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "nav_msgs": ("Path",),
     "palpation_msgs": (
         "Advance", "CameraTrigger", "ExamState", "Finding", "Findings", "ImpedanceSetpoint", "IndentationTruth",
-        "JointTorqueCommand", "OperatorRequest", "PalpationSample", "PalpationTargets", "PhantomTruth", "RecordChunk",
-        "RobotStatus", "RunControl", "ServiceReport", "StiffnessMap", "SupervisorState", "SurfaceMesh", "ToolState",
+        "JointTorqueCommand", "OperatorRequest", "PalpationSample", "PalpationTargets", "PatientTruth", "PhantomTruth",
+        "RecordChunk", "RobotStatus", "RunControl", "ServiceReport", "StiffnessMap", "SupervisorState", "SurfaceMesh",
+        "ToolState",
     ),
     "rosgraph_msgs": ("Clock",),
     "sensor_msgs": ("CameraInfo", "Image", "JointState", "PointCloud2", "PointField", "RegionOfInterest"),

@@ -21,7 +21,7 @@ from palpate_assessment.service import AssessmentService
 from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.stamps import header
 from palpate_models.frames import Array, apply, matrix
-from palpate_models.load import exam_input
+from palpate_models.load import exam_input, true_pose
 from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.field import gaussian_field
@@ -91,7 +91,7 @@ def points(region: tuple[float, float], spacing: float, dt: float) -> Iterator[t
 def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | None = None) -> Scan:
     """Slides the indenter over a scenario's phantom at the examination's depth; `errors` scales all that is wrong."""
     exam, robot = scenario.exam, scenario.robot
-    X_WA = matrix(scenario.phantom.pose.true)
+    X_WA = matrix(true_pose(scenario))
     model = build_phantom(scenario.phantom, scenario.seed)
     tissue = Tissue(model, scenario.phantom.stiffness)
     rng = np.random.Generator(np.random.PCG64(scenario.seed + 1000))

@@ -16,7 +16,7 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.frames import apply, inverse, matrix
-from palpate_models.load import exam_input, load_scenario
+from palpate_models.load import exam_input, load_scenario, plant_input, true_pose
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Scenario
 from palpate_perception import cloud, pattern
@@ -36,7 +36,7 @@ def scenario(*settings: str, seed: int = 0) -> Scenario:
 
 def skin(case: Scenario, rise: float = 0.0) -> Any:
     """sim/surface of the phantom at rest, lifted by `rise` [m]."""
-    p_W = apply(matrix(case.phantom.pose.true), phantom().vertices) + np.array((0, 0, rise))
+    p_W = apply(matrix(true_pose(case)), phantom().vertices) + np.array((0, 0, rise))
     triangles = phantom().triangles.astype(np.uint32).ravel()
     return SurfaceMesh(header(0, "world"), p_W.astype(np.float32).ravel(), np.empty(0, np.float32), triangles)
 
@@ -49,7 +49,7 @@ def default_look() -> dict[str, Any]:
 
 def look(case: Scenario, frames: int | None = None, links: Any = None, rises: tuple[float, ...] = (0.0,)) -> dict[str, Any]:
     """What perception publishes after a burst by the camera: topics to messages."""
-    exam = exam_input(case)
+    exam = plant_input(case)
     camera, perception = CameraService(exam), PerceptionService(exam)
     wanted = frames or case.camera.frames
     seen = HandInbox().receive({"sim/link_poses": links} if links else {})
@@ -75,7 +75,7 @@ def xyz(items: Iterable[Any]) -> np.ndarray:
 
 def surface_error(case: Scenario, sent: dict[str, Any]) -> np.ndarray:
     """Perceived minus true height along z_A [m] at the phantom's vertices in the region."""
-    perceived = apply(inverse(matrix(case.phantom.pose.true)), vertices(sent["perception/surface"]))
+    perceived = apply(inverse(matrix(true_pose(case))), vertices(sent["perception/surface"]))
     width, height = case.exam.region_m
     true = phantom().vertices[phantom().normals[:, 2] > 0.3]
     true = true[(np.abs(true[:, 0]) <= width / 2) & (np.abs(true[:, 1]) <= height / 2)]
@@ -121,7 +121,7 @@ def test_fewer_frames_are_noisier_and_the_estimate_says_so() -> None:
 def test_targets_lie_on_the_lattice_and_the_surface_with_unit_outward_normals() -> None:
     case = scenario()
     targets = default_look()["perception/targets"]
-    p_A = apply(inverse(matrix(case.phantom.pose.true)), xyz(targets.positions))
+    p_A = apply(inverse(matrix(true_pose(case))), xyz(targets.positions))
     normals = xyz(targets.normals)
     x, y = pattern.lattice(case.exam)
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
@@ -206,7 +206,7 @@ def test_a_region_past_the_abdomen_has_no_targets() -> None:
 
 def test_a_wrong_extrinsic_calibration_shifts_the_surface_accordingly() -> None:
     # The optical frame told is 4 mm too far back along its axis, so everything is seen 4 mm nearer to it.
-    case, shift = scenario("camera.extrinsic_error.xyz_m=[0.0, 0.0, -0.004]"), 0.004
+    case, shift = scenario("errors.hand_eye.offset.xyz_m=[0.0, 0.0, 0.004]"), 0.004
     error = surface_error(case, look(case))
     towards = np.array(case.camera.position_m) - np.array(case.camera.look_at_m)
     rise = shift * towards / np.linalg.norm(towards)
@@ -218,12 +218,12 @@ def test_a_wrong_extrinsic_calibration_shifts_the_surface_accordingly() -> None:
     assert error.mean() == pytest.approx(expected.mean(), abs=0.05e-3)
 
 
-def test_a_wrong_registration_moves_the_targets_but_not_the_surface() -> None:
-    case = scenario("phantom.pose.error.xyz_m=[0.01, -0.008, 0.012]")
+def test_targets_are_about_the_registered_pose_and_the_surface_is_where_the_patient_truly_is() -> None:
+    case = scenario("errors.registration.offset.xyz_m=[0.01, -0.008, 0.012]")
     sent = look(case)
     p_W = xyz(sent["perception/targets"].positions)
-    np.testing.assert_allclose(p_W[:, :2].mean(axis=0), (0.57, -0.008), atol=1e-6)
-    perceived = apply(inverse(matrix(case.phantom.pose.true)), vertices(sent["perception/surface"]))
+    np.testing.assert_allclose(p_W[:, :2].mean(axis=0), case.exam.pose.xyz_m[:2], atol=1e-6)
+    perceived = apply(inverse(matrix(true_pose(case))), vertices(sent["perception/surface"]))
     true = phantom().vertices[(phantom().normals[:, 2] > 0.3) & (np.abs(phantom().vertices[:, :2]) < 0.1).all(axis=1)]
     error = LinearNDInterpolator(perceived[:, :2], perceived[:, 2])(true[:, :2]) - true[:, 2]
     assert rms(error) < 0.15e-3
@@ -261,7 +261,7 @@ def test_the_five_steps_run_in_the_papers_order(monkeypatch: pytest.MonkeyPatch)
 
 def test_frames_older_than_the_trigger_do_not_count() -> None:
     case = scenario()
-    exam = exam_input(case)
+    exam = plant_input(case)
     camera, perception = CameraService(exam), PerceptionService(exam)
     inbox = HandInbox().receive(camera.start())
     old = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 9)}
@@ -273,7 +273,7 @@ def test_frames_older_than_the_trigger_do_not_count() -> None:
 
 
 def test_without_a_trigger_nothing_is_published() -> None:
-    perception, camera = PerceptionService(exam_input(scenario())), CameraService(exam_input(scenario()))
+    perception, camera = PerceptionService(exam_input(scenario())), CameraService(plant_input(scenario()))
     inbox = HandInbox().receive(camera.start())
     wake = {"sim/surface": skin(scenario()), "planning/camera_trigger": CameraTrigger(header(0), 2)}
     frame = dict(camera.step(0, HandInbox().receive(wake)))
@@ -301,7 +301,7 @@ def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
 
 def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
     case = scenario()
-    camera, perception = CameraService(exam_input(case)), create(case)
+    camera, perception = CameraService(plant_input(case)), create(case)
     wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 1)}
     frame = dict(camera.step(TICK, HandInbox().receive(wake)))
     inbox = HandInbox()
@@ -314,7 +314,7 @@ def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
 @pytest.mark.parametrize("larger", ["info", "image"])
 def test_an_image_that_camera_info_is_not_of_is_answered_in_words(larger: str) -> None:
     case = scenario()
-    camera, perception = CameraService(exam_input(case)), create(case)
+    camera, perception = CameraService(plant_input(case)), create(case)
     wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 2)}
     frame = dict(camera.step(TICK, HandInbox().receive(wake)))
     depth, info = frame["camera/depth/image_raw"], frame["camera/depth/camera_info"]

@@ -116,7 +116,7 @@ class ExamPlanner:
         return ExamPlan(self._motion(free, q_now, start), tuple(layout.segments), skipped)
 
     def _motion(self, scene: CollisionScene, q0: Array, q1: Array) -> JointTrajectory:
-        return timed_motion(scene, self._kinematics, self._known.limits, q0, q1, self._known.seed, self._period_s)
+        return timed_motion(scene, self._kinematics, self._known.limits, q0, q1, self._known.exam.seed, self._period_s)
 
     def _reachable(
         self, perceived: PerceivedAbdomen, xy: Array, q_now: Array, scene: CollisionScene

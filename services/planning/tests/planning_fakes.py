@@ -33,8 +33,8 @@ BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
 
 def known(robot: Robot = BASE, **exam: object) -> ExamInput:
     """Exam input with a small region, so that an examination takes seconds."""
-    settings = {"region_m": (0.0375, 0.025), "spacing_m": 0.0125, **exam}
-    return exam_input(Scenario(seed=3, robot=robot, exam=ExamSettings(**settings)))
+    settings = {"seed": 3, "region_m": (0.0375, 0.025), "spacing_m": 0.0125, **exam}
+    return exam_input(Scenario(robot=robot, exam=ExamSettings(**settings)))
 
 
 def height(xy: Array) -> Array:

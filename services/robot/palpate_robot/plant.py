@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final, Protocol
 
+import numpy as np
+
+from palpate_models.errors import ArmErrors, DrawnArm, draw_arm
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
 
@@ -16,6 +19,9 @@ STICK_RADPS: Final = 1e-3
 """Below this speed friction is viscous: a joint under less than its friction creeps slower than this [A]."""
 FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
 """Links that stand on or turn over the base and so have no collision shapes."""
+
+NOMINAL_ARM: Final = draw_arm(ArmErrors(), np.random.Generator(np.random.PCG64(0)))
+"""An arm that is as its tables say."""
 
 Wrench = tuple[float, float, float, float, float, float]
 
@@ -41,7 +47,10 @@ class Plant(Protocol):
         ...
 
     def gravity_torque(self) -> Array:
-        """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""
+        """Joint torques [N m], shape (7,), with which the arm's own controller carries arm and tool here.
+
+        It knows its load data, so the tool's nominal mass.
+        """
         ...
 
     def sensor_wrench(self) -> Wrench:
@@ -64,5 +73,9 @@ class Plant(Protocol):
         ...
 
 
-PlantFactory = Callable[[Robot], Plant]
-"""Makes the plant of a scenario's robot, at rest at `lbr.HOME`."""
+class PlantFactory(Protocol):
+    """Makes the plant of a scenario's robot."""
+
+    def __call__(self, robot: Robot, *, drawn: DrawnArm) -> Plant:
+        """The nominal robot with an arm that differs from it as `drawn` says, at rest at `lbr.HOME`."""
+        ...

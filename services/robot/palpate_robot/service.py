@@ -33,11 +33,13 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models import lbr
+from palpate_models.errors import draw_errors
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import ExamInput
+from palpate_models.scenario import PlantInput
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 from palpate_robot.ft_sensor import FtSensor
+from palpate_robot.joint_sensor import JointSensor
 from palpate_robot.plant import DT, PlantFactory
 
 _TICK = round(DT * NS)
@@ -46,7 +48,6 @@ _LINKS_PERIOD = contract().topics["sim/link_poses"].period
 _CONTACT_AGE = (contract().topics["sim/contact_wrench"].max_age_ms or 0) * MS
 _MOST_STEPS = 50
 """Steps of the plant that one tick may catch up with, in wall-clock mode after an overrun."""
-_NOISE_BLOCK = 1024
 _NAMES = list(lbr.JOINT_NAMES)
 
 
@@ -55,19 +56,16 @@ class RobotService(Service):
 
     role: ClassVar[str] = "robot"
 
-    def __init__(self, exam: ExamInput, plant: PlantFactory) -> None:
-        """Starts at rest at `lbr.HOME`. `plant` makes the physics behind the driver and the sensor."""
-        robot = exam.robot
-        streams = np.random.SeedSequence([exam.seed, crc32(b"robot")]).spawn(2)
+    def __init__(self, known: PlantInput, plant: PlantFactory) -> None:
+        """Starts at rest at `lbr.HOME`. `plant` makes the physics behind the driver and the sensors, which have their errors."""
+        robot, drawn = known.robot, draw_errors(known.errors, known.seed)
+        streams = np.random.SeedSequence([known.seed, crc32(b"robot")]).spawn(2)
         joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
         self._robot = robot
-        self._plant = plant(robot)
-        self._sensor = FtSensor(robot, ft_rng)
-        self._driver = Driver(exam.limits.force_emergency_n)
-        self._rng = joint_rng
-        self._deviation = np.repeat((robot.position_noise_rad, robot.velocity_noise_radps), 7)
-        self._joint_noise: list[Array] = []
-        """Of measurements to come, the last one first: of a tick's positions [rad], then its velocities [rad/s], shapes (7,)."""
+        self._plant = plant(robot, drawn=drawn.arm)
+        self._sensor = FtSensor(drawn.force, ft_rng, DT)
+        self._joints = JointSensor(drawn.arm, joint_rng, self._plant.q, self._plant.gravity_torque())
+        self._driver = Driver(known.limits.force_emergency_n)
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
         self._command: Command | None = None
@@ -132,17 +130,18 @@ class RobotService(Service):
 
     def _drive(self, t: int, inbox: Inbox) -> None:
         """Driver, then plant, up to `t`. The first tick is the state at the start."""
-        plant, driver = self._plant, self._driver
+        plant, driver, joints = self._plant, self._driver, self._joints
         steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
         self._t = t
         command = self._newest_command(inbox)
         self._read_contact(t, inbox)
         for _ in range(steps):
             gravity = plant.gravity_torque()
-            torque = driver.update(t, plant.q, plant.v, gravity, self._external_force, command, lost=inbox.lost("control"))
-            damping = driver.damping(plant.v, gravity)
+            torque = driver.update(t, joints.q, joints.v, gravity, self._external_force, command, lost=inbox.lost("control"))
+            damping = driver.damping(joints.v, gravity)
             plant.step(gravity + torque, self._force_W if self._pressed else None, self._moment_W, damping)
-            self._applied = torque if driver.mode is DriverMode.ACTIVE else -damping * plant.v
+            joints.update(plant.q, plant.v, gravity + torque)
+            self._applied = torque if driver.mode is DriverMode.ACTIVE else -damping * joints.v
 
     def _newest_command(self, inbox: Inbox) -> Command | None:
         message = inbox.latest("control/joint_torque")
@@ -174,10 +173,7 @@ class RobotService(Service):
             moment[0], moment[1], moment[2] = m.x, m.y, m.z
 
     def _joint_state(self, stamp: Message) -> Message:
-        if not self._joint_noise:
-            noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, 14))
-            self._joint_noise = list(noise.reshape(-1, 7)[::-1])
-        q, v = self._plant.q + self._joint_noise.pop(), self._plant.v + self._joint_noise.pop()
+        q, v = self._joints.read()
         self._recent += (q, v)
         return JointState(Header(stamp, ""), _NAMES, q, v, self._applied)
 

@@ -11,7 +11,7 @@ from palpate_bus.messages import JointTorqueCommand, RobotStatus
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
-from palpate_models.load import exam_input, load_scenario
+from palpate_models.load import exam_input, load_scenario, plant_input
 from palpate_models.scenario import Scenario
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
@@ -73,7 +73,7 @@ def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any
     """Driver and port; options are the emulator's."""
     exam = exam_input(scenario)
     chosen = Options(**options)
-    port = DirectPort(Emulator(exam, chosen), chosen.period_ms)
+    port = DirectPort(Emulator(plant_input(scenario), chosen), chosen.period_ms)
     inner = InnerLoop(load_control(scenario)) if level == "setpoint" else None
     connection = exam.robot.lbr.model_copy(update={"level": level, "emulated": True})
     robot = exam.robot.model_copy(update={"lbr": connection})

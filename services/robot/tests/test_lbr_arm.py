@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lbr_bench import MS
 
-from palpate_models.load import exam_input, load_scenario
+from palpate_models.load import load_scenario, plant_input
 from palpate_robot.backends.lbr.arm import CLOCK_SET_NS, Arm
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 
@@ -19,7 +19,7 @@ class Stream:
     """States of an arm of which joint 1 turns at 0.5 rad/s, one every 2 ms."""
 
     def __init__(self) -> None:
-        self._state = Emulator(exam_input(load_scenario("rlq_guarding")), Options()).state(0)
+        self._state = Emulator(plant_input(load_scenario("rlq_guarding")), Options()).state(0)
         self._q = np.array(self._state.measured_joint_position)
 
     def at(self, t: int, stamp: int) -> Any:

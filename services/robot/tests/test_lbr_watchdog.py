@@ -7,7 +7,7 @@ import pytest
 from lbr_bench import MS
 
 from palpate_models import lbr
-from palpate_models.load import exam_input, load_scenario
+from palpate_models.load import load_scenario, plant_input
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.idl import SessionState
 from palpate_robot.backends.lbr.watchdog import TIMEOUT_NS, Watchdog
@@ -17,7 +17,7 @@ PUSH = np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 def dead_driver(watched: bool) -> Emulator:
     """The arm 0.6 s after a driver that pushed has died."""
-    emulator = Emulator(exam_input(load_scenario("rlq_guarding")), Options())
+    emulator = Emulator(plant_input(load_scenario("rlq_guarding")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     watchdog = Watchdog()
@@ -44,7 +44,7 @@ def test_without_it_the_arm_goes_on_and_with_it_it_stands() -> None:
 
 def started() -> Watchdog:
     watchdog = Watchdog()
-    emulator = Emulator(exam_input(load_scenario("rlq_guarding")), Options())
+    emulator = Emulator(plant_input(load_scenario("rlq_guarding")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     watchdog.state(0, emulator.state(1))

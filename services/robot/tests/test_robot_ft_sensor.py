@@ -8,7 +8,6 @@ from palpate_models import lbr
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
 from palpate_robot.backends.dart.plant import DT, DartPlant
-from palpate_robot.ft_sensor import FtSensor
 
 NOTHING = np.zeros(3)
 ROBOT = Robot(tool_mass_kg=0.6)
@@ -94,27 +93,3 @@ def test_moving_tool_reads_weight_contact_and_inertia() -> None:
         contact_I = pin.Force(X_WS.rotation.T @ force, X_WS.rotation.T @ moment)
         expected = X_SI.act(contact_I) - needed
         np.testing.assert_allclose(plant.sensor_wrench(), expected.vector, atol=1e-8)
-
-
-def test_errors_have_the_scenarios_size() -> None:
-    robot = Robot(ft_noise_n=0.1, ft_noise_nm=0.01, ft_bias_n=2.0, ft_bias_nm=0.2)
-    sensor = FtSensor(robot, np.random.default_rng(0))
-    readings = np.array([sensor.read([0.0] * 6) for _ in range(5000)])
-    np.testing.assert_allclose(readings.std(axis=0), [0.1] * 3 + [0.01] * 3, rtol=0.05)
-    np.testing.assert_allclose(readings.mean(axis=0), sensor.bias, atol=0.01)
-    assert np.all(np.abs(sensor.bias) <= [2.0] * 3 + [0.2] * 3)
-    white = readings - sensor.bias
-    lag_one = (white[1:] * white[:-1]).mean(axis=0) / white.var(axis=0)
-    assert np.abs(lag_one).max() < 0.06
-
-
-def test_ideal_sensor_reads_the_truth() -> None:
-    robot = Robot(ft_noise_n=0.0, ft_noise_nm=0.0, ft_bias_n=0.0, ft_bias_nm=0.0)
-    wrench = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    np.testing.assert_array_equal(FtSensor(robot, np.random.default_rng(0)).read(wrench), wrench)
-
-
-def test_bias_depends_on_the_seed_only() -> None:
-    biases = [FtSensor(Robot(), np.random.default_rng(seed)).bias for seed in (1, 1, 2)]
-    np.testing.assert_array_equal(biases[0], biases[1])
-    assert np.all(biases[0] != biases[2])

@@ -11,6 +11,7 @@ from palpate_bus.messages.codec import decode, encode, message_type
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
+from palpate_models.errors import ForceErrors
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot, Scenario
 from palpate_robot.backends.dart.service import create
@@ -122,9 +123,9 @@ def test_sensor_topic_carries_weight_and_bias_until_tared(rig: Rig) -> None:
         readings.append((force.x, force.y, force.z))
     mean = np.mean(readings, axis=0)
     weight = Robot().tool_mass_kg * GRAVITY
-    assert abs(mean[2] - weight) < Robot().ft_bias_n + 0.05
+    assert abs(mean[2] - weight) < ForceErrors().bias_n + 0.05
     assert np.abs(mean - [0, 0, weight]).max() > 0.01, "a bias is there"
-    assert np.std(readings, axis=0) == pytest.approx([Robot().ft_noise_n] * 3, rel=0.2)
+    assert np.std(readings, axis=0) == pytest.approx([ForceErrors().noise_n] * 3, rel=0.2)
 
 
 def test_status_carries_the_means_since_the_last_one(rig: Rig) -> None:

@@ -19,15 +19,17 @@ from palpate_bus.messages.geometry import pose_matrix, pose_message, twist, twis
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import Array, inverse, matrix
+from palpate_models.load import true_pose
 from palpate_models.motion import BodyMotion
-from palpate_models.section import Pose
+from palpate_models.scenario import Scenario
 
 TOOL = "sim/tool_state"
 
 
-def carried(tissue: Service, motion: BodyMotion, pose: Pose) -> Service:
-    """The tissue, on a body that is at the true `pose` in world until it moves. One that never moves is left as it is."""
-    return MovingBody(tissue, motion, matrix(pose)) if motion.moves else tissue
+def carried(tissue: Service, scenario: Scenario) -> Service:
+    """The tissue of a scenario, on the body that moves as the scenario says. Where it never does, the tissue itself."""
+    motion = BodyMotion(scenario.phantom.motion, scenario.seed)
+    return MovingBody(tissue, motion, matrix(true_pose(scenario))) if motion.moves else tissue
 
 
 class MovingBody(Service):
@@ -50,6 +52,7 @@ class MovingBody(Service):
             "sim/contact_wrench": self._wrench,
             "sim/surface": self._surface,
             "truth/indentation": self._indentation,
+            "truth/patient": self._patient,
         }
 
     def start(self) -> Outbox:
@@ -100,6 +103,10 @@ class MovingBody(Service):
     def _indentation(self, message: Any) -> Message:
         p_W = self._X_WV[:3, :3] @ vector(message.surface_point) + self._X_WV[:3, 3]
         return replace(message, surface_point=Point(*p_W.tolist()))
+
+    def _patient(self, message: Any) -> Message:
+        X_WA = self._X_WV @ pose_matrix(message.pose)
+        return replace(message, pose=pose_message(X_WA[:3, :3], X_WA[:3, 3]))
 
 
 class _AlongInbox:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import IndentationTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
+from palpate_bus.messages import IndentationTruth, PatientTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.messages.stamps import NS, header
@@ -41,6 +41,7 @@ class TissueService(Service):
         topics = contract().topics
         self._surface_period = topics["sim/surface"].period
         self._truth_period = topics["truth/indentation"].period
+        self._patient_period = topics["truth/patient"].period
         self._out_of_reach = topics["truth/indentation"].ranges["depth"][0]
         """Depth before the first tool state [m]."""
         self._surface = SkinSurface(truth)
@@ -48,6 +49,7 @@ class TissueService(Service):
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
         self._R_AW = np.ascontiguousarray(self._R_WA.T)
         self._p_WA = self._X_WA[:3, 3].copy()
+        self._lies = pose_message(self._R_WA, self._p_WA)
         self._transposed_X_AW = np.ascontiguousarray(inverse(self._X_WA)[:3].T)
         """Shape (4, 3): takes rows of homogeneous coordinates in world, of points (1) and vectors (0), to rows in A."""
         self._vertices_W = np.ascontiguousarray(apply(self._X_WA, truth.vertices).T)
@@ -66,8 +68,7 @@ class TissueService(Service):
         truth = self._truth
         _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
         surface = SurfaceMesh(header(0, "abdomen"), _flat(truth.vertices.T), _flat(truth.normals.T), self._triangles)
-        pose = pose_message(self._R_WA, self._p_WA)
-        message = PhantomTruth(surface, truth.stiffness.copy(), truth.background.copy(), truth.lesion.copy(), pose)
+        message = PhantomTruth(surface, truth.stiffness.copy(), truth.background.copy(), truth.lesion.copy(), self._lies)
         return {"truth/phantom": message}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -86,6 +87,8 @@ class TissueService(Service):
         if t % self._truth_period == 0:
             outbox["truth/indentation"] = self._indentation(t, tool, F_W[:3])
             self._peak_n, self._recent_peak_n = max(self._peak_n, self._recent_peak_n), 0.0
+        if t % self._patient_period == 0:
+            outbox["truth/patient"] = PatientTruth(header(t, "world"), self._tissue.excursion(t / NS), self._lies)
         if outbox:
             yield outbox
 

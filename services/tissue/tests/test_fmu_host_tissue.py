@@ -17,13 +17,13 @@ from palpate_bus.messages.stamps import header
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_models.frames import matrix
-from palpate_models.load import ScenarioError, load_scenario, redacted
+from palpate_models.load import ScenarioError, load_scenario, seen, true_pose
 from palpate_models.scenario import Scenario, TissueChoice
 from palpate_tissue.backends.fmu.mapping import MapError, load_map
 from palpate_tissue.backends.fmu.service import create, hosted
 from palpate_tissue.backends.winkler.service import create as create_winkler
 
-SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.kind=quiet", "phantom.pose.true.rpy_rad=[0.05, -0.1, 0.3]")
+SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.kind=quiet", "exam.pose.rpy_rad=[0.05, -0.1, 0.3]")
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ class Playback:
 
 def tool(scenario: Scenario, k: int) -> Any:
     """A slide down into the lesion, in world."""
-    X_WA = matrix(scenario.phantom.pose.true)
+    X_WA = matrix(true_pose(scenario))
     p = X_WA[:3, :3] @ np.array((-0.07 + 2e-5 * k, -0.055, 0.012 - 4e-5 * k)) + X_WA[:3, 3]
     v = X_WA[:3, :3] @ np.array((0.02, 0.0, -0.04))
     pose = Pose(Point(*p.tolist()), Quaternion(0.0, 0.0, 0.0, 1.0))
@@ -109,7 +109,7 @@ def test_a_map_of_another_role_is_for_a_file_of_ones_own(scenario: Scenario, tmp
         create(chosen(scenario, fmu_map=str(path)))
     fmu = build_scenario_fmu(scenario, tmp_path / "a.fmu", 3, [native()])
     with pytest.raises(MapError, match="lacks topics that the role assessment must send"):  # so it was asked as an assessment
-        hosted(fmu, load_map(path), redacted(scenario))
+        hosted(fmu, load_map(path), seen(scenario, "exam"))
 
 
 def test_a_map_of_ones_own_is_read_from_the_scenario(scenario: Scenario, tmp_path: Path) -> None:

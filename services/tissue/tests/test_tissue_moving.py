@@ -2,39 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from test_tissue_service import OneTopic, tool_state, vector
 
 from palpate_bus.contract import MS
 from palpate_bus.messages.geometry import pose_matrix
+from palpate_bus.service import Service
 from palpate_models.frames import apply, matrix
+from palpate_models.load import true_pose
 from palpate_models.motion import BodyMotion, Motion
-from palpate_models.patient import Lesion, Phantom, Registration
-from palpate_models.scenario import Scenario
+from palpate_models.patient import Lesion, Phantom
+from palpate_models.scenario import Exam, Scenario
 from palpate_models.section import Pose
+from palpate_tissue.backends.fmu.service import create as create_fmu
 from palpate_tissue.backends.winkler.service import create
 from palpate_tissue.moving import MovingBody
 
 MOVED = (Motion(kind="shift", at_s=0.02, over_s=0.1), Motion(kind="turn", at_s=0.02, over_s=0.1))
-LYING = Registration(true=Pose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.1, -0.05, 0.4)))
+LYING = Exam(pose=Pose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.1, -0.05, 0.4)))
 AFTER = 150
 """Tick at which the body lies still again."""
 
 
 def scenario(motion: Motion) -> Scenario:
-    return Scenario(seed=5, phantom=Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), pose=LYING, motion=motion, edge_m=0.008))
+    return Scenario(seed=5, exam=LYING, phantom=Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), motion=motion, edge_m=0.008))
 
 
 def body_poses(case: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """X_WA before, X_WA' after."""
-    X_WA = matrix(case.phantom.pose.true)
+    X_WA = matrix(true_pose(case))
     return X_WA, X_WA @ BodyMotion(case.phantom.motion, case.seed).pose(10.0)
 
 
-def pressed(case: Scenario, X_WA: np.ndarray, start: int = AFTER) -> dict[str, object]:
+def pressed(case: Scenario, X_WA: np.ndarray, make: Callable[[Scenario], Service] = create) -> dict[str, Any]:
     """What is sent when the indenter presses and slides, along a path in A, on a body that is at X_WA."""
-    service, inbox, out = create(case), OneTopic(), {}
+    service, inbox, out, start = make(case), OneTopic(), {}, AFTER
     service.start()
     for k in range(start + 151):
         share = np.clip((k - start) / 100, 0, 1)
@@ -57,10 +63,22 @@ def test_the_moved_body_pressed_at_the_moved_place_feels_as_before(motion):
     assert after["truth/indentation"].depth == pytest.approx(before["truth/indentation"].depth, abs=1e-12)
     points = [vector(out["truth/indentation"].surface_point) for out in (before, after)]
     np.testing.assert_allclose(points[1], apply(X_WM @ np.linalg.inv(X_WA), points[0][None])[0], atol=1e-12)
+    np.testing.assert_allclose(pose_matrix(after["truth/patient"].pose), X_WM, atol=1e-12)
+    np.testing.assert_allclose(pose_matrix(before["truth/patient"].pose), X_WA, atol=1e-12)
     skins = [out["sim/surface"].vertices.reshape(-1, 3) for out in (before, after)]
     np.testing.assert_allclose(skins[1], apply(X_WM @ np.linalg.inv(X_WA), skins[0]), atol=3e-7)
     normals = [out["sim/surface"].normals.reshape(-1, 3) @ X[:3, :3] for X, out in ((X_WA, before), (X_WM, after))]
     np.testing.assert_allclose(normals[1], normals[0], atol=1e-6)
+
+
+def test_an_fmu_is_carried_along_as_well():
+    case = scenario(MOVED[1])
+    _, X_WM = body_poses(case)
+    native, hosted = pressed(case, X_WM), pressed(case, X_WM, create_fmu)
+    force = vector(native["sim/contact_wrench"].wrench.force)
+    np.testing.assert_allclose(vector(hosted["sim/contact_wrench"].wrench.force), force, atol=1e-9 * np.linalg.norm(force))
+    np.testing.assert_allclose(hosted["sim/surface"].vertices, native["sim/surface"].vertices, atol=3e-7)
+    assert hosted["truth/patient"] == native["truth/patient"]
 
 
 @pytest.mark.parametrize("motion", MOVED, ids=lambda motion: motion.kind)
@@ -76,7 +94,7 @@ def test_pressed_at_the_old_place_it_feels_otherwise(motion):
 def test_an_indenter_that_the_body_takes_along_is_not_rubbed(motion):
     """Held in the body's frame while that moves, it feels what an indenter feels that is held on a body at rest."""
     case = scenario(motion.model_copy(update={"at_s": 0.2}))
-    body, X_WA = BodyMotion(case.phantom.motion, case.seed), matrix(case.phantom.pose.true)
+    body, X_WA = BodyMotion(case.phantom.motion, case.seed), matrix(true_pose(case))
     p_A, forces = np.array((0.01, 0.02, 0.005)), []
     for moves in (False, True):
         service, inbox, felt = create(case if moves else scenario(Motion())), OneTopic(), []

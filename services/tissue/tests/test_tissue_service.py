@@ -10,11 +10,13 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models.breathing import Breathing
+from palpate_models.breathing import Breathing, BreathingCurve
+from palpate_models.errors import Errors, PoseErrors
 from palpate_models.frames import matrix
-from palpate_models.patient import Lesion, Phantom, Registration
+from palpate_models.load import true_pose
+from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.scenario import Exam, Scenario
 from palpate_models.section import Pose as TruePose
 from palpate_tissue.backends.winkler.service import create
 from palpate_tissue.surface import SkinSurface, nearest_on_triangle
@@ -102,13 +104,14 @@ def test_truth_tells_the_phantom():
 
 
 def test_wrench_and_depth_follow_the_true_pose_of_the_patient():
-    """Turning patient and tool together turns the wrench; the registration error changes nothing."""
-    turned = TruePose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.2, -0.1, 0.5))
+    """Turning patient and tool together turns the wrench; what registration gets wrong belongs to where the patient truly is."""
+    registered = TruePose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.2, -0.1, 0.5))
+    error = TruePose(xyz_m=(0.01, 0.02, 0.03), rpy_rad=(0.1, 0.0, 0.0))
     cases = [
         scenario(),
-        scenario(pose=Registration(true=turned, error=TruePose(xyz_m=(0.01, 0.02, 0.03), rpy_rad=(0.1, 0.0, 0.0)))),
+        scenario().model_copy(update={"exam": Exam(pose=registered), "errors": Errors(registration=PoseErrors(offset=error))}),
     ]
-    poses = [matrix(case.phantom.pose.true) for case in cases]
+    poses = [matrix(true_pose(case)) for case in cases]
     outs = [press(create(case), X_WA, at=(0.0053, 0.001)) for case, X_WA in zip(cases, poses, strict=True)]
     forces = [X_WA[:3, :3].T @ vector(out["sim/contact_wrench"].wrench.force) for X_WA, out in zip(poses, outs, strict=True)]
     assert forces[0][2] > 1
@@ -120,7 +123,7 @@ def test_wrench_and_depth_follow_the_true_pose_of_the_patient():
 
 def test_indentation_truth_is_consistent_with_the_wrench():
     case = scenario()
-    out = press(create(case), matrix(case.phantom.pose.true))
+    out = press(create(case), matrix(true_pose(case)))
     truth, force = out["truth/indentation"], vector(out["sim/contact_wrench"].wrench.force)
     assert truth.contacts > 5
     assert np.hypot(truth.normal_force, truth.tangential_force) == pytest.approx(np.linalg.norm(force), rel=1e-9)
@@ -130,7 +133,7 @@ def test_indentation_truth_is_consistent_with_the_wrench():
 
 def test_surface_shows_the_dent():
     case = scenario()
-    service, X_WA = create(case), matrix(case.phantom.pose.true)
+    service, X_WA = create(case), matrix(true_pose(case))
     out = press(service, X_WA, depth=0.010, ticks=100)
     surface = out["sim/surface"]
     vertices = surface.vertices.reshape(-1, 3)
@@ -142,11 +145,14 @@ def test_surface_shows_the_dent():
 
 
 def test_without_a_tool_the_abdomen_breathes_and_exerts_nothing():
-    service = create(scenario(breathing=Breathing(kind="quiet", peak_to_peak_m=0.012, depth_cv=0, duration_cv=0)))
+    breathing = Breathing(kind="quiet", peak_to_peak_m=0.012, depth_cv=0, duration_cv=0)
+    service, curve = create(scenario(breathing=breathing)), BreathingCurve(breathing, 0)
     inbox, tops = OneTopic(), []
     for k in range(0, 4301):
         out = service.step(k * MS, inbox)
         assert not vector(out["sim/contact_wrench"].wrench.force).any()
+        if "truth/patient" in out:
+            assert out["truth/patient"].excursion == curve.excursion(k / 1000)
         if "sim/surface" in out:
             tops.append(out["sim/surface"].vertices.reshape(-1, 3)[:, 2].max())
     assert 0.0115 < max(tops) - min(tops) <= 0.0121
@@ -155,7 +161,7 @@ def test_without_a_tool_the_abdomen_breathes_and_exerts_nothing():
 def test_report_counts_contact():
     case = scenario()
     service = create(case)
-    press(service, matrix(case.phantom.pose.true))
+    press(service, matrix(true_pose(case)))
     facts = service.finish()
     assert facts["contact_onsets"] == 1
     assert facts["contact_steps"] > 20

@@ -76,16 +76,19 @@ class KinectNoise:
         self._rng = rng
         self._known: _Statistics | None = None
 
-    def image(self, view: View) -> Image:
-        """Depth [m] along the optical axis, shape (height, width), float32, NaN where invalid."""
+    def image(self, view: View, bias: Image) -> Image:
+        """Depth [m] along the optical axis, shape (height, width), float32, NaN where invalid.
+
+        `bias` [m], of the same shape, is what every pixel reads too much.
+        """
         s = self._statistics(view)
-        z = self._measure(s) if self._scale > 0 else 1 / view.w.ravel()[s.pixel]
+        z = self._measure(s, bias) if self._scale > 0 else 1 / view.w.ravel()[s.pixel] + bias.ravel()[s.pixel]
         z[(z < RANGE_M[0]) | (z > RANGE_M[1])] = np.nan
         image = np.full(view.w.shape, np.nan, np.float32)
         image.ravel()[s.pixel] = z
         return image
 
-    def _measure(self, s: _Statistics) -> Vector:
+    def _measure(self, s: _Statistics, bias: Image) -> Vector:
         height, width = s.view.w.shape
         draw = self._rng.standard_normal((3, s.pixel.size), np.float32)
         du, dv = s.lateral * draw[0], s.lateral * draw[1]
@@ -98,6 +101,7 @@ class KinectNoise:
         w += s.view.gv.ravel()[seen] * (dv - whole_v)
         z = 1 / np.maximum(w, np.float32(1e-6))
         z += s.axial[seen] * draw[2]
+        z += bias.ravel()[seen]
         step = self._scale * np.float32(DISPARITY_STEP_PX)
         disparity = np.maximum(np.rint(self._focal_baseline / np.maximum(z, np.float32(1e-3)) / step), 1) * step
         z = self._focal_baseline / disparity

@@ -127,6 +127,11 @@ class Scene:
             self._merged = merged
         return self._merged
 
+    def seen(self, name: str) -> NDArray[np.bool_]:
+        """The pixels of `view` that show a layer, shape (height, width)."""
+        w = self._layers[name][1].w
+        return (w > 0) & (w >= self.view().w)
+
 
 def _same(old: Mesh, new: Mesh, tolerance: float) -> bool:
     return (

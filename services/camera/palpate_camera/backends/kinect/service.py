@@ -12,15 +12,17 @@ from palpate_bus.messages import CameraInfo, RegionOfInterest, TFMessage, Transf
 from palpate_bus.messages import Image as ImageMessage
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import transform_matrix, transform_message
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera.backends.kinect import surroundings
+from palpate_camera.backends.kinect.bias import DepthBias
 from palpate_camera.backends.kinect.noise import KinectNoise
 from palpate_camera.backends.kinect.pinhole import Pinhole
 from palpate_camera.backends.kinect.scene import Caster, Image, Mesh, Scene
-from palpate_models.frames import Array, look_at, matrix
-from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.errors import draw_errors
+from palpate_models.frames import Array, look_at
+from palpate_models.load import plant_input
+from palpate_models.scenario import PlantInput, Scenario
 
 FRAME = "camera_depth_optical_frame"
 ROBOT_TOLERANCE_M: Final = 1e-4
@@ -32,26 +34,30 @@ class CameraService(Service):
 
     role: ClassVar[str] = "camera"
 
-    def __init__(self, exam: ExamInput) -> None:
-        camera = exam.camera
+    def __init__(self, known: PlantInput) -> None:
+        """The camera as the scenario has it, with its errors."""
+        camera, drawn = known.camera, draw_errors(known.errors, known.seed)
         self._pinhole = Pinhole.of(camera)
-        X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
-        self._X_WC_calibrated = X_WC @ matrix(camera.extrinsic_error)
-        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([exam.seed, crc32(b"camera")])))
-        self._noise = KinectNoise(camera.focal_px, camera.noise_scale, rng)
-        self._scene = Scene(Caster(self._pinhole, X_WC))
-        self._scene.put("furniture", surroundings.furniture(exam.robot))
-        self._links = surroundings.links(exam.robot)
+        self._X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
+        stream = np.random.SeedSequence([known.seed, crc32(b"camera")])
+        noise, wander = (np.random.Generator(np.random.PCG64(s)) for s in (stream, *stream.spawn(1)))
+        self._noise = KinectNoise(camera.focal_px, drawn.camera.given.noise_scale, noise)
+        self._bias = DepthBias(self._pinhole, drawn.camera, wander)
+        self._scene = Scene(Caster(self._pinhole, self._X_WC @ drawn.X_CCt))
+        self._scene.put("furniture", surroundings.furniture(known.robot))
+        self._links = surroundings.links(known.robot)
+        self._on: int | None = None
         self._wanted = 0
         self._taken = 0
         self._bursts = 0
 
     def start(self) -> Outbox:
         """The calibrated pose of the optical frame in world, latched."""
-        return {"tf_static": TFMessage([transform(0, "world", FRAME, self._X_WC_calibrated)])}
+        return {"tf_static": TFMessage([transform(0, "world", FRAME, self._X_WC)])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """A frame with its intrinsics while a burst lasts; a new trigger replaces the burst that is under way."""
+        self._on = t if self._on is None else self._on
         for trigger in inbox.new("planning/camera_trigger"):
             self._wanted = int(trigger.frames)
             self._bursts += 1
@@ -65,7 +71,8 @@ class CameraService(Service):
         robot = None if poses is None else surroundings.placed(self._links, link_poses(poses))
         if robot is not None:
             self._scene.put("robot", robot, ROBOT_TOLERANCE_M)
-        image = self._noise.image(self._scene.view())
+        image = self._noise.image(self._scene.view(), self._bias.image((t - self._on) / NS, self._scene.seen("abdomen")))
+        image[self._bias.lost] = np.nan
         return {
             "camera/depth/image_raw": depth_image(t, image),
             "camera/depth/camera_info": camera_info(t, self._pinhole),
@@ -78,7 +85,7 @@ class CameraService(Service):
 
 def create(scenario: Scenario) -> Service:
     """The camera of a scenario; it knows nothing of the phantom but what `sim/surface` shows."""
-    return CameraService(exam_input(scenario))
+    return CameraService(plant_input(scenario))
 
 
 def surface_mesh(message: Message) -> Mesh:

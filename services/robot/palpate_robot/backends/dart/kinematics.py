@@ -107,15 +107,18 @@ def _links(chain: Array, mounts: Array, q: Array) -> Array:
 class Kinematics:
     """Poses and velocities at joint positions `q` [rad] and velocities `v` [rad/s], shapes (7,)."""
 
-    def __init__(self, robot: Robot) -> None:
-        """For an arm on its base, with its tool. Compiles, which takes seconds the first time."""
+    def __init__(self, robot: Robot, origin_m: Array | None = None) -> None:
+        """For an arm on its base, with its tool. Compiles, which takes seconds the first time.
+
+        `origin_m`, shape (7, 3), is added to the nominal origin of each joint in the link before it.
+        """
         mass, centre = _masses(robot)
         self._behind: Array = np.triu(np.tile(mass, (7, 1)))
         self._chain: Array = np.zeros((9, 4, 6))
         self._chain[:, :, :4] = np.eye(4)
         self._chain[0, :3, :3] = _rotation(np.array((0.0, 0.0, 1.0)), robot.base_yaw_rad)
         self._chain[0, :3, _ORIGIN] = (*robot.base_xy_m, robot.base_height_m)
-        self._chain[1:8, :3, _ORIGIN] = lbr.JOINT_ORIGIN
+        self._chain[1:8, :3, _ORIGIN] = np.array(lbr.JOINT_ORIGIN) + (0.0 if origin_m is None else origin_m)
         self._chain[1:8, :3, _AXIS] = lbr.JOINT_AXIS
         self._chain[2:, :3, _CENTRE] = centre
         self._chain[2:, 3, _CENTRE] = 1.0

@@ -24,13 +24,14 @@ import dartpy as dart
 import numpy as np
 
 from palpate_models import lbr
+from palpate_models.errors import DrawnArm
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
 from palpate_models.table import boxes
 from palpate_robot.backends.dart.clearance import Clearance
 from palpate_robot.backends.dart.kinematics import Kinematics
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, STICK_RADPS, Wrench
+from palpate_robot.plant import DT, NOMINAL_ARM, END_STOP_MARGIN_RAD, FIXED_LINKS, STICK_RADPS, Wrench
 
 LEAST_CLEARANCE_RAD: Final = 0.01
 """Closer than this, in angle, DART looks for contacts: far more than a step turns."""
@@ -84,9 +85,13 @@ def _environment(robot: Robot) -> Any:
 class DartPlant:
     """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
 
-    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME) -> None:
-        """Starts at rest at joint positions `q` [rad]."""
-        self._arm = _load_arm(robot)
+    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME, drawn: DrawnArm = NOMINAL_ARM) -> None:
+        """The nominal `robot` with an arm that differs from it as `drawn` says, at rest at joint positions `q` [rad]."""
+        self._arm = _load_arm(robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass}))
+        for joint, origin, error in zip(self._arm.getJoints()[1:8], lbr.JOINT_ORIGIN, drawn.origin_m, strict=True):
+            X_PL = np.eye(4)
+            X_PL[:3, 3] = origin + error
+            joint.setTransformFromParentBodyNode(_isometry(X_PL))
         self._set_damping = tuple(self._arm.getDof(i).setDampingCoefficient for i in range(7))
         for joint, stop in zip(self._arm.getJoints()[1:8], lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD, strict=True):
             joint.setPositionLowerLimit(0, -stop)
@@ -113,12 +118,12 @@ class DartPlant:
         self._sensor = self._links["ft_sensor"]
         self._indenter = self._links["indenter"]
         stop = lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD
-        self._kinematics = Kinematics(robot)
+        self._kinematics = Kinematics(robot, drawn.origin_m)
         self._clearance = Clearance(self._links, capsules, boxes(robot), stop)
         self._free = 0.0  # sum of angles [rad] that the joints may turn before anything can touch
         self._look_in = 0  # steps until that is found anew
-        self._viscous = robot.joint_damping_nms
-        self._coulomb = robot.joint_friction_nm
+        self._viscous = (robot.joint_damping_nms * drawn.damping).tolist()
+        self._coulomb = (robot.joint_friction_nm * drawn.friction).tolist()
         self._known: Array | None = None
         self.q: Array
         """Joint positions [rad], a fresh array at every step."""
@@ -153,8 +158,8 @@ class DartPlant:
         `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
-        viscous, coulomb = self._viscous, self._coulomb
-        for set_damping, v, extra in zip(self._set_damping, self.v.tolist(), damping.tolist(), strict=True):
+        joints = zip(self._set_damping, self.v.tolist(), damping.tolist(), self._viscous, self._coulomb, strict=True)
+        for set_damping, v, extra, viscous, coulomb in joints:
             speed = abs(v)
             set_damping(viscous + extra + coulomb / (speed if speed > STICK_RADPS else STICK_RADPS))
         self._arm.setForces(torque)
@@ -188,7 +193,7 @@ class DartPlant:
         return clear
 
     def gravity_torque(self) -> Array:
-        """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,)."""
+        """Joint torques that carry the arm's and the nominal tool's weight here [N m], shape (7,)."""
         return self._state()[13:]
 
     def _state(self) -> Array:

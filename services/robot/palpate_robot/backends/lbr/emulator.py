@@ -37,9 +37,10 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models import lbr
+from palpate_models.errors import draw_errors
 from palpate_models.frames import Array
-from palpate_models.load import ScenarioError, exam_input, load_scenario
-from palpate_models.scenario import ExamInput
+from palpate_models.load import ScenarioError, load_scenario, plant_input
+from palpate_models.scenario import PlantInput
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.lbr.fri import Drive, Session
 from palpate_robot.backends.lbr.idl import (
@@ -53,6 +54,7 @@ from palpate_robot.backends.lbr.idl import (
 )
 from palpate_robot.backends.lbr.port import CONTACT_TOPIC, LINKS, LINKS_TOPIC, TOOL_STATE, TOOL_TOPIC, WRENCH
 from palpate_robot.ft_sensor import FtSensor
+from palpate_robot.joint_sensor import JointSensor
 
 log = logging.getLogger("emulator")
 
@@ -77,32 +79,36 @@ class Options:
 class Emulator:
     """Physics and session; `cycle` once a send period. Time comes from outside."""
 
-    def __init__(self, exam: ExamInput, options: Options) -> None:
+    def __init__(self, known: PlantInput, options: Options) -> None:
+        """The arm of a scenario, with its errors."""
+        drawn = draw_errors(known.errors, known.seed)
         self._options = options
-        self._plant = DartPlant(exam.robot)
-        self.session = Session(options.period_ms, np.array(lbr.HOME), command_timeout_ms=options.command_timeout_ms)
-        streams = np.random.SeedSequence([exam.seed, 0x4C4252]).spawn(3)
-        self._rng, ft, load = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
-        self._ft = FtSensor(exam.robot, ft)
-        self._noise = exam.robot.position_noise_rad
-        self._radius = exam.robot.indenter_radius_m
+        self._plant = DartPlant(known.robot, drawn=drawn.arm)
+        streams = np.random.SeedSequence([known.seed, 0x4C4252]).spawn(3)
+        joints, ft, load = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+        self._ft = FtSensor(drawn.force, ft, options.period_ms * 1e-3)
+        self._joints = JointSensor(drawn.arm, joints, self._plant.q, self._plant.gravity_torque())
+        self.session = Session(options.period_ms, self._joints.q.copy(), command_timeout_ms=options.command_timeout_ms)
+        self._radius = known.robot.indenter_radius_m
         self._load_error = load.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
         """What the arm's load data get wrong [N m], constant."""
-        self._applied = Drive(self._plant.q.copy(), np.zeros(7))
+        self._applied = Drive(self._joints.q.copy(), np.zeros(7))
         self.force_W, self.moment_W = np.zeros(3), np.zeros(3)
-        self.measured: Array = self._plant.q.copy()
+        self.measured: Array = self._joints.q.copy()
 
     def cycle(self, *, answered: bool = True) -> None:
         """Moves the arm by one send period under the newest command."""
-        plant, options = self._plant, self._options
-        self.measured = plant.q + self._noise * self._rng.standard_normal(7)
+        plant, joints, options = self._plant, self._joints, self._options
+        self.measured, _ = joints.read()
         self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque(), answered=answered)
         active = self.session.state is SessionState.COMMANDING_ACTIVE
         damping = 2 * 0.7 * np.sqrt(np.full(7, options.stiffness_nm)) if active else BRAKE
         for _ in range(options.period_ms):
-            spring = options.stiffness_nm * (drive.position - plant.q)
+            spring = options.stiffness_nm * (drive.position - joints.q)
             error = self._load_error if active else 0.0
-            plant.step(plant.gravity_torque() + drive.torque + spring + error, self.force_W, self.moment_W, damping)
+            torque = plant.gravity_torque() + drive.torque + spring + error
+            plant.step(torque, self.force_W, self.moment_W, damping)
+            joints.update(plant.q, plant.v, torque)
 
     def state(self, now: int) -> Any:
         """LBRState at wall time `now` [ns]."""
@@ -237,7 +243,7 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(level="INFO", format="%(asctime)s emulator %(levelname)s %(message)s", stream=sys.stderr)
     options = Options(given.period_ms, given.stiffness, given.gravity_error, given.command_timeout_ms)
     try:
-        emulator = Emulator(exam_input(load_scenario(given.scenario)), options)
+        emulator = Emulator(plant_input(load_scenario(given.scenario)), options)
     except (ScenarioError, ValueError) as error:
         print(f"emulator: {error}", file=sys.stderr)
         return 2

@@ -12,11 +12,12 @@ import mujoco
 import numpy as np
 
 from palpate_models import lbr
+from palpate_models.errors import DrawnArm
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
 from palpate_models.table import boxes
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS
+from palpate_robot.plant import DT, NOMINAL_ARM, END_STOP_MARGIN_RAD, FIXED_LINKS
 
 SUBSTEPS: Final = 2
 """Integration steps a millisecond: another step size than the DART plant's, so that what depends on it shows."""
@@ -41,7 +42,7 @@ def _quaternion(rotation: Array) -> Array:
     return quaternion
 
 
-def _add_link(parent: Any, link: str, position: tuple[float, float, float], inertia: lbr.Inertia) -> Any:
+def _add_link(parent: Any, link: str, position: tuple[float, float, float] | Array, inertia: lbr.Inertia) -> Any:
     body = parent.add_body(name=link, pos=position)
     body.explicitinertial = True
     body.mass = inertia.mass
@@ -50,7 +51,7 @@ def _add_link(parent: Any, link: str, position: tuple[float, float, float], iner
     return body
 
 
-def _add_joint(body: Any, i: int, robot: Robot) -> None:
+def _add_joint(body: Any, i: int) -> None:
     stop = float(lbr.POSITION_LIMIT[i]) + END_STOP_MARGIN_RAD
     body.add_joint(
         name=lbr.JOINT_NAMES[i],
@@ -60,7 +61,6 @@ def _add_joint(body: Any, i: int, robot: Robot) -> None:
         range=(-stop, stop),
         solref_limit=_STOP,
         solimp_limit=_IMPEDANCE,
-        damping=[robot.joint_damping_nms, 0.0, 0.0],
     )
 
 
@@ -73,8 +73,8 @@ def _add_shape(body: Any, capsule: lbr.Capsule) -> None:
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends, size=[capsule.radius, 0, 0], **shape)
 
 
-def build(robot: Robot) -> Any:
-    """The compiled model: bodies named as in `lbr.LINK_NAMES`, seven joints, force and torque sensors at the measuring face."""
+def build(robot: Robot, drawn: DrawnArm = NOMINAL_ARM) -> Any:
+    """The compiled model of the nominal robot with an arm that differs as `drawn` says: bodies named as in `lbr.LINK_NAMES`, seven joints, force and torque sensors at the measuring face."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.compiler.balanceinertia = False
@@ -92,7 +92,8 @@ def build(robot: Robot) -> Any:
             solref=_STOP,
             solimp=_IMPEDANCE,
         )
-    inertias, capsules = lbr.inertias(robot), lbr.capsules(robot)
+    true = robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass})
+    inertias, capsules = lbr.inertias(true), lbr.capsules(robot)
     body = spec.worldbody
     for i, link in enumerate(lbr.LINK_NAMES):
         if i == 0:
@@ -101,8 +102,9 @@ def build(robot: Robot) -> Any:
         elif link in _FIXED:
             body = _add_link(body, link, _FIXED[link], inertias[link])
         else:
-            body = _add_link(body, link, lbr.JOINT_ORIGIN[i - 1], inertias[link])
-            _add_joint(body, i - 1, robot)
+            origin = np.array(lbr.JOINT_ORIGIN[i - 1]) + drawn.origin_m[i - 1]
+            body = _add_link(body, link, origin, inertias[link])
+            _add_joint(body, i - 1)
         for capsule in () if link in FIXED_LINKS else capsules[link]:
             _add_shape(body, capsule)
         if link == "ft_sensor":

@@ -17,19 +17,20 @@ import mujoco
 import numpy as np
 
 from palpate_models import lbr
+from palpate_models.errors import DrawnArm
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
 from palpate_robot.backends.mujoco.model import SUBSTEPS, build
-from palpate_robot.plant import DT, STICK_RADPS, Wrench
+from palpate_robot.plant import DT, NOMINAL_ARM, STICK_RADPS, Wrench
 
 
 class MujocoPlant:
     """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
 
-    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME) -> None:
-        """Starts at rest at joint positions `q` [rad]."""
-        self._model = build(robot)
+    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME, drawn: DrawnArm = NOMINAL_ARM) -> None:
+        """The nominal `robot` with an arm that differs from it as `drawn` says, at rest at joint positions `q` [rad]."""
+        self._model = build(robot, drawn)
         self._data = mujoco.MjData(self._model)
         data = self._data
         self._qpos, self._qvel, self._qacc = data.qpos, data.qvel, data.qacc  # views, for life: to ask MuJoCo for one costs 1 us
@@ -40,8 +41,11 @@ class MujocoPlant:
         self._bodies = [self._model.body(link).id for link in lbr.LINK_NAMES]
         self._base, self._indenter = self._bodies[0], self._bodies[-1]
         self._weight = GRAVITY * float(self._model.body_subtreemass[self._base])
-        self._viscous = robot.joint_damping_nms
-        self._coulomb = robot.joint_friction_nm
+        self._tool = self._model.body("ft_sensor").id
+        self._forgotten = GRAVITY * robot.tool_mass_kg * (drawn.tool_mass - 1)
+        """Weight of the tool [N] that is not in the controller's load data."""
+        self._viscous = robot.joint_damping_nms * drawn.damping
+        self._coulomb = robot.joint_friction_nm * drawn.friction
         self._jacobian = np.zeros((3, 7))
         self._twist = np.zeros(6)
         self._contacts = 0
@@ -88,12 +92,16 @@ class MujocoPlant:
         self.q, self.v = self._qpos.copy(), v.copy()
 
     def gravity_torque(self) -> Array:
-        """Joint torques that carry the arm's and the tool's weight here [N m], shape (7,).
+        """Joint torques that carry the arm's and the nominal tool's weight here [N m], shape (7,).
 
         The weight times how much the centre of mass of it all rises with each joint.
         """
         mujoco.mj_jacSubtreeCom(self._model, self._data, self._jacobian, self._base)
-        return np.asarray(self._weight * self._jacobian[2])
+        torque = np.asarray(self._weight * self._jacobian[2])
+        if self._forgotten:
+            mujoco.mj_jacSubtreeCom(self._model, self._data, self._jacobian, self._tool)
+            torque -= self._forgotten * self._jacobian[2]
+        return torque
 
     def kinetic_energy(self) -> float:
         """[J]."""

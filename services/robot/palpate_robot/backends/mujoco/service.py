@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from palpate_models.load import exam_input
+from palpate_models.load import plant_input
 from palpate_models.scenario import Scenario
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.service import RobotService
 
 
 def create(scenario: Scenario) -> RobotService:
-    """The robot of a scenario, of which it may know the exam input."""
-    return RobotService(exam_input(scenario), MujocoPlant)
+    """The robot of a scenario, of which it may know the equipment."""
+    return RobotService(plant_input(scenario), MujocoPlant)

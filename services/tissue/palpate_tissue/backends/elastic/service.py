@@ -6,7 +6,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Service
 from palpate_models.breathing import BreathingCurve
-from palpate_models.motion import BodyMotion
+from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
@@ -43,5 +43,4 @@ def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
         "lesion_depths_m": [lesion.depth_m for lesion in phantom.lesions],
         "equivalent_stiffness_ratio": round(float((shown.stiffness / shown.background).max()), 3),
     }
-    service = TissueService(tissue, shown, phantom.pose.true, facts)
-    return carried(service, BodyMotion(phantom.motion, scenario.seed), phantom.pose.true)
+    return carried(TissueService(tissue, shown, true_pose(scenario), facts), scenario)

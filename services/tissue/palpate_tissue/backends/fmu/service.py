@@ -20,7 +20,7 @@ from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
 from palpate_models.frames import Array, matrix
-from palpate_models.motion import BodyMotion
+from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
@@ -134,8 +134,7 @@ def create(scenario: Scenario) -> Service:
     else:
         with tempfile.TemporaryDirectory() as folder:
             service = hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
-    phantom = scenario.phantom
-    return carried(service, BodyMotion(phantom.motion, scenario.seed), phantom.pose.true)
+    return carried(service, scenario)
 
 
 def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
@@ -146,7 +145,7 @@ def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuServi
     if not fmu_file.is_file():
         raise MapError(f"FMU {fmu_file}: no such file")
     table = table or packaged_map("tissue_fmi2" if _fmi_version(fmu_file) == "2.0" else "tissue")
-    X_WA = matrix(scenario.phantom.pose.true)
+    X_WA = matrix(true_pose(scenario))
     frames = {"world": np.eye(4), "abdomen": X_WA}
     known: dict[str, Any] = {"X_WA.position": X_WA[:3, 3], "X_WA.orientation": Rotation.from_matrix(X_WA[:3, :3]).as_quat()}
     if table.role == "tissue":

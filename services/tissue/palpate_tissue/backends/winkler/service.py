@@ -6,7 +6,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Service
 from palpate_models.breathing import BreathingCurve
-from palpate_models.motion import BodyMotion
+from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
@@ -29,5 +29,4 @@ def create(scenario: Scenario) -> Service:
         "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),
         "substeps": tissue.substeps,
     }
-    service = TissueService(tissue, model, phantom.pose.true, facts)
-    return carried(service, BodyMotion(phantom.motion, scenario.seed), phantom.pose.true)
+    return carried(TissueService(tissue, model, true_pose(scenario), facts), scenario)

@@ -1,0 +1,249 @@
+"""What sensors and arm get wrong: each error shows in readings or in motion, by the size that was drawn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from lbr_bench import Rig
+
+from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_models import lbr
+from palpate_models.errors import MOMENT_PER_FORCE_M, ArmErrors, DrawnArm, DrawnForce, Errors, ForceErrors, draw_errors
+from palpate_models.frames import Array
+from palpate_models.gravity import GRAVITY
+from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
+from palpate_models.load import load_scenario, plant_input
+from palpate_models.scenario import Robot, Scenario
+from palpate_robot.backends.dart.plant import DartPlant
+from palpate_robot.backends.dart.service import create
+from palpate_robot.backends.lbr.emulator import Emulator, Options
+from palpate_robot.backends.mujoco.plant import MujocoPlant
+from palpate_robot.ft_sensor import FtSensor
+from palpate_robot.joint_sensor import RIPPLES, SETTLING_S, JointSensor
+from palpate_robot.plant import DT, Plant
+
+QUIET: dict[str, float] = {"noise_n": 0.0, "noise_nm": 0.0, "bias_n": 0.0, "bias_nm": 0.0}
+STILL: dict[str, float] = {"position_noise_rad": 0.0, "velocity_noise_radps": 0.0}
+NOTHING = np.zeros(3)
+WRENCH = (3.0, -4.0, -12.0, 0.3, -0.2, 0.1)
+PLANTS = (DartPlant, MujocoPlant)
+
+
+def force(seed: int = 0, **given: float) -> DrawnForce:
+    return draw_errors(Errors(level="none", force=ForceErrors(**{**QUIET, **given})), seed).force
+
+
+def arm(seed: int = 0, **given: float) -> DrawnArm:
+    return draw_errors(Errors(level="none", arm=ArmErrors(**{**STILL, **given})), seed).arm
+
+
+def readings(drawn: DrawnForce, n: int, period_s: float = DT, seed: int = 1, wrench: Any = np.zeros(6)) -> Array:
+    """Shape (n, 6)."""
+    sensor = FtSensor(drawn, rng(seed), period_s)
+    return np.array([sensor.read(wrench) for _ in range(n)])
+
+
+def rng(seed: int = 1) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+
+
+def test_white_noise_and_bias_have_the_size_that_is_said() -> None:
+    drawn = force(noise_n=0.1, noise_nm=0.01, bias_n=2.0, bias_nm=0.2)
+    found = readings(drawn, 5000)
+    np.testing.assert_allclose(found.std(axis=0), [0.1] * 3 + [0.01] * 3, rtol=0.05)
+    np.testing.assert_allclose(found.mean(axis=0), drawn.bias, atol=0.01)
+    white = found - drawn.bias
+    lag_one = (white[1:] * white[:-1]).mean(axis=0) / white.var(axis=0)
+    assert np.abs(lag_one).max() < 0.06
+
+
+def test_an_ideal_sensor_reads_the_truth() -> None:
+    np.testing.assert_array_equal(readings(force(), 3, wrench=WRENCH), [WRENCH] * 3)
+
+
+def test_gain_and_cross_talk_appear_in_readings() -> None:
+    drawn = force(gain=0.05, cross_talk=0.02)
+    (found,) = readings(drawn, 1, wrench=WRENCH)
+    np.testing.assert_allclose(found, drawn.sensitivity @ WRENCH)
+    assert abs(found[2] - WRENCH[2]) > 0.05
+    only_gain = force(gain=0.05)
+    (found,) = readings(only_gain, 1, wrench=(0.0, 0.0, 10.0, 0.0, 0.0, 0.0))
+    assert found[2] == pytest.approx(10.0 * only_gain.sensitivity[2, 2])
+    assert found[2] != pytest.approx(10.0, abs=0.01)
+    np.testing.assert_array_equal(np.delete(found, 2), np.zeros(5))
+
+
+def test_tares_differ_by_the_wander_and_it_forgets() -> None:
+    size = force(tare_n=0.3, tare_s=500.0)
+    tares = np.array([readings(size, 1, seed=seed)[0] for seed in range(400)])
+    np.testing.assert_allclose(tares.std(axis=0), 0.3 * np.repeat((1.0, MOMENT_PER_FORCE_M), 3), rtol=0.15)
+    path = readings(size, 600_000, period_s=0.1)[::1000] / np.repeat((1.0, MOMENT_PER_FORCE_M), 3)  # every 100 s
+    lags = [np.mean(path[lag:] * path[:-lag]) / np.mean(path**2) for lag in (1, 5, 30)]
+    np.testing.assert_allclose(lags, np.exp(np.array((-0.2, -1.0, -6.0))), atol=0.12)
+
+
+def test_a_walk_grows_with_the_root_of_time() -> None:
+    paths = [readings(force(walk_n=0.2), 4097, period_s=60 / 1024, seed=seed)[:, :3] for seed in range(40)]
+    np.testing.assert_allclose(np.std(paths, axis=(0, 2))[[1024, 4096]], (0.2, 0.4), rtol=0.2)
+
+
+def test_a_sensor_warms_up_to_its_end_and_no_farther() -> None:
+    drawn = force(warm_up_n=2.0, warm_up_s=5.0)
+    path = readings(drawn, 60_000)
+    np.testing.assert_allclose(path[5000], drawn.warm_up * (1 - np.exp(-1)), rtol=1e-3)
+    np.testing.assert_allclose(path[-1], drawn.warm_up, rtol=1e-3)
+    assert np.abs(drawn.warm_up[:3]).max() > 0.3
+
+
+def test_bias_depends_on_the_seed_only() -> None:
+    one, same, other = (force(seed, bias_n=1.0).bias for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert np.all(one[:3] != other[:3])
+
+
+def test_zero_elasticity_and_ripple_appear_in_measured_positions() -> None:
+    q, v, torque = np.array(lbr.HOME), np.linspace(0.1, 0.4, 7), np.linspace(-30.0, 30.0, 7)
+    drawn = arm(zero_rad=0.002)
+    assert np.abs(drawn.zero_rad).min() > 1e-5
+    np.testing.assert_allclose(JointSensor(drawn, rng(), q, torque).q - q, drawn.zero_rad, atol=1e-15)
+    soft = JointSensor(arm(compliance_radpnm=1e-4), rng(), q, torque)
+    np.testing.assert_allclose(soft.q - q, 1e-4 * torque, atol=1e-12)
+    for _ in range(round(SETTLING_S / DT)):
+        soft.update(q, v, np.zeros(7))
+    np.testing.assert_allclose(soft.q - q, 1e-4 * torque * np.exp(-1), rtol=0.05)
+    phase = np.linspace(0.0, 2 * np.pi / RIPPLES, 50)
+    rough = JointSensor(arm(ripple_rad=1e-4), rng(), q, torque)
+    ripples = []
+    for turn in phase:
+        rough.update(q + turn, v, torque)
+        ripples.append(rough.q - q - turn)
+    np.testing.assert_allclose(np.abs(ripples).max(axis=0), 1e-4, rtol=0.01)
+    np.testing.assert_allclose(np.mean(ripples[:-1], axis=0), 0.0, atol=1e-6)
+
+
+def test_measured_velocity_is_the_derivative_of_measured_position() -> None:
+    joints = JointSensor(arm(compliance_radpnm=1e-4, ripple_rad=1e-4), rng(), np.array(lbr.HOME), np.zeros(7))
+    v = np.linspace(0.02, 0.05, 7)
+    path = []
+    for k in range(1, 300):
+        joints.update(lbr.HOME + v * k * DT, v, np.full(7, 20.0 * np.sin(0.01 * k)))
+        path.append((joints.q, joints.v))
+    q, speed = (np.array([row[i] for row in path]) for i in (0, 1))
+    np.testing.assert_allclose(np.diff(q, axis=0) / DT, speed[1:], atol=1e-4)
+    assert np.abs(speed - v).max() > 1e-3
+
+
+def test_an_arm_without_errors_is_measured_exactly() -> None:
+    joints = JointSensor(arm(), rng(), np.array(lbr.HOME), np.full(7, 50.0))
+    q, v = lbr.HOME + 0.1, np.full(7, 0.2)
+    joints.update(q, v, np.full(7, -20.0))
+    assert (joints.q.tobytes(), joints.v.tobytes()) == (q.tobytes(), v.tobytes())
+    assert [x.tobytes() for x in joints.read()] == [q.tobytes(), v.tobytes()]
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_the_tool_is_elsewhere_by_what_the_lengths_are_wrong(plant: Any) -> None:
+    """To first order each joint's origin moves the tool as it is turned by the joints before it."""
+    drawn = arm(length_m=0.001)
+    true, nominal = plant(Robot(), drawn=drawn), plant(Robot())
+    moved = true.tool_motion()[:3] - nominal.tool_motion()[:3]
+    turns = [np.eye(3)]
+    for pose in nominal.link_poses()[:7]:
+        x, y, z, w = pose[3:]
+        turns.append(np.array(lbr_rotation(x, y, z, w)))
+    expected = sum(turn @ error for turn, error in zip(turns[1:], drawn.origin_m, strict=True))
+    np.testing.assert_allclose(moved, expected, atol=1e-9)
+    assert 0.5e-3 < np.linalg.norm(moved) < 10e-3
+
+
+def lbr_rotation(x: float, y: float, z: float, w: float) -> Array:
+    """The rotation of a unit quaternion."""
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        )
+    )
+
+
+def test_both_plants_have_the_same_true_arm() -> None:
+    drawn = draw_errors(Errors(level="poor"), 7).arm
+    q = lbr.HOME + np.linspace(-0.3, 0.3, 7)
+    dart, mujoco = (plant(Robot(), q, drawn) for plant in PLANTS)
+    np.testing.assert_allclose(mujoco.tool_motion(), dart.tool_motion(), atol=1e-9)
+    np.testing.assert_allclose(mujoco.link_poses()[:, :3], dart.link_poses()[:, :3], atol=1e-9)
+    np.testing.assert_allclose(mujoco.gravity_torque(), dart.gravity_torque(), atol=1e-6)
+    X, _ = dart.link_pose("indenter")  # DART's own chain, not our table
+    np.testing.assert_allclose(X, dart.tool_motion()[:3], atol=1e-9)
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_the_sensor_feels_the_true_tool_and_the_controller_carries_the_nominal_one(plant: Any) -> None:
+    drawn = arm(tool_mass=0.3, seed=3)
+    assert abs(drawn.tool_mass - 1) > 0.05
+    true, nominal = plant(Robot(), drawn=drawn), plant(Robot())
+    for one in (true, nominal):
+        held(one)
+    weight = Robot().tool_mass_kg * GRAVITY
+    assert true.sensor_wrench()[2] == pytest.approx(drawn.tool_mass * weight, abs=2e-2)
+    assert nominal.sensor_wrench()[2] == pytest.approx(weight, abs=2e-2)
+    np.testing.assert_allclose(true.gravity_torque(), nominal.gravity_torque(), atol=1e-3)
+
+
+def held(plant: Plant) -> None:
+    for _ in range(3):
+        plant.step(plant.gravity_torque(), NOTHING, NOTHING, np.full(7, 1e6))
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_friction_is_that_of_the_true_arm(plant: Any) -> None:
+    """A steady turn of A1 under a torque: speed = (torque - Coulomb) / viscous."""
+    drawn = arm(friction=0.4, damping=0.4, seed=2)
+    robot = Robot(joint_friction_nm=2.0, joint_damping_nms=20.0)
+    one = plant(robot, drawn=drawn)
+    torque = np.array([6.0, 0, 0, 0, 0, 0, 0])
+    lock = np.array([0.0, *[1e6] * 6])
+    for _ in range(1500):
+        one.step(one.gravity_torque() + torque, NOTHING, NOTHING, lock)
+    expected = (6.0 - 2.0 * drawn.friction[0]) / (20.0 * drawn.damping[0])
+    assert one.v[0] == pytest.approx(expected, rel=0.01)
+    assert abs(expected / (4.0 / 20.0) - 1) > 0.05
+
+
+def test_the_service_measures_another_tool_pose_than_the_true_one_and_tells_the_nominal_arm() -> None:
+    """What others compute from joint_states and robot_description is off by the drawn errors; without them it is exact."""
+    found = []
+    for errors in ("none", "poor"):
+        scenario = Scenario(seed=5, errors=Errors(level=errors))  # type: ignore[arg-type]
+        service = create(scenario)
+        assert service.start()["robot_description"].data == lbr.urdf(scenario.robot)
+        sent = service.step(0, HandInbox())
+        p = sent["sim/tool_state"].pose.position
+        told = tool_pose(sent["joint_states"].position, scenario.robot)[:3, 3]
+        found.append(np.linalg.norm(told - (p.x, p.y, p.z)))
+    assert found[0] < 1e-5
+    drawn = draw_errors(Errors(level="poor"), 5).arm
+    lengths = DartPlant(Robot(), drawn=drawn).tool_motion()[:3] - DartPlant(Robot()).tool_motion()[:3]
+    sag = 1e-4 * DartPlant(Robot()).gravity_torque()
+    turned = tool_jacobian(np.array(lbr.HOME), Robot())[:3] @ (drawn.zero_rad + sag)
+    assert found[1] == pytest.approx(np.linalg.norm(lengths - turned), abs=0.4e-3)
+    assert found[1] > 1e-3
+
+
+def test_the_emulated_arm_has_the_errors_and_the_driver_does_not_know_them() -> None:
+    scenario = load_scenario("poor_errors", seed=2)
+    drawn = draw_errors(scenario.errors, 2)
+    emulator = Emulator(plant_input(scenario), Options())
+    state, tool = emulator.state(0), emulator.tool(0)
+    told = tool_pose(np.array(state.measured_joint_position), scenario.robot)[:3, 3]
+    p = tool.pose.position
+    assert np.linalg.norm(told - (p.x, p.y, p.z)) > 1e-3
+    off = np.array(state.measured_joint_position) - lbr.HOME
+    np.testing.assert_allclose(off, drawn.arm.zero_rad, atol=1e-4 * 60 + 3e-4)
+    f = emulator.wrench(0).wrench.force
+    expected = drawn.force.bias[2] + drawn.arm.tool_mass * scenario.robot.tool_mass_kg * GRAVITY
+    assert f.z == pytest.approx(expected, abs=1.5)
+    assert Rig().driver.start()["robot_description"].data == lbr.urdf(scenario.robot)

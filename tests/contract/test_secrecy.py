@@ -1,0 +1,170 @@
+"""What a role is given - files, environment, arguments - tells those who may not know the patient nothing of his or her seed."""
+
+from __future__ import annotations
+
+import ast
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from palpate.run import composed
+from palpate.run.forks import Forks
+from palpate.run.processes import LocalProcesses, compose_file, read_processes
+from palpate.run.roles import OBSERVERS, WORKERS, write_scenario_files
+from palpate_bus.contract import contract
+from palpate_conductor.timing import Timing
+from palpate_models.load import dump_scenario, load_scenario, view_of
+from palpate_models.scenario import Scenario
+
+ROOT = Path(__file__).resolve().parents[2]
+ROLES = (*WORKERS, *OBSERVERS)
+UNKNOWING = tuple(role for role in WORKERS if view_of(role) == "exam")
+SEEDS = (11, 4711)
+DRAWING = {"draw_errors", "draw_arm", "true_pose", "plant_input", "PlantInput"}
+
+
+@dataclass(frozen=True)
+class Handout:
+    """All that a role is given at its start."""
+
+    files: Mapping[str, bytes]
+    """By name: the scenario file, and all that stands in its folder."""
+    environment: Mapping[str, str]
+    arguments: Sequence[str]
+
+
+Hand = Callable[[Scenario, Path], Mapping[str, Handout]]
+"""The handouts of a run of a scenario, by role."""
+
+
+class Witness:
+    """Stands where processes are forked, and keeps what each was given."""
+
+    def __init__(self) -> None:
+        self.handouts: dict[str, Handout] = {}
+
+    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Any:
+        file = Path(environment["PALPATE_SCENARIO"])
+        files = {path.name: path.read_bytes() for path in file.parent.iterdir() if path.is_file()}
+        listening = Path(environment["PALPATE_LISTEN"].partition("/")[2]).parent  # a folder of random name
+        kept = {name: value.replace(str(listening), "/sockets") for name, value in environment.items()}
+        self.handouts[log.stem] = Handout(files, kept, tuple(command))
+        return None
+
+
+def distributed(scenario: Scenario, out: Path, leak: Callable[[Scenario, dict[str, Path]], None] | None = None) -> Any:
+    """Those of processes. `leak` may tamper with the files."""
+    files = write_scenario_files(scenario, out)
+    if leak is not None:
+        leak(scenario, files)
+    witness = Witness()
+    local = LocalProcesses(ROLES, out, files, Timing(), record=True, forks=cast("Forks", witness))
+    try:
+        for process in read_processes(compose_file(), ROLES).values():
+            local.start(process)
+    finally:
+        local.running.clear()
+        local.stop()
+    return witness.handouts
+
+
+def in_one_process(scenario: Scenario, out: Path) -> Any:
+    """Those of services in one process: what `create` is called with."""
+    handouts = {}
+
+    class StopError(Exception):
+        """All services have been made."""
+
+    def create(role: str, _: str, given: Scenario) -> Any:
+        handouts[role] = Handout({"scenario": dump_scenario(given).encode()}, dict(os.environ), ())
+        if len(handouts) == len(ROLES):
+            raise StopError
+        return None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(composed, "create", create)
+        with pytest.raises(StopError):
+            composed.run_composed(scenario, out, lambda _: None)
+    return handouts
+
+
+def told_apart(hand: Hand, tmp_path: Path) -> dict[str, list[str]]:
+    """What differs for each role between two patients who differ in seed alone, as do the names of their folders."""
+    one, other = (
+        hand(load_scenario("poor_errors", seed=seed), tmp_path / f"patient-{seed}-of-{hand.__name__}") for seed in SEEDS
+    )
+    found = {}
+    for role in ROLES:
+        a, b = one[role], other[role]
+        found[role] = [f"file {name}" for name in a.files.keys() | b.files.keys() if a.files.get(name) != b.files.get(name)]
+        names = a.environment.keys() | b.environment.keys()
+        found[role] += [name for name in names if a.environment.get(name) != b.environment.get(name)]
+        found[role] += [] if a.arguments == b.arguments else [f"{a.arguments} or {b.arguments}"]
+    return found
+
+
+def leaking_file(scenario: Scenario, out: Path) -> Any:
+    """Planning is given the file of the plant."""
+    return distributed(scenario, out, lambda _, files: files.update(planning=files["robot"]))
+
+
+def leaking_seed(scenario: Scenario, out: Path) -> Any:
+    """The examination draws from the patient's seed."""
+    return distributed(scenario.model_copy(update={"exam": scenario.exam.model_copy(update={"seed": scenario.seed})}), out)
+
+
+def leaking_folder(scenario: Scenario, out: Path) -> Any:
+    """Every process is told the results folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("palpate.run.processes.OBSERVERS", frozenset(ROLES))
+        return distributed(scenario, out)
+
+
+def leaking_environment(scenario: Scenario, out: Path) -> Any:
+    """The seed stands in the environment."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATIENT", str(scenario.seed))
+        return in_one_process(scenario, out)
+
+
+@pytest.mark.parametrize("hand", [distributed, in_one_process])
+def test_two_patients_who_differ_in_seed_alone_are_the_same_to_who_may_not_know(hand: Hand, tmp_path: Path) -> None:
+    found = told_apart(hand, tmp_path)
+    assert {role: found[role] for role in UNKNOWING} == {role: [] for role in UNKNOWING}
+    assert all(found[role] for role in ROLES if role not in UNKNOWING), (
+        "these are told who the patient is, or what the errors are"
+    )
+
+
+@pytest.mark.parametrize("hand", [leaking_file, leaking_seed, leaking_folder, leaking_environment])
+def test_a_leak_is_noticed(hand: Hand, tmp_path: Path) -> None:
+    assert told_apart(hand, tmp_path)["planning"]
+
+
+def test_who_may_not_know_is_everybody_but_tissue_plant_and_observers() -> None:
+    assert set(UNKNOWING) == {"control", "planning", "perception", "assessment", "supervisor"}
+
+
+def test_no_file_of_those_who_may_not_know_mentions_a_secret() -> None:
+    scenario = load_scenario("poor_errors", seed=4711)
+    exam, plant = (dump_scenario(scenario, view) for view in ("exam", "plant"))
+    assert not [word for word in ("4711", "lesions", "phantom", "poor", "errors", "paper") if word in exam]
+    assert not [word for word in ("lesions", "phantom", "paper") if word in plant]
+    assert "4711" in plant
+
+
+@pytest.mark.parametrize("role", [role for role in contract().roles if role in UNKNOWING])
+def test_who_may_not_know_draws_no_errors(role: str) -> None:
+    for path in (ROOT / "services" / role / f"palpate_{role}").rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                drawn = {alias.name for alias in node.names} & DRAWING
+                assert node.module != "palpate_models.errors", f"{path}:{node.lineno}"
+                assert not drawn, f"{path}:{node.lineno} imports {sorted(drawn)}"
+            if isinstance(node, ast.Import):
+                assert "palpate_models.errors" not in {alias.name for alias in node.names}, f"{path}:{node.lineno}"
