@@ -56,17 +56,26 @@ def path(surface: SkinSurface) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]
     return list(zip(position, velocity, spin, strict=True))
 
 
+BREATHING = "phantom.breathing.kind=quiet"
+FINE = "phantom.edge_m=0.0035"
+STIFFENING = "phantom.stiffness.stiffening_per_m=80"
+STRAIGHT_SOON = "phantom.stiffness.stiffening_per_m=600"
+"""The modulus rises no further from a depth of 6.5 mm on."""
+INVOLUNTARY = "phantom.guarding=[{centre_m: [-0.03, -0.04], kind: involuntary}]"
+VOLUNTARY = "phantom.guarding=[{centre_m: [-0.03, -0.04], kind: voluntary}]"
+
+
 @pytest.mark.parametrize(
     "settings",
-    [(), ("phantom.breathing.kind=quiet",), ("phantom.edge_m=0.0035",)],
-    ids=["default", "breathing", "fine mesh"],
+    [(), (BREATHING,), (FINE,), (STIFFENING,), (STRAIGHT_SOON, INVOLUNTARY), (STIFFENING, VOLUNTARY, BREATHING, FINE)],
+    ids=["default", "breathing", "fine mesh", "stiffening", "guarding", "all"],
 )
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:
     scenario = load_scenario("rlq_guarding", settings)
     model = build_phantom(scenario.phantom, scenario.seed)
     tissue = WinklerTissue(model, scenario.phantom.stiffness, BreathingCurve(scenario.phantom.breathing, scenario.seed))
     motions = path(SkinSurface(model))
-    if "phantom.edge_m=0.0035" in settings:
+    if FINE in settings:
         motions = motions[:1500]
     wrenches = np.empty((len(motions), 2, 6))
     moved = largest = 0.0
@@ -79,12 +88,14 @@ def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple
             motion.push()
             fmu.step((k - 1) * STEP_S, STEP_S)
             wrenches[k, 1] = wrench.pull()
+            assert abs(float(fmu.get("activation")) - tissue.activation) < BOUND
             if k % 20 == 0:
                 moved = max(moved, float(np.abs(surface.pull() - tissue.inward).max()))
                 largest = max(largest, float(np.abs(tissue.inward).max()))
     difference = np.abs(wrenches[:, 0] - wrenches[:, 1]).max(axis=0)
     scale = np.linalg.norm(wrenches[:, 0, :3], axis=1).max()
     assert scale > 2
+    assert (VOLUNTARY in settings) == (tissue.activation < 1)
     assert largest > 0.005
     assert difference[:3].max() < BOUND * scale, difference
     assert difference[3:].max() < BOUND * scale * RADIUS_M, difference

@@ -1,4 +1,4 @@
-"""The patient of a scenario: shape, wall, lesions, breathing, motion. Reaches only the tissue and scoring."""
+"""The patient of a scenario: shape, wall, lesions, guarding, breathing, motion. Reaches only the tissue and scoring."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from palpate_models.breathing import Breathing
+from palpate_models.guarding import Guarding
 from palpate_models.motion import Motion
 from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
 
@@ -78,8 +79,15 @@ class Phantom(Section):
     stiffness: Stiffness = Stiffness()
     background: Background = Background()
     lesions: tuple[Lesion, ...] = ()
+    guarding: tuple[Guarding, ...] = ()
     breathing: Breathing = Breathing()
     motion: Motion = Motion()
+
+    @model_validator(mode="after")
+    def _guarding(self) -> Phantom:
+        if len({area.kind for area in self.guarding}) > 1:
+            raise ValueError("guarding: all areas of a patient are of one kind, voluntary or involuntary")
+        return self
 
     @model_validator(mode="after")
     def _mesh(self) -> Phantom:

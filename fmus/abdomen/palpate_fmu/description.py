@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import product
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_fmu.structure import Indices, structure_2, structure_3
 from palpate_fmu.variables import Sizes, Variable, VariableKind, VariableRole, variables
 from palpate_models.frames import Array
+from palpate_models.phantom import PhantomModel
 
 MODEL = "abdomen"
 """The model identifier: name of binaries and prefix of functions."""
 STEP_S = 1e-3
 """The step size a master should take."""
 SOURCES = (
-    "component.c", "contact.c", "derivative.c", "exchange.c", "flow.c",
+    "breath.c", "component.c", "contact.c", "derivative.c", "exchange.c", "flow.c", "guarding.c",
     "matrices.c", "outputs.c", "phantom.c", "surface.c", "tissue.c",
 )  # fmt: skip
 
 UNITS: dict[str, dict[str, str]] = {
     "1": {},
     "s": {"s": "1"},
+    "1/s": {"s": "-1"},
     "m": {"m": "1"},
     "m/s": {"m": "1", "s": "-1"},
-    "rad": {"rad": "1"},
     "rad/s": {"rad": "1", "s": "-1"},
-    "1/min": {"s": "-1", "factor": repr(1 / 60)},
+    "1/m": {"m": "-1"},
     "N": {"kg": "1", "m": "1", "s": "-2"},
     "N.m": {"kg": "1", "m": "2", "s": "-2"},
     "N/m3": {"kg": "1", "m": "-2", "s": "-2"},
@@ -131,14 +131,7 @@ def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Si
     return _text(root)
 
 
-def description_2(
-    token: str,
-    about: str,
-    starts: Mapping[str, Array],
-    sizes: Sizes,
-    coupled: Sequence[NDArray[np.intp]],
-    samples: NDArray[np.int32],
-) -> bytes:
+def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes, model: PhantomModel) -> bytes:
     """modelDescription.xml of FMI 2.0, where each element of an array is a scalar."""
     root = ET.Element(
         "fmiModelDescription",
@@ -182,7 +175,7 @@ def description_2(
             if variable.rate_of:
                 attributes["derivative"] = str(next(indices.at(variable.rate_of, [k])))
             ET.SubElement(scalar, "Integer" if variable.integer else "Real", attributes)
-    structure_2(root, sizes, coupled, samples)
+    structure_2(root, sizes, model)
     return _text(root)
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from palpate_fmu.compiling import compile_library, fmi_headers, platforms
 from palpate_fmu.description import MODEL, SOURCES, build_description, description_2, description_3, documentation
-from palpate_fmu.phantom_file import encode_phantom, sample_vertices, sizes_of, start_values
-from palpate_fmu.structure import couplings
+from palpate_fmu.phantom_file import encode_phantom, sizes_of, start_values
 from palpate_fmu.variables import c_table
+from palpate_models.breathing import BreathingCurve
 from palpate_models.patient import Phantom
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Scenario
@@ -64,12 +64,13 @@ def build_fmu(
     model = model or build_phantom(phantom, seed)
     starts = start_values(phantom, radius_m)
     sizes = sizes_of(model, starts)
-    token = _token(encode_phantom(model, starts, ""), version)
+    breaths = BreathingCurve(phantom.breathing, seed).table
+    token = _token(encode_phantom(model, breaths, starts, ""), version)
     about = f"Soft abdomen, {sizes.vertices} vertices, pressed by a sphere; abdomen frame (x left, y head, z outward), SI units"
     if version == 3:
         description = description_3(token, about, starts, sizes)
     else:
-        description = description_2(token, about, starts, sizes, couplings(model), sample_vertices(model))
+        description = description_2(token, about, starts, sizes, model)
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "sources"
         names = write_sources(folder, version)
@@ -78,7 +79,7 @@ def build_fmu(
         files = {
             "modelDescription.xml": description,
             "documentation/index.html": documentation(version, about, sizes),
-            "resources/phantom.bin": encode_phantom(model, starts, token),
+            "resources/phantom.bin": encode_phantom(model, breaths, starts, token),
             **{f"sources/{path.name}": path.read_bytes() for path in sorted(folder.iterdir())},
         }
         for target in wanted:

@@ -28,7 +28,7 @@ def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
 
     Raises ExportError if it has more lesions or Prony branches than the FMU has room for.
     """
-    material, breathing, lesions = phantom.stiffness, phantom.breathing, phantom.lesions
+    material, lesions = phantom.stiffness, phantom.lesions
     if len(lesions) > LESIONS:
         raise ExportError(f"phantom.lesions has {len(lesions)} entries, an FMU has room for {LESIONS}")
     if len(material.prony_g) > BRANCHES:
@@ -39,8 +39,7 @@ def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
         "pasternak_length": material.length_m,
         "dashpot": material.dashpot_s,
         "friction": material.friction,
-        "breathing_amplitude": 0.0 if breathing.kind == "none" else breathing.peak_to_peak_m / 2,
-        "breathing_rate": breathing.rate_per_min,
+        "voluntary": any(area.kind == "voluntary" for area in phantom.guarding),
         "lesion_count": len(lesions),
         "prony_g": [*material.prony_g, *[0.0] * (BRANCHES - len(material.prony_g))],
         "prony_tau": [*material.prony_tau_s, *[1.0] * (BRANCHES - len(material.prony_tau_s))],
@@ -78,18 +77,19 @@ def sizes_of(model: PhantomModel, starts: Mapping[str, Array]) -> Sizes:
     return Sizes(len(model.vertices), len(model.triangles), len(sample_vertices(model)), relaxing)
 
 
-def encode_phantom(model: PhantomModel, starts: dict[str, Array], token: str) -> bytes:
-    """The phantom file."""
+def encode_phantom(model: PhantomModel, breaths: Array, starts: dict[str, Array], token: str) -> bytes:
+    """The phantom file; `breaths` is the table of a `BreathingCurve`, shape (n, 5)."""
     laplacian = model.laplacian.copy()
     laplacian.sort_indices()
     sizes = sizes_of(model, starts)
     values = np.concatenate([starts[variable.name] for variable in parameters()])
-    counts = (sizes.vertices, laplacian.nnz, sizes.triangles, sizes.samples, len(values), sizes.branches)
-    reals = (values, model.vertices, model.normals, model.areas, model.background, model.breathing, laplacian.data)
+    counts = (sizes.vertices, laplacian.nnz, sizes.triangles, sizes.samples, len(values), sizes.branches, len(breaths))
+    fields = (model.areas, model.background, model.stiffening, model.tension, model.breathing)
+    reals = (values, model.vertices, model.normals, *fields, laplacian.data, breaths)
     integers = (laplacian.indptr, laplacian.indices, model.triangles, sample_vertices(model))
     return b"".join(
         (
-            struct.pack("<8s64s6id", b"PALPHAN1", token.encode("ascii"), *counts, float(np.median(model.background))),
+            struct.pack("<8s64s7id", b"PALPHAN2", token.encode("ascii"), *counts, float(np.median(model.background))),
             *(np.ascontiguousarray(array, dtype="<f8").tobytes() for array in reals),
             *(np.ascontiguousarray(array, dtype="<i4").tobytes() for array in integers),
             model.fixed.astype(np.uint8).tobytes(),

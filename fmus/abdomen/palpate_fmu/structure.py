@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_fmu.phantom_file import sample_vertices
 from palpate_fmu.variables import Sizes, Variable, VariableRole, variables
 from palpate_models.phantom import PhantomModel
 
@@ -64,28 +65,27 @@ class Indices:
         return (self._first[name] + int(k) for k in elements)
 
 
-def _dependencies(
-    variable: Variable, indices: Indices, sizes: Sizes, coupled: Sequence[NDArray[np.intp]], samples: NDArray[np.int32]
-) -> Iterator[Iterable[int] | None]:
+def _dependencies(variable: Variable, indices: Indices, sizes: Sizes, model: PhantomModel) -> Iterator[Iterable[int] | None]:
     """The dependencies of each element; None: all."""
     n = sizes.vertices
     if variable.rate_of == "displacement":
-        for near in coupled:
+        for near, tension in zip(couplings(model), model.tension, strict=True):
             own = indices.at("displacement", near)
             relaxed = (indices.at("relaxation", k * n + near) for k in range(sizes.branches))
             outside = (*indices.at("time", [0]), *indices.at("indenter_position", range(3))) if len(near) else ()
-            yield chain(outside, own, *relaxed)
+            muscle = indices.at("activation", [0]) if len(near) and tension else ()
+            yield chain(outside, own, *relaxed, muscle)
     elif variable.rate_of == "relaxation":
         for k in range(sizes.branches * n):
             yield chain(indices.at("displacement", [k % n]), indices.at("relaxation", [k]))
     elif variable.name == "sample_displacement":
-        for vertex in samples:
+        for vertex in sample_vertices(model):
             yield chain(indices.at("time", [0]), indices.at("displacement", [vertex]))
     else:
         yield from (None for _ in indices.of(variable))
 
 
-def structure_2(root: ET.Element, sizes: Sizes, coupled: Sequence[NDArray[np.intp]], samples: NDArray[np.int32]) -> None:
+def structure_2(root: ET.Element, sizes: Sizes, model: PhantomModel) -> None:
     """ModelStructure of FMI 2.0, by places of scalars in ModelVariables."""
     table = variables(2, sizes)
     indices = Indices(table, sizes)
@@ -95,7 +95,7 @@ def structure_2(root: ET.Element, sizes: Sizes, coupled: Sequence[NDArray[np.int
         group = ET.SubElement(structure, name)
         places: dict[int, Iterable[int] | None] = {}
         for variable in members:
-            of_elements = _dependencies(variable, indices, sizes, coupled, samples)
+            of_elements = _dependencies(variable, indices, sizes, model)
             places |= dict(zip(indices.of(variable), of_elements, strict=True))
         for place in sorted(places) if name == "InitialUnknowns" else places:
             unknown = ET.SubElement(group, "Unknown", index=str(place))

@@ -72,13 +72,16 @@ class Variable:
     versions: tuple[int, ...] = (2, 3)
     rate_of: str | None = None
     """The continuous state of which this is the derivative by time."""
-    behind: bool = False
-    """Whether the C code keeps a pointer to the values; those whose extent is the phantom's always are."""
 
     @property
     def parameter(self) -> bool:
         """Whether it is set before or, if tunable, during the simulation and held."""
         return self.kind in (VariableKind.FIXED, VariableKind.TUNABLE)
+
+    @property
+    def behind(self) -> bool:
+        """Whether the C code keeps a pointer to the values; those whose extent is the phantom's always are."""
+        return self.kind is VariableKind.STATE or self.rate_of is not None
 
     @property
     def settable(self) -> bool:
@@ -108,17 +111,16 @@ def _parameter(
 
 
 def _state(
-    vr: int, rate_vr: int, name: str, rate: str, member: str, doc: str, shape: tuple[int | str, ...], behind: bool = False
+    vr: int, rate_vr: int, name: str, member: str, doc: str, shape: tuple[int | str, ...], unit: str = "m", **more: Any
 ) -> tuple[Variable, Variable]:
-    """A continuous state of model exchange and its derivative."""
+    """A continuous state of model exchange, a length unless `more` fields say otherwise, and its derivative."""
+    fields: dict[str, Any] = {"low": -2, "high": 2, "nominal": 1e-3, "start": 0.0} | more
+    rate_unit = "m/s" if unit == "m" else "1/s"
     return (
+        Variable(vr, name, f"arrays.{member}", doc, unit, shape, VariableKind.STATE, VariableRole.LOCAL, **fields),
         Variable(
-            vr, name, f"arrays.{member}", doc, "m", shape, VariableKind.STATE, VariableRole.LOCAL, low=-1, high=1, nominal=1e-3,
-            start=0.0, behind=behind,
-        ),
-        Variable(
-            rate_vr, rate, f"arrays.{member}_rate", f"Derivative of {name}", "m/s", shape, VariableKind.READ, VariableRole.LOCAL,
-            group="RATES", rate_of=name, behind=behind,
+            rate_vr, f"{name}_rate", f"arrays.{member}_rate", f"Derivative of {name}", rate_unit, shape, VariableKind.READ,
+            VariableRole.LOCAL, group="RATES", rate_of=name,
         ),
     )  # fmt: skip
 
@@ -146,9 +148,9 @@ TABLE: tuple[Variable, ...] = (
     _parameter(32, "pasternak_length", "m", (0.002, 0.1), "l = sqrt(G / k_w)", member="length"),
     _parameter(33, "dashpot", "s", (1e-4, 1), "Dashpot over foundation modulus"),
     _parameter(34, "friction", "1", (0, 2), "Coulomb friction between indenter and skin"),
-    _parameter(35, "breathing_amplitude", "m", (0, 0.02), "Half of the peak-to-peak excursion", member="amplitude"),
-    _parameter(36, "breathing_rate", "1/min", (0, 60), "Breaths a minute", member="rate"),
-    _parameter(37, "breathing_phase", "rad", (-6.2831854, 6.2831854), "Phase of breathing at time 0", start=0.0, member="phase"),
+    _parameter(35, "breathing_scale", "1", (0, 10), "Factor on all breaths; 0 holds them", start=1.0, member="breathing"),
+    _parameter(36, "voluntary", None, (0, 1), "Whether guarding fades under gentle pressure (1)", integer=True),
+    _parameter(37, "breathing_offset", "s", (-1e6, 1e6), "How far the breaths are ahead of time", start=0.0),
     _parameter(38, "lesion_count", None, (0, LESIONS), "How many entries of the lesion list count", integer=True),
     _parameter(
         39, "contact_time", "s", (1e-5, 0.1), "Model exchange: within which contact and friction are restored", start=1e-3
@@ -200,19 +202,29 @@ TABLE: tuple[Variable, ...] = (
         role=VariableRole.CALCULATED, group="MATRICES", integer=True, versions=(3,),
     ),
     Variable(
+        5009, "stiffening", "arrays.stiffening", "How fast the modulus rises with depth", "1/m", ("vertices",),
+        role=VariableRole.CALCULATED, versions=(3,),
+    ),
+    Variable(
+        5010, "tension", "arrays.tension", "What contracted muscle adds to the modulus, over k_w", "1", ("vertices",),
+        role=VariableRole.CALCULATED, versions=(3,),
+    ),
+    Variable(
         5008, "triangles", "arrays.triangles", "Vertex indices from 0, counter-clockwise seen from outside", None,
         ("triangles", 3), role=VariableRole.CALCULATED, integer=True, versions=(3,),
     ),
     *_state(
-        100_000_000, 200_000_000, "displacement", "displacement_rate", "displacement",
+        100_000_000, 200_000_000, "displacement", "displacement",
         "Inward displacement of every vertex, breathing excluded", ("vertices",),
     ),
     *_state(
-        300_000_000, 400_000_000, "relaxation", "relaxation_rate", "relaxation",
+        300_000_000, 400_000_000, "relaxation", "relaxation",
         "What of it each Prony branch has relaxed", ("branches", "vertices"),
     ),
+    *_state(3000, 3003, "skin_stretch", "stretch", "Stretch of the skin by friction", (3,)),
     *_state(
-        3000, 3003, "skin_stretch", "skin_stretch_rate", "stretch", "Stretch of the skin by friction", (3,), behind=True
+        3006, 3007, "activation", "activation", "How far guarding muscle is contracted: 1 is all of its tension", (),
+        "1", nominal=1.0, start=1.0,
     ),
 )  # fmt: skip
 

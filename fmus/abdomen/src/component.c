@@ -98,7 +98,9 @@ static int allocate(Component *c) {
     a->stretch = c->tissue->state.stretch;
     a->displacement_rate = c->flow->rate;
     a->relaxation_rate = c->flow->rate + n;
-    a->stretch_rate = c->flow->rate + flow_states(c->phantom) - 3;
+    a->stretch_rate = c->flow->rate + flow_states(c->phantom) - 4;
+    a->activation = &c->tissue->state.activation;
+    a->activation_rate = a->stretch_rate + 3;
     a->inward = calloc(n, sizeof(double));
     a->position = calloc(3 * n, sizeof(double));
     a->normal = calloc(3 * n, sizeof(double));
@@ -108,6 +110,8 @@ static int allocate(Component *c) {
     a->rest_normal = c->phantom->normals;
     a->stiffness = c->matrices->k_w;
     a->background = c->matrices->plain;
+    a->stiffening = c->phantom->stiffening;
+    a->tension = c->phantom->tension;
     a->lesion = c->matrices->lesion;
     a->triangles = c->phantom->triangles;
     return a->inward && a->position && a->normal && a->sample_inward && a->sample_position;
@@ -324,7 +328,7 @@ int component_exit_initialization(Component *c) {
 
 int component_step(Component *c, double time, double dt) {
     const double now = c->tissue->state.time;
-    double count, periods;
+    double substeps, periods;
     if (!component_expects(c, c->phase == PHASE_STEP, "a step")) return 0;
     if (!(dt > 0) || dt > LONGEST_STEP_S) {
         component_say(c, "a step of %g s is not possible: want more than 0 and at most %g s", dt, LONGEST_STEP_S);
@@ -339,10 +343,10 @@ int component_step(Component *c, double time, double dt) {
         component_say(c, "a step to %.9g s is not possible: the stop time is %.9g s", time + dt, c->stop);
         return 0;
     }
-    count = matrices_substeps(c->matrices, dt);
     periods = ceil(dt / PERIOD_S * (1 - 1e-9));
+    substeps = matrices_substeps(c->matrices, dt / periods);
     c->tissue->state.time = time;
-    tissue_step(c->tissue, &c->inputs, dt, (long)(count > periods ? count : periods));
+    tissue_step(c->tissue, &c->inputs, dt, (long)periods, (long)substeps);
     c->fresh &= 1u << GROUP_MATRICES;
     return 1;
 }

@@ -40,9 +40,11 @@ typedef struct {
     double *displacement;      /* (n) */
     double *relaxation;        /* (branches, n) */
     double *stretch;           /* (3) */
+    double *activation;        /* (1) */
     double *displacement_rate; /* (n) */
     double *relaxation_rate;   /* (branches, n) */
     double *stretch_rate;      /* (3) */
+    double *activation_rate;   /* (1) */
     double *inward;          /* (n) */
     double *position;        /* (n, 3) */
     double *normal;          /* (n, 3) */
@@ -50,6 +52,8 @@ typedef struct {
     double *rest_normal;     /* (n, 3) */
     double *stiffness;       /* (n) */
     double *background;      /* (n) */
+    double *stiffening;      /* (n) */
+    double *tension;         /* (n) */
     int32_t *lesion;         /* (n) */
     int32_t *triangles;      /* (m, 3) */
     double *sample_inward;   /* (samples) */

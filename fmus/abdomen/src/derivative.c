@@ -21,10 +21,12 @@ static Component *shadow_of(Component *c) {
     a = &c->shadow->arrays;
     a->displacement = c->shadow_memory;
     a->relaxation = a->displacement + n;
-    a->stretch = a->displacement + states - 3;
+    a->stretch = a->displacement + states - 4;
+    a->activation = a->stretch + 3;
     a->displacement_rate = a->displacement + states;
     a->relaxation_rate = a->displacement_rate + n;
-    a->stretch_rate = a->displacement_rate + states - 3;
+    a->stretch_rate = a->displacement_rate + states - 4;
+    a->activation_rate = a->stretch_rate + 3;
     a->inward = a->displacement_rate + states;
     a->sample_inward = a->inward + n;
     return c->shadow;
@@ -50,7 +52,7 @@ static void look_under_along(const Component *c, Component *s) {
     d->tangential_force = o->tangential_force > 0 ? inner / o->tangential_force : 0;
 }
 
-/* Of the energy stored in springs: sum of x' K dx, with x = u, or x = u - y / g of a branch. */
+/* Of the energy stored in springs: sum of x' K dx, with x = u, or x = u - y / g of a branch; and of those that stiffen. */
 static double energy_along(const Component *c, const Component *s) {
     const int32_t n = c->phantom->n;
     const double *u = c->arrays.displacement, *du = s->arrays.displacement;
@@ -68,6 +70,10 @@ static double energy_along(const Component *c, const Component *s) {
         }
         change += g * sum;
     }
+    for (int32_t i = 0; i < n; i++) {
+        const double by_muscle = u[i] > 0 ? c->matrices->tension[i] * u[i] * u[i] / 2 * s->arrays.activation[0] : 0;
+        change += c->matrices->k_w[i] * c->phantom->areas[i] * (tissue_stiffening(c->tissue, i) * du[i] + by_muscle);
+    }
     return change + contact_skin_stiffness(c->phantom, &c->parameters) * dot(c->arrays.stretch, s->arrays.stretch);
 }
 
@@ -80,6 +86,7 @@ static void derive(Component *c, Component *s) {
     along.inputs = s->inputs;
     along.field = s->arrays.displacement;
     memcpy(along.stretch, s->arrays.stretch, sizeof along.stretch);
+    along.activation = s->arrays.activation[0];
     change.rate = s->arrays.displacement_rate;
     flow_derive(c->flow, &c->inputs, &along, &change);
     s->outputs.excursion = change.excursion;

@@ -3,8 +3,8 @@
 #include <math.h>
 #include <string.h>
 
-#define NOMINAL_M 1e-3  /* of a state: what an integrator's tolerance is relative to */
-#define LARGEST_M 1.0   /* of a state */
+#define NOMINAL_M 1e-3 /* of a state that is a length: what an integrator's tolerance is relative to */
+#define LARGEST 2.0    /* of a state, in its own unit: integrators try values a little out of place */
 
 static int is_running(const Component *c) { return c->phase == PHASE_EVENT || c->phase == PHASE_CONTINUOUS; }
 
@@ -25,7 +25,7 @@ int exchange_time(Component *c, double time) {
         return 0;
     }
     c->tissue->state.time = time;
-    c->tissue->state.excursion = tissue_excursion(&c->parameters, time);
+    c->tissue->state.excursion = tissue_excursion(c->tissue, time);
     c->fresh &= 1u << GROUP_MATRICES;
     return 1;
 }
@@ -43,22 +43,24 @@ static int fits(Component *c, int ready, size_t count, const char *function) {
 int exchange_set_states(Component *c, const double *values, size_t count) {
     if (!fits(c, is_running(c), count, "setting continuous states")) return 0;
     for (size_t i = 0; i < count; i++) {
-        if (!(fabs(values[i]) <= LARGEST_M)) {
-            component_say(c, "continuous state %lu = %g m is not allowed: want %g to %g", (unsigned long)i + 1, values[i], -LARGEST_M,
-                          LARGEST_M);
+        if (!(fabs(values[i]) <= LARGEST)) {
+            component_say(c, "continuous state %lu = %g is not allowed: want %g to %g", (unsigned long)i + 1, values[i], -LARGEST,
+                          LARGEST);
             return 0;
         }
     }
-    memcpy(c->tissue->field, values, (count - 3) * sizeof *values);
-    memcpy(c->tissue->state.stretch, values + count - 3, 3 * sizeof *values);
+    memcpy(c->tissue->field, values, (count - 4) * sizeof *values);
+    memcpy(c->tissue->state.stretch, values + count - 4, 3 * sizeof *values);
+    c->tissue->state.activation = values[count - 1];
     c->fresh &= 1u << GROUP_MATRICES;
     return 1;
 }
 
 int exchange_get_states(Component *c, double *values, size_t count) {
     if (!fits(c, is_initialised(c), count, "getting continuous states")) return 0;
-    memcpy(values, c->tissue->field, (count - 3) * sizeof *values);
-    memcpy(values + count - 3, c->tissue->state.stretch, 3 * sizeof *values);
+    memcpy(values, c->tissue->field, (count - 4) * sizeof *values);
+    memcpy(values + count - 4, c->tissue->state.stretch, 3 * sizeof *values);
+    values[count - 1] = c->tissue->state.activation;
     return 1;
 }
 
@@ -71,6 +73,6 @@ int exchange_rates(Component *c, double *values, size_t count) {
 
 int exchange_nominals(Component *c, double *values, size_t count) {
     if (!fits(c, is_initialised(c), count, "getting nominal values")) return 0;
-    for (size_t i = 0; i < count; i++) values[i] = NOMINAL_M;
+    for (size_t i = 0; i < count; i++) values[i] = i + 1 < count ? NOMINAL_M : 1;
     return 1;
 }

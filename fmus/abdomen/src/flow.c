@@ -7,7 +7,7 @@
 /* A sphere is followed to this depth below the rest surface, whatever path it took: rates depend on the states alone. */
 #define DEEPEST_M 0.1
 
-size_t flow_states(const Phantom *p) { return (1 + (size_t)p->branches) * (size_t)p->n + 3; }
+size_t flow_states(const Phantom *p) { return (1 + (size_t)p->branches) * (size_t)p->n + 4; }
 
 Flow *flow_new(const Tissue *tissue) {
     const size_t n = (size_t)tissue->phantom->n;
@@ -40,7 +40,7 @@ static void gather(Flow *f, const double *p) {
     const double radius = t->parameters.radius;
     if (f->radius == radius && memcmp(f->at, p, sizeof f->at) == 0) return;
     candidates_collect(&f->near, t->phantom, t->matrices, p, radius,
-                       sqrt(radius * radius + DEEPEST_M * DEEPEST_M) + t->parameters.amplitude);
+                       sqrt(radius * radius + DEEPEST_M * DEEPEST_M) + tissue_largest_excursion(t));
     memcpy(f->at, p, sizeof f->at);
     f->radius = radius;
 }
@@ -74,6 +74,15 @@ static void rub(Flow *f, const Inputs *in, double *rate) {
     for (int k = 0; k < 3; k++) rate[k] = v[k] - (s[k] - held[k]) / t->parameters.contact_time;
 }
 
+/* How fast muscle contracts under the sphere [1/s]. */
+static double contract(const Flow *f, const Inputs *in) {
+    const Tissue *t = f->tissue;
+    double provoked;
+    if (!t->parameters.voluntary || f->deepest < 0) return 0;
+    provoked = guarding_provoked(tissue_press(t, in, f->deepest));
+    return (provoked - t->state.activation) / guarding_time(t->state.activation, provoked);
+}
+
 void flow_evaluate(Flow *f, const Inputs *in) {
     const Tissue *t = f->tissue;
     const double T = t->parameters.contact_time;
@@ -81,7 +90,9 @@ void flow_evaluate(Flow *f, const Inputs *in) {
     gather(f, in->position);
     tissue_strain(t, f->strain);
     relax(t, t->field, f->strain, f->rate);
+    for (int32_t i = 0; i < t->phantom->n; i++) f->rate[i] -= tissue_stiffening(t, i) / t->parameters.dashpot;
     memset(&f->grip, 0, sizeof f->grip);
+    f->deepest = -1;
     memset(f->force, 0, sizeof f->force);
     memset(f->torque, 0, sizeof f->torque);
     for (int32_t k = 0; k < f->near.count; k++) {
@@ -93,13 +104,15 @@ void flow_evaluate(Flow *f, const Inputs *in) {
         if (gap <= 0) continue;
         f->gap[k] = gap;
         f->rate[i] += gap / T;
+        if (f->deepest < 0 || t->field[i] > t->field[f->deepest]) f->deepest = i;
         contact_add(&f->grip, f->near.normals + 3 * k, &hold, gap * (f->near.damping[k] / T));
     }
     for (int k = 0; k < 3 && f->grip.count; k++) {
         f->force[k] = f->grip.push[k] + f->grip.side[k];
         f->grip.point[k] /= f->grip.load;
     }
-    rub(f, in, f->rate + flow_states(t->phantom) - 3);
+    rub(f, in, f->rate + flow_states(t->phantom) - 4);
+    f->rate[flow_states(t->phantom) - 1] = contract(f, in);
 }
 
 static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -127,7 +140,7 @@ static void rub_along(const Flow *f, const Inputs *in, const Direction *along, c
     const double load = sqrt(dot(push, push)), mu = t->parameters.friction, T = t->parameters.contact_time;
     const double stiffness = contact_skin_stiffness(t->phantom, &t->parameters);
     double e[3], de[3], v[3], dv[3], held[3] = {0, 0, 0}, dheld[3] = {0, 0, 0}, pull[3], dpull[3];
-    double *rate = change->rate + flow_states(t->phantom) - 3;
+    double *rate = change->rate + flow_states(t->phantom) - 4;
     memset(dv, 0, sizeof dv);
     if (mu * load > 0) {
         const double dload = dot(push, dpush) / load;
@@ -164,6 +177,18 @@ static void rub_along(const Flow *f, const Inputs *in, const Direction *along, c
     for (int k = 0; k < 3; k++) rate[k] = dv[k] - (along->stretch[k] - dheld[k]) / T;
 }
 
+/* The derivative of `contract`. */
+static double contract_along(const Flow *f, const Inputs *in, const Direction *along) {
+    const Tissue *t = f->tissue;
+    Press press, change;
+    if (!t->parameters.voluntary || f->deepest < 0) return 0;
+    press = tissue_press(t, in, f->deepest);
+    change.depth = along->field[f->deepest];
+    change.speed = -dot(along->inputs.velocity, t->phantom->normals + 3 * f->deepest);
+    return (guarding_provoked_along(press, change) - along->activation) /
+           guarding_time(t->state.activation, guarding_provoked(press));
+}
+
 void flow_derive(const Flow *f, const Inputs *in, const Direction *along, Change *change) {
     const Tissue *t = f->tissue;
     const Parameters *par = &t->parameters;
@@ -171,7 +196,7 @@ void flow_derive(const Flow *f, const Inputs *in, const Direction *along, Change
     const int32_t n = t->phantom->n;
     double dpush[3] = {0, 0, 0}, dpoint[3] = {0, 0, 0}, dload = 0;
     Hold hold;
-    change->excursion = tissue_excursion_rate(par, t->state.time) * along->time;
+    change->excursion = tissue_excursion_rate(t, t->state.time) * along->time;
     memset(change->force, 0, sizeof change->force);
     memset(change->torque, 0, sizeof change->torque);
     memcpy(f->strain, along->field, (size_t)n * sizeof(double));
@@ -181,6 +206,9 @@ void flow_derive(const Flow *f, const Inputs *in, const Direction *along, Change
         for (int32_t i = 0; i < n; i++) f->strain[i] -= dy[i];
     }
     relax(t, along->field, f->strain, change->rate);
+    for (int32_t i = 0; i < n; i++) {
+        change->rate[i] -= tissue_stiffening_along(t, i, along->field[i], along->activation) / par->dashpot;
+    }
     for (int32_t k = 0; k < f->near.count; k++) {
         const int32_t i = f->near.index[k];
         const double *normal = f->near.normals + 3 * k, *x = hold.x, damping = f->near.damping[k];
@@ -205,4 +233,5 @@ void flow_derive(const Flow *f, const Inputs *in, const Direction *along, Change
         dpoint[j] = (dpoint[j] - f->grip.point[j] * dload) / f->grip.load;
     }
     rub_along(f, in, along, dpush, dpoint, change);
+    change->rate[flow_states(t->phantom) - 1] = contract_along(f, in, along);
 }

@@ -4,16 +4,17 @@
 
 #include "tissue.h"
 
-/* Continuous states: u (n), y_k (branches, n), stretch (3). Their rates lie in this order. */
+/* Continuous states: u (n), y_k (branches, n), stretch (3), activation. Their rates lie in this order. */
 typedef struct {
     const Tissue *tissue;
-    double *rate;   /* (states) [m/s] */
+    double *rate;   /* (states) [m/s], the last [1/s] */
     double *strain; /* (n), scratch */
     Candidates near;
     double *gap;   /* (near.count) how far a vertex is moved to the sphere; 0: it is not [m] */
     double at[3];  /* for which they were gathered [m] */
     double radius; /* [m]; 0: none gathered yet */
     Grip grip;
+    int32_t deepest; /* of the vertices that are moved to the sphere; -1: none */
     double force[3]; /* on the sphere [N] */
     double torque[3];
 } Flow;
@@ -24,6 +25,7 @@ typedef struct {
     Inputs inputs;
     const double *field; /* as that of the tissue: (1 + branches, n) */
     double stretch[3];
+    double activation;
 } Direction;
 
 /* What changes with it. */

@@ -4,6 +4,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "wall.h"
+
 #define LANCZOS 100
 
 static double smoothstep(double t) {
@@ -54,10 +56,21 @@ Matrices *matrices_new(const Phantom *phantom) {
     s->column = calloc(nnz, sizeof(int32_t));
     s->value = calloc(nnz, sizeof(double));
     s->relative = calloc(nnz, sizeof(double));
+    s->stiffening = calloc(n, sizeof(double));
+    s->straight = calloc(n, sizeof(double));
+    s->tension = calloc(n, sizeof(double));
+    s->most = calloc(n, sizeof(double));
     s->work = calloc(4 * n, sizeof(double));
-    if (!s->k_w || !s->plain || !s->lesion || !s->damping || !s->first || !s->column || !s->value || !s->relative || !s->work) {
+    if (!s->k_w || !s->plain || !s->lesion || !s->damping || !s->first || !s->column || !s->value || !s->relative || !s->stiffening ||
+        !s->straight || !s->tension || !s->most || !s->work) {
         matrices_free(s);
         return NULL;
+    }
+    for (size_t i = 0; i < n; i++) {
+        s->stiffening[i] = phantom->fixed[i] ? 0 : phantom->stiffening[i];
+        s->straight[i] = wall_straight(s->stiffening[i]);
+        s->tension[i] = phantom->fixed[i] ? 0 : phantom->tension[i];
+        s->stiffens |= s->stiffening[i] > 0 || s->tension[i] > 0;
     }
     return s;
 }
@@ -72,6 +85,10 @@ void matrices_free(Matrices *s) {
     free(s->column);
     free(s->value);
     free(s->relative);
+    free(s->stiffening);
+    free(s->straight);
+    free(s->tension);
+    free(s->most);
     free(s->work);
     free(s);
 }
@@ -131,13 +148,13 @@ static double largest_eigenvalue(const double *a, const double *b, int size, dou
     return high;
 }
 
-/* Largest eigenvalue of C^-1 K by Lanczos on C^-1/2 K C^-1/2, with a margin, at most Gershgorin's bound. */
+/* Largest eigenvalue of C^-1 K, K at its stiffest, by Lanczos on C^-1/2 K C^-1/2, with a margin, at most Gershgorin's bound. */
 static double largest_rate(Matrices *s, int32_t n) {
     double *v = s->work, *before = v + n, *w = before + n, *root = w + n;
     double a[LANCZOS], b[LANCZOS], norm = 0, gershgorin = 0, found;
     int size = 0;
     for (int32_t i = 0; i < n; i++) {
-        double row = 0;
+        double row = s->most[i];
         for (int32_t e = s->first[i]; e < s->first[i + 1]; e++) row += fabs(s->value[e]);
         if (row / s->damping[i] > gershgorin) gershgorin = row / s->damping[i];
         root[i] = sqrt(s->damping[i]);
@@ -149,7 +166,7 @@ static double largest_rate(Matrices *s, int32_t n) {
     while (size < LANCZOS) {
         double alpha = 0, beta = 0;
         for (int32_t i = 0; i < n; i++) {
-            double sum = 0;
+            double sum = s->most[i] * v[i] / root[i];
             for (int32_t e = s->first[i]; e < s->first[i + 1]; e++) sum += s->value[e] * v[s->column[e]] / root[s->column[e]];
             w[i] = sum / root[i] - (size ? b[size - 1] * before[i] : 0);
             alpha += w[i] * v[i];
@@ -176,6 +193,7 @@ void matrices_assemble(Matrices *s, const Phantom *phantom, const Parameters *pa
     assemble(s, phantom, par->length);
     for (int32_t i = 0; i < phantom->n; i++) {
         s->damping[i] = par->dashpot * s->k_w[i] * phantom->areas[i];
+        s->most[i] = s->k_w[i] * phantom->areas[i] * (wall_largest_slope(s->stiffening[i]) + s->tension[i]);
         for (int32_t e = s->first[i]; e < s->first[i + 1]; e++) s->relative[e] = s->value[e] / s->damping[i];
     }
     s->rate = largest_rate(s, phantom->n);

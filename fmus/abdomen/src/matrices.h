@@ -16,7 +16,12 @@ typedef struct {
     int32_t *column;
     double *value;    /* K [N/m] */
     double *relative; /* C^-1 K [1/s] */
-    double rate;      /* largest eigenvalue of C^-1 K [1/s] */
+    double *stiffening; /* (n) those of the phantom, but 0 where it is fixed [1/m] */
+    double *straight;   /* (n) displacement from which a spring stiffens no further [m] */
+    double *tension;    /* (n) as stiffening [1] */
+    int stiffens;       /* whether either is anywhere above 0 */
+    double *most;     /* (n) what stiffening and tensed muscle add at most to the diagonal of K [N/m] */
+    double rate;      /* largest eigenvalue of C^-1 K with that added [1/s] */
     double *work;     /* (4 n) */
 } Matrices;
 

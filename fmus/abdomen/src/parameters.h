@@ -13,9 +13,8 @@ typedef struct {
     double length;                   /* Pasternak length l [m] */
     double dashpot;                  /* C / (k_w A) [s] */
     double friction;                 /* Coulomb coefficient [1] */
-    double amplitude;                /* of breathing, half of peak to peak [m] */
-    double rate;                     /* of breathing [1/min] */
-    double phase;                    /* of breathing at time 0 [rad] */
+    double breathing;                /* factor on the excursion of all breaths [1] */
+    double breathing_offset;         /* how far the breaths are ahead [s] */
     double contact_time;             /* within which contact and friction are restored in model exchange [s] */
     double prony_g[BRANCHES];        /* relaxing fractions [1] */
     double prony_tau[BRANCHES];      /* time constants [s] */
@@ -24,7 +23,7 @@ typedef struct {
     double lesion_contrast[LESIONS];   /* [1] */
     double lesion_edge[LESIONS];       /* width of the smooth edge [m] */
     int32_t lesion_count;
-    int32_t unused;
+    int32_t voluntary;               /* whether guarding fades under gentle pressure */
 } Parameters;
 
 typedef struct {

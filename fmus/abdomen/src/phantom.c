@@ -11,8 +11,8 @@
 #include <wchar.h>
 #endif
 
-#define MAGIC "PALPHAN1"
-#define HEADER (8u + 64u + 6u * 4u + 8u)
+#define MAGIC "PALPHAN2"
+#define HEADER (8u + 64u + 7u * 4u + 8u)
 #define LARGEST 4000000
 
 typedef struct {
@@ -45,6 +45,18 @@ static double *read_reals(Reader *r, size_t count) {
         for (size_t i = 0; i < count; i++) values[i] = read_f64(r);
     }
     return values;
+}
+
+static Breath *read_breaths(Reader *r, size_t count) {
+    Breath *breaths = malloc((count ? count : 1) * sizeof *breaths);
+    for (size_t k = 0; breaths && k < count; k++) {
+        breaths[k].start = read_f64(r);
+        breaths[k].inspiration = read_f64(r);
+        breaths[k].expiration = read_f64(r);
+        breaths[k].pause = read_f64(r);
+        breaths[k].amplitude = read_f64(r);
+    }
+    return breaths;
 }
 
 static int32_t *read_integers(Reader *r, size_t count) {
@@ -115,6 +127,19 @@ static int all_below(const int32_t *values, size_t count, int32_t limit) {
     return 1;
 }
 
+static int is_not_negative(double value) { return isfinite(value) && value >= 0; }
+
+/* Whether the breaths follow each other, and take some time. */
+static int breaths_follow(const Phantom *p) {
+    for (int32_t k = 0; k < p->breaths; k++) {
+        const Breath *b = p->breath + k;
+        if (!isfinite(b->start) || !is_not_negative(b->amplitude)) return 0;
+        if (!is_not_negative(b->inspiration) || !is_not_negative(b->expiration) || !is_not_negative(b->pause)) return 0;
+        if (!(b->inspiration + b->expiration + b->pause > 0) || (k && !(b->start > b[-1].start))) return 0;
+    }
+    return 1;
+}
+
 /* Names the first thing that is wrong, or NULL. */
 static const char *fault(const Phantom *p) {
     const size_t n = (size_t)p->n, nnz = (size_t)p->nnz;
@@ -124,8 +149,10 @@ static const char *fault(const Phantom *p) {
     for (size_t i = 0; i < n; i++) {
         if (!(p->areas[i] > 0) || !isfinite(p->areas[i])) return "an area is not positive";
         if (!(p->background[i] > 0) || !isfinite(p->background[i])) return "a stiffness is not positive";
+        if (!is_not_negative(p->stiffening[i]) || !is_not_negative(p->tension[i])) return "stiffening or tension is negative";
         if (p->first[i] > p->first[i + 1]) return "rows of the Laplacian are not in order";
     }
+    if (!breaths_follow(p)) return "breaths are not in order";
     if (p->first[0] != 0 || p->first[n] != p->nnz) return "rows of the Laplacian do not add up";
     if (!all_below(p->column, nnz, p->n) || !all_below(p->triangles, 3 * (size_t)p->m, p->n) ||
         !all_below(p->sample, (size_t)p->samples, p->n)) {
@@ -144,7 +171,10 @@ void phantom_free(Phantom *p) {
     free(p->normals);
     free(p->areas);
     free(p->background);
+    free(p->stiffening);
+    free(p->tension);
     free(p->breathing);
+    free(p->breath);
     free(p->laplacian);
     free(p->first);
     free(p->column);
@@ -157,7 +187,7 @@ void phantom_free(Phantom *p) {
 static Phantom *parse(const unsigned char *bytes, size_t size, const char **wrong) {
     Reader r = {bytes};
     Phantom *p;
-    size_t n, nnz, m, samples, values, expected;
+    size_t n, nnz, m, samples, values, breaths, expected;
     *wrong = "not a phantom file";
     if (size < HEADER || memcmp(bytes, MAGIC, 8) != 0) return NULL;
     p = calloc(1, sizeof *p);
@@ -171,16 +201,18 @@ static Phantom *parse(const unsigned char *bytes, size_t size, const char **wron
     p->samples = read_i32(&r);
     p->values = read_i32(&r);
     p->branches = read_i32(&r);
+    p->breaths = read_i32(&r);
     p->median_background = read_f64(&r);
     *wrong = "a count is out of range";
     if (p->n < 3 || p->n > LARGEST || p->nnz < p->n || p->nnz > 16 * LARGEST || p->m < 1 || p->m > 2 * LARGEST ||
         p->samples < 0 || p->samples > p->n || p->values < 0 || p->values > 1000 || p->branches < 0 ||
-        p->branches > BRANCHES || !(p->median_background > 0)) {
+        p->branches > BRANCHES || p->breaths < 0 || p->breaths > LARGEST || !(p->median_background > 0)) {
         phantom_free(p);
         return NULL;
     }
     n = (size_t)p->n, nnz = (size_t)p->nnz, m = (size_t)p->m, samples = (size_t)p->samples, values = (size_t)p->values;
-    expected = HEADER + 8 * (values + 9 * n + nnz) + 4 * (n + 1 + nnz + 3 * m + samples) + n;
+    breaths = (size_t)p->breaths;
+    expected = HEADER + 8 * (values + 11 * n + nnz + 5 * breaths) + 4 * (n + 1 + nnz + 3 * m + samples) + n;
     *wrong = "the size does not fit its header";
     if (size != expected) {
         phantom_free(p);
@@ -191,10 +223,14 @@ static Phantom *parse(const unsigned char *bytes, size_t size, const char **wron
     p->normals = read_reals(&r, 3 * n);
     p->areas = read_reals(&r, n);
     p->background = read_reals(&r, n);
+    p->stiffening = read_reals(&r, n);
+    p->tension = read_reals(&r, n);
     p->breathing = read_reals(&r, n);
     p->laplacian = read_reals(&r, nnz);
+    p->breath = read_breaths(&r, breaths);
     *wrong = "out of memory";
-    if (p->start && p->vertices && p->normals && p->areas && p->background && p->breathing && p->laplacian) {
+    if (p->start && p->vertices && p->normals && p->areas && p->background && p->stiffening && p->tension && p->breathing &&
+        p->laplacian && p->breath) {
         p->first = read_integers(&r, n + 1);
         p->column = read_integers(&r, nnz);
         p->triangles = read_integers(&r, 3 * m);

@@ -4,9 +4,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define REACH_M 0.030 /* least depth of the centre below the rest surface at which contact candidates are still complete */
+#include "breath.h"
+#include "wall.h"
 
-static const double PI = 3.14159265358979323846;
+#define REACH_M 0.030 /* least depth of the centre below the rest surface at which contact candidates are still complete */
 
 Tissue *tissue_new(const Phantom *phantom, const Matrices *matrices) {
     const size_t n = (size_t)phantom->n;
@@ -33,30 +34,49 @@ void tissue_free(Tissue *t) {
 
 void tissue_reset(Tissue *t, double time) {
     memset(t->state.stretch, 0, sizeof t->state.stretch);
+    t->state.activation = 1;
     memset(t->field, 0, (1 + BRANCHES) * (size_t)t->phantom->n * sizeof(double));
     tissue_begin(t, time);
 }
 
 void tissue_begin(Tissue *t, double time) {
     const size_t values = (1 + BRANCHES) * (size_t)t->phantom->n;
-    double stretch[3];
-    memcpy(stretch, t->state.stretch, sizeof stretch);
+    const State before = t->state;
     memset(&t->state, 0, sizeof t->state);
-    memcpy(t->state.stretch, stretch, sizeof stretch);
+    memcpy(t->state.stretch, before.stretch, sizeof before.stretch);
+    t->state.activation = before.activation;
     t->near.count = 0;
     t->state.time = time;
-    t->state.excursion = tissue_excursion(&t->parameters, time);
+    t->state.excursion = tissue_excursion(t, time);
     for (size_t i = 0; i < values && !t->state.disturbed; i++) t->state.disturbed = t->field[i] != 0;
 }
 
-double tissue_excursion(const Parameters *par, double time) {
-    if (par->amplitude == 0) return 0;
-    return par->amplitude * sin(2 * PI * par->rate / 60 * time + par->phase);
+double tissue_excursion(const Tissue *t, double time) {
+    return t->parameters.breathing * breath_excursion(t->phantom, time + t->parameters.breathing_offset);
 }
 
-double tissue_excursion_rate(const Parameters *par, double time) {
-    const double turn = 2 * PI * par->rate / 60;
-    return par->amplitude * turn * cos(turn * time + par->phase);
+double tissue_excursion_rate(const Tissue *t, double time) {
+    return t->parameters.breathing * breath_rate(t->phantom, time + t->parameters.breathing_offset);
+}
+
+double tissue_largest_excursion(const Tissue *t) { return t->parameters.breathing * breath_largest(t->phantom); }
+
+double tissue_stiffening(const Tissue *t, int32_t i) {
+    const Matrices *m = t->matrices;
+    const double u = t->field[i];
+    return wall_stress(u, m->stiffening[i], m->straight[i]) + t->state.activation * m->tension[i] * wall_pressed(u);
+}
+
+double tissue_stiffening_along(const Tissue *t, int32_t i, double du, double dactivation) {
+    const Matrices *m = t->matrices;
+    const double u = t->field[i], slope = wall_slope(u, m->stiffening[i], m->straight[i]);
+    return u > 0 ? (slope + t->state.activation * m->tension[i]) * du + m->tension[i] * u * dactivation : 0;
+}
+
+Press tissue_press(const Tissue *t, const Inputs *in, int32_t i) {
+    const double *n = t->phantom->normals + 3 * i, *v = in->velocity;
+    const Press press = {t->field[i], -(v[0] * n[0] + v[1] * n[1] + v[2] * n[2])};
+    return press;
 }
 
 double tissue_inward(const Tissue *t, int32_t i) {
@@ -82,7 +102,7 @@ static void gather(Tissue *t, const double *p) {
     depth = deepest + 0.01 > REACH_M ? deepest + 0.01 : REACH_M;
     memcpy(s->origin, p, sizeof s->origin);
     s->near_radius = t->parameters.radius;
-    s->ball = sqrt(s->near_radius * s->near_radius + depth * depth) + t->parameters.amplitude + SKIN_M;
+    s->ball = sqrt(s->near_radius * s->near_radius + depth * depth) + tissue_largest_excursion(t) + SKIN_M;
     s->reach = least - s->ball > SKIN_M ? least - s->ball : SKIN_M;
     collect(t);
 }
@@ -102,12 +122,16 @@ void tissue_strain(const Tissue *t, double *strain) {
     }
 }
 
-/* The field as it moves by itself: u += -h C^-1 K (u - sum y). */
+/* The field as it moves by itself: u += -h C^-1 [K (u - sum y) + k_w A (sigma + tension a u)]. */
 static void relax(Tissue *t, double h) {
     const Matrices *m = t->matrices;
+    const double by_stiffening = h / t->parameters.dashpot;
     double *u = t->field, *strain = t->strain;
     if (!t->state.disturbed) return;
     tissue_strain(t, strain);
+    if (m->stiffens) {
+        for (int32_t i = 0; i < t->phantom->n; i++) u[i] -= by_stiffening * tissue_stiffening(t, i);
+    }
     for (int32_t i = 0; i < t->phantom->n; i++) u[i] -= h * matrices_row(m, m->relative, strain, i);
 }
 
@@ -144,12 +168,15 @@ static void touch(Tissue *t, double h, const double *p, const Inputs *in, double
     const Candidates *near = &t->near;
     Grip grip = {0, {0, 0, 0}, {0, 0, 0}, {0, 0, 0}, 0};
     Hold hold;
+    t->deepest = -1;
     for (int32_t k = 0; k < near->count; k++) {
+        const int32_t i = near->index[k];
         double gap;
         if (!contact_hold(near, k, p, t->parameters.radius, &hold)) continue;
-        gap = hold.hold + t->state.excursion * near->breathing[k] - t->field[near->index[k]];
+        gap = hold.hold + t->state.excursion * near->breathing[k] - t->field[i];
         if (gap <= 0) continue;
-        t->field[near->index[k]] += gap;
+        t->field[i] += gap;
+        if (t->deepest < 0 || t->field[i] > t->field[t->deepest]) t->deepest = i;
         contact_add(&grip, near->normals + 3 * k, &hold, gap * (near->damping[k] / h));
     }
     t->state.contacts = grip.count;
@@ -166,8 +193,9 @@ static void touch(Tissue *t, double h, const double *p, const Inputs *in, double
     rub(t, h, in, grip.point, grip.push, force, torque);
 }
 
-void tissue_step(Tissue *t, const Inputs *in, double dt, long count) {
+void tissue_step(Tissue *t, const Inputs *in, double dt, long periods, long substeps) {
     State *s = &t->state;
+    const long count = periods * substeps;
     const double begin = s->time, h = dt / (double)count;
     double from[3], force[3] = {0, 0, 0}, torque[3] = {0, 0, 0};
     memcpy(from, s->moved ? s->at : in->position, sizeof from);
@@ -175,11 +203,14 @@ void tissue_step(Tissue *t, const Inputs *in, double dt, long count) {
         const double share = (double)k / (double)count;
         double p[3];
         for (int j = 0; j < 3; j++) p[j] = k == count ? in->position[j] : from[j] + share * (in->position[j] - from[j]);
-        s->excursion = tissue_excursion(&t->parameters, begin + dt * share);
+        s->excursion = tissue_excursion(t, begin + dt * share);
         if (s->near_radius != t->parameters.radius || contact_distance(p, s->origin) > s->reach) gather(t, p);
         relax(t, h);
         touch(t, h, p, in, force, torque);
         remember(t, h);
+        if (t->parameters.voluntary && t->deepest >= 0 && k % substeps == 0) {
+            s->activation = guarding_after(s->activation, tissue_press(t, in, t->deepest), dt / (double)periods);
+        }
     }
     for (int j = 0; j < 3; j++) {
         s->force[j] = force[j] / (double)count;
@@ -198,6 +229,18 @@ static double spring_energy(const Tissue *t, const double *y, double g) {
     return 0.5 * sum;
 }
 
+/* What the springs store that stiffen, and those of tensed muscle. */
+static double stiffening_energy(const Tissue *t) {
+    const Matrices *m = t->matrices;
+    double sum = 0;
+    for (int32_t i = 0; i < t->phantom->n; i++) {
+        const double u = t->field[i], pressed = wall_pressed(u), tension = t->state.activation * m->tension[i];
+        sum += m->k_w[i] * t->phantom->areas[i] *
+               (wall_stored(u, m->stiffening[i], m->straight[i]) + tension * pressed * pressed / 2);
+    }
+    return sum;
+}
+
 double tissue_energy(const Tissue *t) {
     const double *s = t->state.stretch;
     double held = 1, stored = 0.5 * contact_skin_stiffness(t->phantom, &t->parameters) * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2]);
@@ -207,5 +250,5 @@ double tissue_energy(const Tissue *t) {
         held -= g;
         stored += g * spring_energy(t, t->field + (size_t)(k + 1) * (size_t)t->phantom->n, g);
     }
-    return stored + held * spring_energy(t, NULL, 1);
+    return stored + held * spring_energy(t, NULL, 1) + stiffening_energy(t);
 }

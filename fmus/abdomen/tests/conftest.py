@@ -9,11 +9,17 @@ import pytest
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_models.breathing import Breathing
-from palpate_models.patient import Lesion, Phantom
+from palpate_models.guarding import Guarding
+from palpate_models.patient import Lesion, Phantom, Stiffness
 
 PHANTOM = Phantom(
-    lesions=(Lesion(centre_m=(-0.05, -0.05)),), breathing=Breathing(kind="quiet", peak_to_peak_m=0.004), edge_m=0.008
+    stiffness=Stiffness(stiffening_per_m=80),
+    lesions=(Lesion(centre_m=(-0.05, -0.05)),),
+    guarding=(Guarding(centre_m=(-0.03, -0.02), kind="voluntary"),),
+    breathing=Breathing(kind="quiet", peak_to_peak_m=0.004),
+    edge_m=0.008,
 )
+"""It has all that the wall can do: it stiffens, is guarded and breathes."""
 
 
 @pytest.fixture(scope="session")

@@ -176,7 +176,7 @@ static void read_all(Handle h, long n, long m) {
     double value;
     (void)n, (void)m;
     for (unsigned vr = 1; vr < 96; vr++) {
-        if (vr != 26 && vr != 38 && vr != 29) expect(fmi2GetReal(h, &vr, 1, &value) == fmi2OK, "get one");
+        if (vr != 26 && vr != 29 && vr != 36 && vr != 38) expect(fmi2GetReal(h, &vr, 1, &value) == fmi2OK, "get one");
     }
     for (unsigned vr = 1000; vr < 1064; vr++) expect(fmi2GetReal(h, &vr, 1, &value) == fmi2OK, "get a sample");
     for (unsigned vr = 1500; vr < 1692; vr++) expect(fmi2GetReal(h, &vr, 1, &value) == fmi2OK, "get a sample's place");
@@ -213,7 +213,7 @@ static int start_exchange(Handle h) {
 }
 static size_t states_of(Handle h, long n) {
     (void)h;
-    return 3 * (size_t)n + 3; /* the tests' phantom has two branches */
+    return 3 * (size_t)n + 4; /* the tests' phantom has two branches */
 }
 static int set_time(Handle h, double t) { return fmi2SetTime(h, t) == fmi2OK; }
 static int get_x(Handle h, double *x, size_t n) { return fmi2GetContinuousStates(h, x, n) == fmi2OK; }

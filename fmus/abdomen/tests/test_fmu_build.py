@@ -88,7 +88,7 @@ def test_sanitizers_find_nothing(version: int, request: pytest.FixtureRequest, p
     whole = file.read_bytes()
     for _ in range(20):
         damaged = bytearray(whole)
-        for at in np.concatenate((rng.integers(72, 112, rng.integers(2)), rng.integers(120, len(whole), 40))):
+        for at in np.concatenate((rng.integers(72, 116, rng.integers(2)), rng.integers(120, len(whole), 40))):
             damaged[at] = rng.integers(256)
         file.write_bytes(damaged[: rng.choice((len(whole), rng.integers(len(whole))), p=(0.8, 0.2))])
         done = subprocess.run([str(binary), str(folder / "resources"), token], capture_output=True, text=True, check=False)

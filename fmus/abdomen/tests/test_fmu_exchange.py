@@ -13,7 +13,7 @@ from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 
 STEP_S = 1e-3
-STILL = {"breathing_amplitude": 0.0}
+STILL = {"breathing_scale": 0.0}
 OUTPUTS = ["contact_force", "contact_torque", "contacts", "surface_displacement"]
 
 
@@ -47,13 +47,16 @@ def run(path: Path, kind: str, ahead_s: float, stop_s: float = 0.4, **options: o
 
 
 def test_explicit_euler_is_the_step_of_the_co_simulation(fmu3: Path) -> None:
-    """With steps of contact_time; the Prony branches are exact there and Euler here, and friction sees the velocity before."""
+    """With steps of contact_time.
+
+    The Prony branches and the contraction of muscle are exact there and Euler here, and friction sees the velocity before.
+    """
     steps = run(fmu3, "CoSimulation", STEP_S)[1:]
     euler = run(fmu3, "ModelExchange", STEP_S, solver="Euler", step_size=STEP_S)
     force, own = steps["contact_force"], euler["contact_force"][:-1]
     assert np.abs(force[:, 2]).max() > 2
     np.testing.assert_array_equal(euler["contacts"][:-1], steps["contacts"])
-    np.testing.assert_allclose(euler["surface_displacement"][1:], steps["surface_displacement"], atol=1e-7)
+    np.testing.assert_allclose(euler["surface_displacement"][1:], steps["surface_displacement"], atol=3e-7)
     np.testing.assert_allclose(own[:, 2], force[:, 2], atol=1e-3)
     np.testing.assert_allclose(own, force, atol=0.01)
     np.testing.assert_allclose(euler["contact_torque"][:-1], steps["contact_torque"], atol=2e-4)
@@ -77,7 +80,10 @@ def test_cvode_agrees_with_the_co_simulation(coarse: Path) -> None:
 
 @pytest.mark.parametrize("sliding", [False, True], ids=["sticking", "sliding"])
 def test_directional_derivatives_are_those_of_finite_differences(fmu: Path, sliding: bool) -> None:
-    """All outputs and rates are differentiated by all inputs, states and time, in contact, while the body breathes."""
+    """All outputs and rates are differentiated by all inputs, states and time, in contact, breathing, under muscle that contracts.
+
+    Tension acts on inward displacement alone, so no vertex is left where its force has a kink.
+    """
     inputs = {
         "indenter_position": np.array([-0.049, -0.051, 0.0065]),
         "indenter_velocity": np.array([0.02, -0.01, -0.02]),
@@ -86,7 +92,9 @@ def test_directional_derivatives_are_those_of_finite_differences(fmu: Path, slid
     with Exchange(fmu, {"friction": 0.05 if sliding else 0.9}) as exchange:
         for name, value in inputs.items():
             exchange.set(name, value)
-        x = exchange.euler(np.zeros(exchange.states), 200 if sliding else 12)
+        x = exchange.euler(np.append(np.zeros(exchange.states - 1), 0.3), 200 if sliding else 12)
+        u = x[: exchange.variables["displacement"].size]
+        u[np.abs(u) < 1e-6] = 1e-5
         rates = [name for name in exchange.variables if name.endswith("_rate") and not name.startswith("breathing")]
         outputs = [v.name for v in exchange.variables.values() if v.causality == "output" and v.name != "contacts"]
         names = [*rates, *outputs]
@@ -104,12 +112,13 @@ def test_directional_derivatives_are_those_of_finite_differences(fmu: Path, slid
         du["indenter_angular_velocity"], dt, h = rng.normal(size=3), 2.0, 1e-8
         low, high = (at(s * h * dx, {k: s * h * v for k, v in du.items()}, s * h * dt) for s in (-1, 1))
         at(0 * dx, {k: 0 * v for k, v in du.items()}, 0.0)
-        states = ("displacement", "relaxation", "skin_stretch")
+        states = ("displacement", "relaxation", "skin_stretch", "activation")
         parts = np.split(dx, np.cumsum([exchange.variables[name].size for name in states])[:-1])
         known = {"time": np.array([dt]), **du, **dict(zip(states, parts, strict=True))}
         found = exchange.derivative(names, known)
         assert exchange.value("contact_force")[2] > 1
         assert exchange.value("tangential_force") > 0.01
+        assert abs(found["activation_rate"][0]) > 0.1
         for name in names:
             expected = (high[name] - low[name]) / (2 * h)
             np.testing.assert_allclose(found[name], expected, atol=2e-5 * max(1e-3, np.abs(expected).max()), err_msg=name)
@@ -129,7 +138,7 @@ def test_at_rest_the_sphere_holds_its_vertices_exactly(coarse: Path) -> None:
 def test_bad_states_and_calls_are_refused(coarse: Path) -> None:
     with Exchange(coarse) as exchange:
         x = exchange.euler(np.zeros(exchange.states), 3)
-        for bad in (np.nan, np.inf, 2.0):
+        for bad in (np.nan, np.inf, 3.0):
             wrong = x.copy()
             wrong[5] = bad
             with pytest.raises(Exception, match="SetContinuousStates"):

@@ -27,10 +27,8 @@ def test_probing_gives_the_reference_results(fmu: Path) -> None:
 
 
 def test_a_lesion_is_stiffer_and_force_relaxes_while_held(fmu3: Path) -> None:
-    with (
-        FmuInstance(fmu3, values={"breathing_amplitude": 0.0}) as on,
-        FmuInstance(fmu3, values={"breathing_amplitude": 0.0}) as off,
-    ):
+    relaxed = {"breathing_scale": 0.0, "voluntary": 0, "activation": 0.0}
+    with FmuInstance(fmu3, values=relaxed) as on, FmuInstance(fmu3, values=relaxed) as off:
         stiff, soft = probe(on, at_m=(-0.05, -0.05)), probe(off, at_m=(0.05, -0.05))
     assert stiff.force.max() > 2 * soft.force.max()
     held = (stiff.time > 0.61) & (stiff.time < 1.6)
@@ -55,7 +53,7 @@ def test_it_simulates_in_fmpy_with_inputs_from_a_table(fmu3: Path) -> None:
     signals["indenter_position"][:, 2] = 0.02 - 0.04 * t
     signals["indenter_velocity"][:, 2] = -0.04
     outputs = ["normal_force", "indentation_depth", "contact_force"]
-    still = {"breathing_amplitude": 0.0}
+    still = {"breathing_scale": 0.0}
     result = fmpy.simulate_fmu(str(fmu3), stop_time=0.5, output_interval=1e-3, input=signals, output=outputs, start_values=still)
     assert result["time"][-1] == pytest.approx(0.5)
     assert result["normal_force"][-1] > 0.5

@@ -95,6 +95,7 @@ class ElasticTissue(TissueBackend):
             self.touching = self.disturbed = True
             sphere = Sphere(tuple(p), tuple(v_A.tolist()), (0.0, 0.0, 0.0) if w_A is None else tuple(w_A.tolist()), radius)
             rub(self.friction, sphere, patch.push(), self.dt, wrench)
+            self.guard(v_A)
         else:
             self._release()
         return wrench[:3], wrench[3:]
@@ -165,6 +166,14 @@ class ElasticTissue(TissueBackend):
         if patch is None or not self.touching:
             return np.empty(0)
         return patch.force[patch.force > 0]
+
+    @property
+    def indentation(self) -> Array:
+        """How far each vertex in contact is displaced along its inward normal [m], shape (k,)."""
+        patch = self._patch
+        if patch is None or not self.touching:
+            return np.empty(0)
+        return np.asarray(patch.state[0][patch.force > 0])
 
     @property
     def inward(self) -> Array:
