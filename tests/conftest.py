@@ -37,7 +37,7 @@ def distributed(tmp_path_factory: pytest.TempPathFactory, overheard: list[subpro
 
     stranger = threading.Thread(target=listen, daemon=True)
     stranger.start()
-    finished = palpate_run("rlq_guarding", folder, settings=GATE)
+    finished = palpate_run("clean", folder, settings=GATE)
     stranger.join(timeout=180)
     return finished
 
@@ -45,7 +45,7 @@ def distributed(tmp_path_factory: pytest.TempPathFactory, overheard: list[subpro
 @pytest.fixture(scope="session")
 def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """The same examination in one process."""
-    return palpate_run("rlq_guarding", tmp_path_factory.mktemp("composed"), "--composed", "--no-record", settings=GATE)
+    return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--no-record", settings=GATE)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -38,7 +38,7 @@ class Killed:
 
 
 def kill_in_contact(role: str, folder: Path, *options: str) -> Killed:
-    words = command("rlq_guarding", folder, *options, settings=(*SHORT, "camera.frames=4"))
+    words = command("clean", folder, *options, settings=(*SHORT, "camera.frames=4"))
     run = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     assert run.stderr is not None
     lines: list[str] = []

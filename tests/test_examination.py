@@ -58,7 +58,7 @@ def test_the_results_folder_is_complete(distributed: Finished) -> None:
 def test_bad_input_ends_with_status_2_and_says_what_is_wrong(
     tmp_path: Path, options: tuple[str, ...], settings: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
-    finished = palpate_run("rlq_guarding", tmp_path, *options, settings=settings)
+    finished = palpate_run("clean", tmp_path, *options, settings=settings)
     assert finished.status == 2, finished.output
     for word in words:
         assert word in finished.output
@@ -70,7 +70,7 @@ def test_bad_input_ends_with_status_2_and_says_what_is_wrong(
 )
 def test_an_examination_that_planning_gave_up_ends_with_status_3_and_says_why(tmp_path: Path, runtime: str) -> None:
     own = ("--service", f"planning={Path(__file__).with_name('quitting_planning.py')}")
-    finished = palpate_run("rlq_guarding", tmp_path, runtime, "--no-record", *own)
+    finished = palpate_run("clean", tmp_path, runtime, "--no-record", *own)
     assert finished.status == 3, finished.output
     assert "the run failed: aborted in phase HOME: enough" in finished.output
     assert finished.report["failure"] == "aborted in phase HOME: enough"
@@ -79,4 +79,4 @@ def test_an_examination_that_planning_gave_up_ends_with_status_3_and_says_why(tm
 def test_an_unknown_scenario_is_answered_with_the_known_ones(tmp_path: Path) -> None:
     finished = palpate_run("no_such", tmp_path)
     assert finished.status == 2
-    assert "rlq_guarding" in finished.output
+    assert "clean" in finished.output

@@ -71,7 +71,7 @@ VOLUNTARY = "phantom.guarding=[{centre_m: [-0.03, -0.04], kind: voluntary}]"
     ids=["default", "breathing", "fine mesh", "stiffening", "guarding", "all"],
 )
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:
-    scenario = load_scenario("rlq_guarding", settings)
+    scenario = load_scenario("clean", settings)
     model = build_phantom(scenario.phantom, scenario.seed)
     tissue = WinklerTissue(model, scenario.phantom.stiffness, BreathingCurve(scenario.phantom.breathing, scenario.seed))
     motions = path(SkinSurface(model))
@@ -153,7 +153,7 @@ SETTINGS = ("exam.region_m=[0.05, 0.05]", "exam.centre_m=[-0.055, -0.055]", "cam
 
 
 def _scenario() -> Scenario:
-    return load_scenario("rlq_guarding", SETTINGS, seed=3)
+    return load_scenario("clean", SETTINGS, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +215,7 @@ def test_one_line_of_the_compose_file_puts_it_on_the_bus(tmp_path: Path, monkeyp
     swapped = tmp_path / "docker-compose.yml"
     swapped.write_text(text.replace(line, "command: [python, -m, palpate_tissue, fmu]"), encoding="utf-8")
     monkeypatch.setenv("PALPATE_COMPOSE", str(swapped))
-    finished = palpate_run("rlq_guarding", tmp_path / "out", "--no-record", "--seed", "3", settings=SETTINGS)
+    finished = palpate_run("clean", tmp_path / "out", "--no-record", "--seed", "3", settings=SETTINGS)
     assert finished.status == 0, finished.output
     assert "FMI 3.0" in (tmp_path / "out" / "logs" / "tissue.log").read_text(encoding="utf-8")
     assert finished.report["run_hash"] == composed.stdout.split()[-1]

@@ -55,7 +55,7 @@ def test_a_killed_service_ends_the_run_by_name_and_the_force_does_not_rise(tmp_p
 
 def test_the_fmu_gives_the_same_examination(composed: Finished, tmp_path: Path) -> None:
     """The sums are the same in another order: 1e-13 of a force, which sticking and slipping enlarge; the scores do not differ."""
-    finished = palpate_run("rlq_guarding", tmp_path, "--composed", "--no-record", settings=(*GATE, "services.tissue=fmu"))
+    finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=(*GATE, "services.tissue=fmu"))
     assert_within_bounds(finished)
     ours, theirs = finished.report, composed.report
     assert ours["samples"] == theirs["samples"]

@@ -50,7 +50,7 @@ def test_every_command_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for words in commands():
         settings = [value for flag, value in pairwise(words) if flag == "--set"]
         settings += settings_of([value for flag, value in pairwise(words) if flag == "--service"])
-        name = words[0] if words and not words[0].startswith("--") else "rlq_guarding"
+        name = words[0] if words and not words[0].startswith("--") else "clean"
         checked(load_scenario(name, settings))
 
 
@@ -80,7 +80,7 @@ def test_the_service_that_a_page_shows_is_one(page: str, name: str, tmp_path: Pa
 def test_ones_own_assessment_finds_the_lesion(tmp_path: Path) -> None:
     place = f"assessment={EXAMPLES / 'threshold_assessment.py'}"
     settings = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.04, -0.04]", "camera.frames=6")
-    ran = palpate_run("rlq_guarding", tmp_path, "--composed", "--no-record", "--service", place, settings=settings)
+    ran = palpate_run("clean", tmp_path, "--composed", "--no-record", "--service", place, settings=settings)
     assert ran.status == 0, ran.output
     assert ran.report["scores"]["matched"] == 1
     assert ran.report["scores"]["localisation_error_m"] < 0.02

@@ -43,7 +43,7 @@ class Operator(Collector):
 
 
 def examine(word: int | None) -> tuple[Collected, Operator]:
-    scenario = load_scenario("rlq_guarding", (*SHORT, "camera.frames=4"))
+    scenario = load_scenario("clean", (*SHORT, "camera.frames=4"))
     operator = Operator(word)
     run = Composed([*load_services(scenario, WORKERS), operator])
     run.run(lambda: operator.collected.end_tick, 120 * NS)

@@ -10,16 +10,16 @@ TINY = ("exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "phantom
 
 @pytest.mark.slow
 def test_a_secure_examination_completes_with_the_same_run_hash(tmp_path: Path) -> None:
-    secure = palpate_run("rlq_guarding", tmp_path / "secure", "--secure", settings=TINY)
+    secure = palpate_run("clean", tmp_path / "secure", "--secure", settings=TINY)
     assert secure.status == 0, secure.output
-    composed = palpate_run("rlq_guarding", tmp_path / "composed", "--composed", "--no-record", settings=TINY)
+    composed = palpate_run("clean", tmp_path / "composed", "--composed", "--no-record", settings=TINY)
     assert secure.report["run_hash"] == composed.report["run_hash"]
 
 
 def test_secure_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
-    finished = palpate_run("rlq_guarding", tmp_path, "--composed", "--secure")
+    finished = palpate_run("clean", tmp_path, "--composed", "--secure")
     assert finished.status == 2
     assert "--secure" in finished.output
-    finished = palpate_run("rlq_guarding", tmp_path, "--secure", "--keys", str(tmp_path / "none"))
+    finished = palpate_run("clean", tmp_path, "--secure", "--keys", str(tmp_path / "none"))
     assert finished.status == 2
     assert "ca.pem" in finished.output

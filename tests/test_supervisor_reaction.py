@@ -171,7 +171,7 @@ CASES: dict[str, Case] = {
 
 def react(name: str) -> Reaction:
     case = CASES[name]
-    scenario = load_scenario("rlq_guarding", (*SHORT, *case.settings))
+    scenario = load_scenario("clean", (*SHORT, *case.settings))
     (real,) = load_services(scenario, ("planning",))
     mad = MadPlanning(real, case.velocity)
     watcher = Watcher()

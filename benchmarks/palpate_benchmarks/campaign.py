@@ -37,7 +37,7 @@ SETTINGS: Final = (
     "camera.frames=2",
     "limits.release_patience_s=0.5",
 )
-"""A small region on the lesion of rlq_guarding, so that a case takes seconds, and nobody waits long for an operator."""
+"""A small region on the lesion of clean, so that a case takes seconds, and nobody waits long for an operator."""
 PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
 HANG_S: Final = 90.0
 """A case that takes longer after its fault has hung."""
@@ -205,13 +205,13 @@ def _signs(progress: RunProgress) -> list[str]:
 
 def forks() -> Forks:
     """What starts the processes of many cases."""
-    scenario = load_scenario("rlq_guarding", SETTINGS)
+    scenario = load_scenario("clean", SETTINGS)
     return Forks(module(role, choice(scenario, role)) for role in WORKERS)
 
 
 def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> FaultFinding:
     """Runs one case; its logs stay in a folder of its own under `folder`."""
-    scenario = load_scenario("rlq_guarding", SETTINGS)
+    scenario = load_scenario("clean", SETTINGS)
     out = (folder / case.name).resolve()
     files = write_scenario_files(scenario, out)
     processes = read_processes(compose_file(), WORKERS)

@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 ELSEWHERE = "elsewhere"
-DEFAULT_CASES = ("rlq_guarding", "healthy", "two_lesions", ELSEWHERE)
+DEFAULT_CASES = ("lump", "healthy", "two_lesions", ELSEWHERE)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from palpate_benchmarks.swaps import measure, read_swaps, table
 
 
 def swaps(
-    scenario: Annotated[str, typer.Argument(help="The examination.")] = "rlq_guarding",
+    scenario: Annotated[str, typer.Argument(help="The examination.")] = "clean",
     only: Annotated[list[str] | None, typer.Option(help="A swap; may be repeated. All by default.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field in every run; may be repeated.")

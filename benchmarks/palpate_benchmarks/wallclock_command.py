@@ -99,7 +99,7 @@ def comparison(reports: Mapping[str, dict[str, Any]]) -> str:
 
 
 def wallclock(
-    scenario: Annotated[str, typer.Argument(help="The examination.")] = "rlq_guarding",
+    scenario: Annotated[str, typer.Argument(help="The examination.")] = "clean",
     rate: Annotated[list[int] | None, typer.Option(help="Of the controller [Hz]; may be repeated. 200, 500 and 1000.")] = None,
     settings: Settings = None,
     out: Annotated[Path | None, output_folder("Folder for the runs; by default they are thrown away.")] = None,

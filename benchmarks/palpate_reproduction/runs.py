@@ -19,7 +19,7 @@ from palpate_bus.wire.zenoh_config import session
 GRAPH: Final = "graph.json"
 LISTEN_S: Final = 3.0
 """How long the graph of a run that has begun is listened to."""
-SCENARIO: Final = "rlq_guarding"
+SCENARIO: Final = "clean"
 POLL_S: Final = 0.5
 STOP_S: Final = 30.0
 

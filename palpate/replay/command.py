@@ -50,7 +50,7 @@ def replay(  # noqa: PLR0913 - the options of a command
 
     [bold]Examples[/]
 
-      palpate replay out/rlq_guarding-20260101-120000           plays the run on the bus, in real time
+      palpate replay out/lump-20260101-120000           plays the run on the bus, in real time
 
       palpate replay recording.mcap --rate 4 --hold             four times as fast, then stays for late joiners
 

@@ -14,7 +14,7 @@ from palpate.report.figures import draw_map
 
 def test_with_truth_and_finding(tmp_path: Path) -> None:
     path = tmp_path / "map.png"
-    draw_map(path, stiffness_map(), findings(), samples_of(samples()), truth_of(phantom()), "rlq_guarding, seed 0")
+    draw_map(path, stiffness_map(), findings(), samples_of(samples()), truth_of(phantom()), "clean, seed 0")
     image = imread(path)
     assert image.shape[0] > 1000
     assert image.shape[1] > 1600

@@ -20,7 +20,7 @@ from palpate_models.load import load_scenario
 
 
 def run_folder(folder: Path, **what: object) -> Path:
-    scenario = load_scenario("rlq_guarding", seed=3)
+    scenario = load_scenario("clean", seed=3)
     write_scenario_files(scenario, folder)
     failure = what.pop("failure", None)
     ran = result(collected(**what), failure)  # type: ignore[arg-type]
@@ -84,7 +84,7 @@ def test_a_run_that_failed_says_so_first(tmp_path: Path) -> None:
 
 
 def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> None:
-    scenario = load_scenario("rlq_guarding")
+    scenario = load_scenario("clean")
     whole = assemble(scenario, result(collected(), failure=None)).model_copy(update={"findings": [], "skipped_targets": 0})
     assert verdict(whole) == "No area was found that is stiffer than healthy variation explains."
     blind = verdict(whole.model_copy(update={"skipped_targets": 3}))

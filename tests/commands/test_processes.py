@@ -88,7 +88,7 @@ def test_the_override_for_hardware_starts_no_simulation() -> None:
     file = root / "compose" / "hardware.yml"
     document = yaml.safe_load(file.read_text(encoding="utf-8"))
     words = document["services"]["prepare"]["environment"]["PALPATE_SETTINGS"].split()
-    scenario = load_scenario("rlq_guarding", [word for word in words if "=" in word])
+    scenario = load_scenario("clean", [word for word in words if "=" in word])
     roles = workers(scenario)
     assert set(WORKERS) - set(roles) == {"tissue"}
     assert document["services"]["tissue"]["profiles"] == ["simulated"]

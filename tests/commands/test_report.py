@@ -30,7 +30,7 @@ SCORE_FIELDS = ["localisation_error_m", "dice", "matched", "missed", "false_posi
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    return load_scenario("rlq_guarding", seed=3)
+    return load_scenario("clean", seed=3)
 
 
 def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
     assert set(FINDING_FIELDS) <= set(written["findings"][0])
     assert set(SCORE_FIELDS) <= set(written["scores"])
     assert Report.model_validate(written) == report
-    assert written["scenario"] == "rlq_guarding"
+    assert written["scenario"] == "clean"
     assert written["seed"] == 3
     assert written["findings"][0]["quadrant"] == "RLQ"
     assert written["findings"][0]["centroid_m"][:2] == pytest.approx(FOUND)

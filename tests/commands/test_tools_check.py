@@ -21,7 +21,7 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.load import load_scenario
 
-SCENARIO = load_scenario("rlq_guarding")
+SCENARIO = load_scenario("clean")
 HARDWARE = {"robot.lbr", "camera.ros", "camera.replay"}
 """By the wall clock only: `palpate check` takes them live; and the replay, whose own tests check it on a recorded plane."""
 SLOW = {"robot.mujoco", "supervisor.default", "tissue.elastic"}

@@ -13,7 +13,7 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.load import load_scenario
 from palpate_supervisor.service import create
 
-SCENARIO = load_scenario("rlq_guarding")
+SCENARIO = load_scenario("clean")
 
 
 class Spoilt(Service):

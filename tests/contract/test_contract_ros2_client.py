@@ -66,7 +66,7 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
     write_definitions(tmp_path / "definitions")
     port = free_port()
     where = f"tcp/127.0.0.1:{port}"
-    settings = RigSettings(load_scenario("rlq_guarding"), slack_ms=3000)
+    settings = RigSettings(load_scenario("clean"), slack_ms=3000)
     with ExitStack() as stack:
         bus = stack.enter_context(session(BusOptions(mode="router", listen=(where,))))
         rigs = {}

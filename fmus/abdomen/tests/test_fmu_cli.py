@@ -51,7 +51,7 @@ def test_a_mesh_is_a_phantom(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["build", "no_such"], ("no_such", "rlq_guarding")),
+        (["build", "no_such"], ("no_such", "clean")),
         (["build", "healthy", "--platform", "sparc"], ("sparc", "x86_64-linux")),
         (["build", "healthy", "--set", "phantom.edge_m=1"], ("phantom.edge_m",)),
         (["build", "missing.stl"], ("missing.stl",)),

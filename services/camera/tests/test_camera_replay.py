@@ -19,7 +19,7 @@ from palpate_models.load import load_scenario
 from palpate_recorder.service import RecorderService
 
 FRAMES = 4
-SCENARIO = load_scenario("rlq_guarding")
+SCENARIO = load_scenario("clean")
 
 
 @pytest.fixture(scope="module")

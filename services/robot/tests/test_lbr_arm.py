@@ -19,7 +19,7 @@ class Stream:
     """States of an arm of which joint 1 turns at 0.5 rad/s, one every 2 ms."""
 
     def __init__(self) -> None:
-        self._state = Emulator(plant_input(load_scenario("rlq_guarding")), Options()).state(0)
+        self._state = Emulator(plant_input(load_scenario("clean")), Options()).state(0)
         self._q = np.array(self._state.measured_joint_position)
 
     def at(self, t: int, stamp: int) -> Any:

@@ -127,4 +127,4 @@ def test_a_load_that_is_wrong_by_a_newton_metre_is_carried(rig: Rig) -> None:
 @pytest.mark.parametrize(("name", "value"), [("level", "pose"), ("ft_sign", "2"), ("domain", "x")])
 def test_a_field_of_the_connection_that_cannot_be_is_named(name: str, value: str) -> None:
     with pytest.raises(ScenarioError, match=f"robot.lbr.{name}"):
-        load_scenario("rlq_guarding", [f"robot.lbr.{name}={value}"])
+        load_scenario("clean", [f"robot.lbr.{name}={value}"])

@@ -17,7 +17,7 @@ PUSH = np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 def dead_driver(watched: bool) -> Emulator:
     """The arm 0.6 s after a driver that pushed has died."""
-    emulator = Emulator(plant_input(load_scenario("rlq_guarding")), Options())
+    emulator = Emulator(plant_input(load_scenario("clean")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     watchdog = Watchdog()
@@ -44,7 +44,7 @@ def test_without_it_the_arm_goes_on_and_with_it_it_stands() -> None:
 
 def started() -> Watchdog:
     watchdog = Watchdog()
-    emulator = Emulator(plant_input(load_scenario("rlq_guarding")), Options())
+    emulator = Emulator(plant_input(load_scenario("clean")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     watchdog.state(0, emulator.state(1))

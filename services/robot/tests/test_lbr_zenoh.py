@@ -18,7 +18,7 @@ from palpate_robot.backends.lbr.port import ZenohPort
 
 def test_states_come_and_commands_move_the_arm(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/lbr.sock"
-    words = [sys.executable, "-m", "palpate_robot.backends.lbr.emulator", "rlq_guarding", "--listen", endpoint]
+    words = [sys.executable, "-m", "palpate_robot.backends.lbr.emulator", "clean", "--listen", endpoint]
     emulator = subprocess.Popen(words, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
     port = ZenohPort(LbrConnection(router=endpoint, emulated=True))
     torque = np.zeros(7)

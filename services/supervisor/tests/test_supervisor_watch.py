@@ -13,7 +13,7 @@ from palpate_models.scenario import Limits
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import Breach, Cause, Level, Watch
 
-KNOWN = exam_input(load_scenario("rlq_guarding"))
+KNOWN = exam_input(load_scenario("clean"))
 ABOVE = np.array([0.56, 0.0, 1.0])
 
 

@@ -28,7 +28,7 @@ SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.kind=quiet", "exam.pose.r
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    return load_scenario("rlq_guarding", SETTINGS)
+    return load_scenario("clean", SETTINGS)
 
 
 def chosen(scenario: Scenario, **fields: str) -> Scenario:
@@ -135,4 +135,4 @@ def test_a_missing_file_is_said(scenario: Scenario) -> None:
 def test_a_file_without_the_choice_is_refused() -> None:
     for field in ("fmu", "fmu_map"):
         with pytest.raises(ScenarioError, match=r"need services\.tissue: fmu"):
-            load_scenario("rlq_guarding", (f"tissue.{field}=x",))
+            load_scenario("clean", (f"tissue.{field}=x",))
