@@ -60,7 +60,8 @@ def pressed_force(stiffness: Stiffness, tension: float) -> float:
         left (u - l^2 lap u) + drag u + sigma(u) + tension u = p / k_w,   p >= 0,  u >= w,  p (u - w) = 0
 
     is solved on rings about the axis. `left` is what has not relaxed after a displacement that rose evenly for
-    DEPTH_M / SPEED_MPS, `drag` the dashpot's share. Contact by a primal-dual active set in which sigma is linearised anew each round (Newton).
+    DEPTH_M / SPEED_MPS, `drag` the dashpot's share. Contact by a primal-dual active set in which
+    sigma is linearised anew each round (Newton).
     """
     seconds = DEPTH_M / SPEED_MPS
     g, tau = np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
