@@ -28,8 +28,6 @@ class TissueBackend(ABC):
         """Period of a step [s]."""
         self.breathing = breathing
         """How the body breathes."""
-        self.activation = 1.0
-        """How far guarding muscle is contracted, in [0, 1]: what the model's `tension` is multiplied by."""
         self._guarding = Activation(model.voluntary, dt)
 
     @abstractmethod
