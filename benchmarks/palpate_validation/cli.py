@@ -19,6 +19,7 @@ SECTIONS = {
     "elastic": "elastic",
     "lumps": "lumps",
     "mesh": "meshes",
+    "people": "people",
     "relaxation": "relaxation",
     "energy": "energy",
     "drop": "drop",

@@ -1,10 +1,10 @@
 """One step of the Winkler-Pasternak tissue, compiled: the equations of the README, vertex by vertex.
 
-    u* = u - h C^-1 K (u - sum_k y_k)         `move_freely`
-    u  = max(u*, w),  f = C (u - u*) / h      `hold`: w is where the sphere holds a vertex
-    y_k = e_k y_k + (1 - e_k) g_k u           `relax`
+    u* = u - h C^-1 [K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0))]     `move_freely`, `stiffen`
+    u  = max(u*, w),  f = C (u - u*) / h                                             `hold`: w is where the sphere holds a vertex
+    y_k = e_k y_k + (1 - e_k) g_k u                                                  `relax`
 
-The FMU's C source has the same equations.
+The FMU's C source has the same equations; sigma is `palpate_models.wall.stress`.
 """
 
 from __future__ import annotations
@@ -42,6 +42,12 @@ class Wall(NamedTuple):
     """e_k = exp(-h / tau_k), and (1 - e_k) g_k, shape (b, 2)."""
     h: float
     """[s]"""
+    spring: Array
+    """The springs beside the linear wall: rows `_BETA2`, `_BENT` and `_TENSION`, shape (3, n); (3, 0) where there are none."""
+    share: float
+    """h k_w A / C = h / dashpot_s: how far such a spring's pressure over k_w moves a vertex in a step, the same everywhere."""
+    activation: Array
+    """a, how far muscles are contracted, 0 to 1; shape (1,). Changed in place."""
 
 
 class Patch(NamedTuple):
@@ -60,6 +66,8 @@ class Patch(NamedTuple):
 
 _N, _X, _BETA, _GAIN = 0, 3, 6, 7
 """Columns of a patch: outward normal (three), position (three) [m], share of the breathing excursion, and C / h [N/m]."""
+_BETA2, _BENT, _TENSION = 0, 1, 2
+"""Rows of the springs: beta^2 [1/m^2], the displacement from which they are straight [m], and what a contracted muscle adds [1]."""
 
 
 @compiled
@@ -85,11 +93,13 @@ def step(
 
 @compiled
 def move_freely(wall: Wall) -> None:
-    """The wall as it moves by itself: u += A (u - sum_k y_k)."""
+    """The wall as it moves by itself: u += A (u - sum_k y_k) - h k_w A / C (sigma(u) + tension a max(u, 0))."""
     u, rate, indices = wall.u, wall.rate, wall.indices
     strain = u.copy()
     for k in range(len(wall.y)):
         strain -= wall.y[k]
+    if wall.spring.shape[1]:
+        stiffen(wall)
     begin = wall.indptr[0]
     for i in range(len(u)):
         end = wall.indptr[i + 1]
@@ -102,6 +112,18 @@ def move_freely(wall: Wall) -> None:
                 total += rate[j] * strain[indices[j]]
         u[i] = total
         begin = end
+
+
+@compiled
+def stiffen(wall: Wall) -> None:
+    """What the springs beside the linear wall do to a displacement in a step. The law is in `palpate_models.wall`."""
+    u, beta2, straight_from, tension = wall.u, wall.spring[_BETA2], wall.spring[_BENT], wall.spring[_TENSION]
+    share, activation = wall.share, wall.activation[0]
+    for i in range(len(u)):
+        pressed = max(u[i], 0.0)
+        bent = min(pressed, straight_from[i])
+        stress = beta2[i] * bent * bent * (pressed - 2.0 / 3.0 * bent)
+        u[i] -= share * (stress + tension[i] * activation * pressed)
 
 
 @compiled

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
+from palpate_models import wall
 from palpate_models.frames import Array
 from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel
@@ -24,14 +25,14 @@ class StabilityError(ValueError):
 
 @dataclass(frozen=True)
 class Mechanics:
-    """`C u' + K u = f` on the vertices, with fixed vertices left out."""
+    """`C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f` on the vertices, with fixed vertices left out."""
 
     stiffness: sparse.csr_array
     """K = diag(k_w A) + L[G], instantaneous [N/m], shape (n, n); rows and columns of fixed vertices are empty."""
     damping: Array
     """Diagonal of C [N s/m], shape (n,)."""
     rate: float
-    """Largest eigenvalue of C^-1 K [1/s]."""
+    """Largest eigenvalue of C^-1 K [1/s], with the springs beside the linear wall as stiff as they can get."""
     gershgorin: float
     """Its bound max_i (K_ii + sum_j |K_ij|) / C_i [1/s]."""
 
@@ -76,8 +77,10 @@ def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
         shape=(n, n),
     )
     matrix.sort_indices()
-    damping = stiffness.dashpot_s * model.stiffness * model.areas
-    return Mechanics(matrix, damping, _largest_rate(matrix, damping), _gershgorin(matrix, damping))
+    foundation = model.stiffness * model.areas
+    damping = stiffness.dashpot_s * foundation
+    hardest = matrix + sparse.diags_array(np.where(free, foundation * wall.largest_slope(model.stiffening, model.tension), 0.0))
+    return Mechanics(matrix, damping, _largest_rate(hardest, damping), _gershgorin(hardest, damping))
 
 
 def _gershgorin(matrix: sparse.csr_array, damping: Array) -> float:

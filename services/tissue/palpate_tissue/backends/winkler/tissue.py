@@ -2,9 +2,10 @@
 
 State: displacement u of every vertex along its inward rest normal [m], and one internal variable a Prony branch and vertex.
 
-    C u' + K (u - sum_k y_k) = f,     y_k' = (g_k u - y_k) / tau_k,     f >= 0,  u >= w,  f (u - w) = 0
+    C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f,     y_k' = (g_k u - y_k) / tau_k
+    f >= 0,  u >= w,  f (u - w) = 0
 
-w(p) is where the sphere holds a vertex on its inward normal. See the README for the derivation, and `kernel.py` for the step.
+sigma is the stiffening of `palpate_models.wall`. w(p) is where the sphere holds a vertex on its inward normal. See the README for the derivation, and `kernel.py` for the step.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models import wall
 from palpate_models.breathing import STILL, BreathingCurve
 from palpate_models.frames import Array
 from palpate_models.patient import Stiffness
@@ -101,6 +103,7 @@ class WinklerTissue(TissueBackend):
 
     def _press(self, patch: Patch, radius: float, wrench: Array) -> None:
         """One explicit step; `wrench` (6,) gets force [N] and torque [N m] on the sphere, and is left alone out of contact."""
+        self._wall.activation[0] = self.activation
         touching = kernel.step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
         if touching:
             self.disturbed = True
@@ -128,7 +131,19 @@ class WinklerTissue(TissueBackend):
             columns = columns.astype(np.uint16)
         decay: Array = np.exp(-h / np.array(stiffness.prony_tau_s))
         feed: Array = np.array(stiffness.prony_g) * (1 - decay)
-        return Wall(self.displacement, self.branches, indptr, columns, A.data, np.column_stack((decay, feed)), h)
+        prony, share = np.column_stack((decay, feed)), h / stiffness.dashpot_s
+        return Wall(
+            self.displacement, self.branches, indptr, columns, A.data, prony, h, self._springs(), share, np.array([self.activation])
+        )
+
+    def _springs(self) -> Array:
+        """The rows of `Wall.spring`: none where no vertex stiffens or has a muscle."""
+        model = self.model
+        if not (model.stiffening.any() or model.tension.any()):
+            return np.empty((3, 0))
+        springs = np.array((model.stiffening**2, wall.straight_from(model.stiffening), model.tension))
+        springs[:, model.fixed] = 0.0
+        return springs
 
     @property
     def contacts(self) -> NDArray[np.intp]:
@@ -148,11 +163,14 @@ class WinklerTissue(TissueBackend):
         return self.displacement
 
     def energy(self) -> float:
-        """Elastic energy [J] stored in the springs, the Maxwell branches' included, and in the sheared skin."""
+        """Elastic energy [J] stored in the springs, the Maxwell branches' and the stiffening included, and in the sheared skin."""
         u, K = self.displacement, self.mechanics.stiffness
         stored = 0.5 * (1 - sum(self._prony_g)) * (u @ (K @ u))
         for g, y in zip(self._prony_g, self.branches, strict=True):
             if g > 0:
                 stretch = u - y / g
                 stored += 0.5 * g * (stretch @ (K @ stretch))
+        model = self.model
+        beside = wall.stored(u, model.stiffening) + 0.5 * self.activation * model.tension * np.maximum(u, 0.0) ** 2
+        stored += (model.stiffness * model.areas) @ beside
         return float(stored + self.friction.energy())

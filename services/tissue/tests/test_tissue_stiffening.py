@@ -1,0 +1,132 @@
+"""The stiffening wall and the contracted muscle on the surface tier: law, contact, energy, stability."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from palpate_models import wall
+from palpate_models.patient import Lesion, Phantom, Stiffness
+from palpate_models.phantom import build_phantom, flat_phantom
+from palpate_tissue.backends.winkler import kernel
+from palpate_tissue.backends.winkler.mechanics import STEP_LIMIT, assemble
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+
+STILL = np.zeros(3)
+RADIUS = 0.015
+
+
+def flat_wall(beta=100.0, tension=0.0, half=0.07, edge=0.005, lesions=()):
+    """A flat phantom that stiffens everywhere, with muscle over its right half."""
+    model = flat_phantom(half, edge, lesions=lesions)
+    muscle = np.where(model.vertices[:, 0] > 0, tension, 0.0)
+    return replace(model, stiffening=np.full(len(model.vertices), beta), tension=muscle)
+
+
+def press(tissue, depth, speed=0.02, x=0.0):
+    """Force after pressing to a depth at constant speed."""
+    force = STILL
+    for at in np.arange(0.0, depth, speed * tissue.dt):
+        force, _ = tissue.step(0, np.array((x, 0.0, RADIUS - at)), np.array((0, 0, -speed)), RADIUS)
+    return force[2]
+
+
+def test_the_compiled_springs_are_those_of_the_law():
+    tissue = WinklerTissue(flat_wall(beta=150.0, tension=3.0), Stiffness())
+    model, rng = tissue.model, np.random.default_rng(1)
+    tissue.activation = 0.7
+    before = np.where(model.fixed, 0.0, rng.uniform(-0.01, 0.06, len(model.vertices)))  # the spring is straight from 26 mm on
+    tissue.displacement[:] = before
+    tissue._wall.activation[0] = tissue.activation
+    kernel.stiffen(tissue._wall)
+    beside = wall.stress(before, model.stiffening) + 0.7 * model.tension * np.maximum(before, 0.0)
+    np.testing.assert_allclose(tissue.displacement, before - tissue.dt / 0.05 * beside, atol=1e-17)
+
+
+def test_a_wall_without_springs_takes_no_step_for_them():
+    assert WinklerTissue(flat_phantom(0.03), Stiffness())._wall.spring.shape == (3, 0)
+
+
+def test_force_rises_faster_than_that_of_the_linear_wall():
+    shallow, deep = (press(WinklerTissue(flat_wall(0.0)), depth) for depth in (0.002, 0.018))
+    stiff_shallow, stiff_deep = (press(WinklerTissue(flat_wall(100.0)), depth) for depth in (0.002, 0.018))
+    assert stiff_shallow == pytest.approx(shallow, rel=0.02)
+    assert stiff_deep > 1.2 * deep
+
+
+def test_a_contracted_muscle_adds_force_and_a_slack_one_none():
+    forces = []
+    for activation in (0.0, 0.5, 1.0):
+        tissue = WinklerTissue(flat_wall(tension=3.0))
+        tissue.activation = activation
+        forces.append(press(tissue, 0.010, x=0.035))
+    assert forces[0] == press(WinklerTissue(flat_wall()), 0.010, x=0.035)
+    assert forces[0] < forces[1] < forces[2]
+    assert forces[2] > 1.5 * forces[0]
+
+
+def test_contact_is_complementary_at_every_vertex():
+    tissue = WinklerTissue(flat_wall(beta=150.0, tension=2.0, lesions=(Lesion(centre_m=(-0.02, 0.0)),)))
+    for k in range(800):
+        p = np.array((-0.03 + 5e-5 * k, 0.003, 0.006 + 0.006 * np.sin(k / 60)))
+        tissue.step(k * 1e-3, p, np.array((0.05, 0, 0)), RADIUS)
+        distance = np.linalg.norm(tissue.deformed_vertices - p, axis=1)
+        assert distance.min() >= RADIUS - 1e-12
+        assert (tissue.contact_forces > 0).all()
+        np.testing.assert_allclose(distance[tissue.contacts], RADIUS, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_closed_cycle_yields_work(seed):
+    rng = np.random.default_rng(seed)
+    lump = Lesion(centre_m=(0.01, 0.0), radii_m=(0.02, 0.02), contrast=10)
+    tissue = WinklerTissue(flat_wall(float(rng.choice((80.0, 250.0))), 3.0, lesions=(lump,)))
+    tissue.activation = float(rng.uniform())
+    t = np.linspace(0, 2 * np.pi, int(rng.integers(300, 2000)))
+    wobble = 0.02 * np.sin(np.array(((1,), (2,))) * t + rng.uniform(0, 6, (2, 1)))
+    path = np.column_stack((*wobble, RADIUS + 0.001 - 0.019 * np.sin(t / 2) ** 2))
+    work, last = 0.0, STILL
+    for a, b in pairwise(path):
+        force, _ = tissue.step(0, b, (b - a) / tissue.dt, RADIUS)
+        work -= 0.5 * (force + last) @ (b - a)
+        last = force
+        assert tissue.energy() <= work + 1e-6  # never more than was put in
+    assert work > 0
+    np.testing.assert_array_equal(last, 0)
+
+
+def test_the_rate_is_that_of_the_hardest_springs():
+    """Against a dense solution: every spring at its cap, the muscle wholly contracted."""
+    model = flat_wall(beta=50.0, tension=4.0, half=0.03)
+    mechanics = assemble(model, Stiffness())
+    free = ~model.fixed
+    hardest = np.diag(model.stiffness * model.areas * (wall.MOST_STIFFENING + model.tension))
+    scale = 1 / np.sqrt(mechanics.damping[free])
+    dense = (mechanics.stiffness.toarray() + hardest)[np.ix_(free, free)] * scale[:, None] * scale
+    largest = np.linalg.eigvalsh(dense)[-1]
+    assert largest <= mechanics.rate <= 1.02 * largest
+    assert largest > 300 + assemble(flat_wall(0.0, half=0.03), Stiffness()).rate
+
+
+@pytest.mark.parametrize("tension", [4.0, 60.0])
+def test_energy_only_falls_at_the_bound_of_the_hardest_springs(tension):
+    """From random dents at which the springs are straight, with steps as long as the bound allows."""
+    model = flat_wall(beta=400.0, tension=tension)
+    tissue = WinklerTissue(model, dt=0.999 * STEP_LIMIT / assemble(model, Stiffness()).rate)
+    assert tissue.substeps == 1
+    rng = np.random.default_rng(5)
+    tissue.displacement[:] = np.where(model.fixed, 0.0, rng.uniform(0.02, 0.05, len(model.vertices)))
+    tissue.disturbed = True
+    energies = [tissue.energy()]
+    for k in range(60):
+        tissue.idle(k * tissue.dt)
+        energies.append(tissue.energy())
+    assert (np.diff(energies) < 0).all()
+
+
+def test_the_default_mesh_with_a_median_person_needs_no_sub_steps():
+    stiffness = Stiffness(**wall.MEDIAN._asdict())
+    assert WinklerTissue(build_phantom(Phantom(stiffness=stiffness), 0), stiffness).substeps == 1
