@@ -134,7 +134,14 @@ def section(found: People | None = None) -> Section:
     tensed = float(np.median([place.tensed_ratio for place in places]))
     measured = float(np.median([place.fit.activated_ratio for place in places]))
     checks.append(
-        Check("median force ratio of tensed muscles at 10 mm", tensed, "", 0.9 * measured, 1.1 * measured, f"measured: {measured:.2f}")
+        Check(
+            "median force ratio of tensed muscles at 10 mm",
+            tensed,
+            "",
+            0.9 * measured,
+            1.1 * measured,
+            f"measured: {measured:.2f}",
+        )
     )
     for hysteresis in found.loops:
         name = f"work lost in a press of {1e3 * PRESSED_M:g} mm and its release at {1e3 * hysteresis.speed:g} mm/s"

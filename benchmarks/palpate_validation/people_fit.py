@@ -94,7 +94,21 @@ def write(found: dict[tuple[str, str], Fit], path: Path) -> None:
     """Writes `fitted.csv`."""
     with path.open("w", encoding="ascii", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow((*"region id k_w_n_per_m3 length_m stiffening_per_m zero_offset_m rms_percent activated_ratio tension".split(),))
+        out.writerow(
+            (
+                *[
+                    "region",
+                    "id",
+                    "k_w_n_per_m3",
+                    "length_m",
+                    "stiffening_per_m",
+                    "zero_offset_m",
+                    "rms_percent",
+                    "activated_ratio",
+                    "tension",
+                ],
+            )
+        )
         for (region, person), f in found.items():
             k_w, length, beta = f.wall
             out.writerow(

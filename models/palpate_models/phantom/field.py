@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from palpate_models.frames import Array
 from palpate_models.guarding import Guarding
 from palpate_models.patient import Background, Lesion
+from palpate_models.seeds import generator
 
 _FEATURES = 512
 """Random Fourier features of the background field: its covariance is within 1/sqrt(512) = 4 % of the Gaussian one."""
@@ -32,7 +32,7 @@ def gaussian_field(points: Array, correlation_m: float, seed: int) -> Array:
     Covariance exp(-r^2 / (2 correlation_m^2)), by random Fourier features (Rahimi and Recht 2007): a function of
     position, so the field does not depend on the mesh.
     """
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, zlib.crc32(b"phantom")])))
+    rng = generator(seed, "phantom")
     frequencies = rng.standard_normal((3, _FEATURES)) / correlation_m
     phases = rng.uniform(0, 2 * np.pi, _FEATURES)
     return np.asarray(np.cos(points @ frequencies + phases).sum(axis=1) * np.sqrt(2 / _FEATURES))

@@ -18,6 +18,8 @@ class TissueBackend(ABC):
 
     touching: bool = False
     """Whether the sphere holds a vertex after the step."""
+    activation: float = 1.0
+    """How far guarding muscles are contracted, from 0 to 1: the a of `palpate_models.wall`."""
 
     def __init__(self, model: PhantomModel, breathing: BreathingCurve, dt: float) -> None:
         self.model = model

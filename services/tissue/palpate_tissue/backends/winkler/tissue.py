@@ -135,7 +135,16 @@ class WinklerTissue(TissueBackend):
         feed: Array = np.array(stiffness.prony_g) * (1 - decay)
         prony, share = np.column_stack((decay, feed)), h / stiffness.dashpot_s
         return Wall(
-            self.displacement, self.branches, indptr, columns, A.data, prony, h, self._springs(), share, np.array([self.activation])
+            self.displacement,
+            self.branches,
+            indptr,
+            columns,
+            A.data,
+            prony,
+            h,
+            self._springs(),
+            share,
+            np.array([self.activation]),
         )
 
     def _springs(self) -> Array:
