@@ -32,7 +32,7 @@ Share = Annotated[float, Field(ge=0, lt=1)]
 class Breathing(Section):
     """Breathing of the abdominal type. The wall's place at rest is that at the end of expiration."""
 
-    kind: Literal["none", "quiet", "deep", "held"] = "none"
+    kind: Literal["none", "quiet", "deep", "held"] = "quiet"
     """`deep` has other values where none are given: 25 mm, 7.4 a minute, `depth_cv` 0.1. `held`: quiet, but now and then the
     breath is held at the end of expiration."""
     peak_to_peak_m: Annotated[float, Field(gt=0, le=MOST_M)] = 0.008
@@ -112,7 +112,7 @@ class BreathingCurve:
         return float(amplitude * (1 + math.cos(math.pi * since / expiration)) / 2) if since < expiration else 0.0
 
 
-STILL = BreathingCurve(Breathing(), 0)
+STILL = BreathingCurve(Breathing(kind="none"), 0)
 """A patient who does not breathe."""
 
 

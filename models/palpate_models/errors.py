@@ -25,7 +25,7 @@ from palpate_models.frames import Array, matrix
 from palpate_models.section import NonNegative, Pose, Positive, Section
 
 Level = Literal["none", "typical", "poor"]
-LEVEL: Final[Level] = "none"
+LEVEL: Final[Level] = "typical"
 """What a scenario that says nothing gets."""
 MOMENT_PER_FORCE_M: Final = 5 / 145
 """What an F/T sensor gets wrong in moment [N m] over what it gets wrong in force [N]: the ratio of its ranges, as of an ATI

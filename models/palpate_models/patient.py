@@ -12,6 +12,7 @@ from palpate_models.draw import Build, Draw
 from palpate_models.guarding import Guarding
 from palpate_models.motion import Motion
 from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
+from palpate_models.wall import MEDIAN
 
 
 class Lesion(Section):
@@ -48,14 +49,14 @@ class Background(Section):
 
 
 class Stiffness(Section):
-    """Mechanics of the healthy wall (k_w 1.7e5 N/m^3, l = 15 mm; Prony weights after liver)."""
+    """Mechanics of the healthy wall: that of the median person (`palpate_models.wall`), with Prony weights after liver."""
 
-    k_w_n_per_m3: Annotated[float, Field(ge=1e3, le=1e8)] = 1.7e5
+    k_w_n_per_m3: Annotated[float, Field(ge=1e3, le=1e8)] = MEDIAN.k_w_n_per_m3
     """Instantaneous Winkler foundation modulus."""
-    length_m: Annotated[float, Field(ge=0.002, le=0.1)] = 0.015
+    length_m: Annotated[float, Field(ge=0.002, le=0.1)] = MEDIAN.length_m
     """Pasternak length l = sqrt(G / k_w)."""
-    stiffening_per_m: NonNegative = 0.0
-    """How fast the modulus rises with depth: at displacement u it is k_w (1 + stiffening_per_m u), see `palpate_models.wall`."""
+    stiffening_per_m: NonNegative = MEDIAN.stiffening_per_m
+    """How fast the modulus rises with depth: at displacement u it is k_w (1 + (stiffening_per_m u)^2), see `palpate_models.wall`."""
     prony_g: tuple[NonNegative, ...] = (0.3, 0.2)
     """Relaxing fractions of the instantaneous modulus."""
     prony_tau_s: tuple[Positive, ...] = (1.86, 51.3)

@@ -113,8 +113,8 @@ def test_coughs_come_in_bursts_and_leave_the_breaths_as_they_are():
     np.testing.assert_array_equal(breaths[~cough][:, 1:], calm[:count, 1:])
 
 
-def test_nobody_breathes_by_default():
-    assert BreathingCurve(Breathing(), 5).table.shape == (0, 5)
+def test_a_still_patient_does_not_breathe():
+    assert BreathingCurve(Breathing(kind="none"), 5).table.shape == (0, 5)
     assert STILL.largest_m == 0
     assert STILL.excursion(1.3) == 0
 

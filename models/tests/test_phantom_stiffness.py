@@ -27,9 +27,9 @@ def test_background_without_variation_is_nominal_in_the_middle():
     phantom = Phantom(background=Background(cv=0.0, margins=1.5))
     model = build_phantom(phantom, 0)
     middle = (np.abs(model.vertices[:, :2]) < 0.03).all(axis=1) & (model.normals[:, 2] > 0)
-    np.testing.assert_allclose(model.stiffness[middle], 1.7e5)
+    np.testing.assert_allclose(model.stiffness[middle], phantom.stiffness.k_w_n_per_m3)
     head = np.argmax(model.vertices[:, 1])
-    assert model.stiffness[head] == pytest.approx(1.5 * 1.7e5, rel=0.01)
+    assert model.stiffness[head] == pytest.approx(1.5 * phantom.stiffness.k_w_n_per_m3, rel=0.01)
 
 
 def test_background_does_not_depend_on_the_mesh():
