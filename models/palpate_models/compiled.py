@@ -5,7 +5,7 @@ anew by every process. A function compiles at its first call, so whoever has a d
 
 numba compiles a function anew when its own file has changed. What it calls is compiled into it, and may stand in another file of
 the package; so here all that is kept for a folder goes when any file of its package, sub-packages included, has changed. A
-compiled function must not call one of another package.
+compiled function must not call one of another package, save those of `vectors.py`, which count as sources of every package.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numba
 _F = TypeVar("_F", bound=Callable[..., Any])
 STAMP = "palpate.stamp"
 """Beside the compiled code: which sources it was made of."""
+_SHARED = Path(__file__).with_name("vectors.py")
 
 
 def compiled(function: _F) -> _F:
@@ -48,7 +49,7 @@ def _package(file: Path) -> Path:
 def _renew(package: Path, kept: Path) -> None:
     """Removes what is kept of a package unless it was made of its sources as they are."""
     digest = sha256()
-    for path in sorted(package.rglob("*.py")):
+    for path in (*sorted(package.rglob("*.py")), _SHARED):
         digest.update(path.name.encode() + path.read_bytes())
     stamp = kept / STAMP
     if stamp.is_file() and stamp.read_text() == digest.hexdigest():

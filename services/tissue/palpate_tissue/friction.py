@@ -15,7 +15,7 @@ import numpy as np
 
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
-from palpate_tissue.vectors import Vector, add, cross, divide, dot, norm, scale, subtract, velocity_at
+from palpate_models.vectors import Vector, add, cross, divide, dot, norm, scale, subtract, velocity_at
 
 REFERENCE_K_W = 1.7e5
 REFERENCE_E = 1.0e4

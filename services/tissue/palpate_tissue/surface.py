@@ -12,7 +12,7 @@ from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_models.nearest import nearest_vertex
 from palpate_models.phantom import PhantomModel
-from palpate_tissue.vectors import Vector, add, divide, dot, norm, row, scale, subtract
+from palpate_models.vectors import Vector, add, divide, dot, norm, row, scale, subtract
 
 _FAR_M = 0.15
 """Further away than this, the nearest vertex stands for the nearest point."""

@@ -2,7 +2,7 @@
 
 With X_WL the pose of link i behind joint i, a its axis, r the way from the joint to what is behind it:
 
-    R_WL = R_WP exp(a q),    p_WL = p_WP + R_WP p_PL                        (poses along the chain)
+    R_WL = exp(a_W q) R_WP,    p_WL = p_WP + R_WP p_PL                      (poses along the chain)
     v = sum a_W qd x r,      w = sum a_W qd                                 (motion of the tool)
     tau_g = a_W . (r x (0, 0, m g))                                         (torque that carries the mass m behind a joint)
 
@@ -22,86 +22,94 @@ from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
+from palpate_models.vectors import Vector, add, cross, dot, row, scale, subtract
 
-_LIFT_W: Final = np.array((0.0, 0.0, GRAVITY))
+_LIFT_W: Final = (0.0, 0.0, GRAVITY)
 """Against gravity [m/s^2]."""
-_ORIGIN, _AXIS, _CENTRE = 3, 4, 5
-"""Columns of a frame's table, (4, 6), all in homogeneous coordinates of the frame before it: the first four are its pose X_PF,
-then come the axis of the joint between them, which is the same in both, and the centre of the mass fixed to the frame before.
-A chain, shape (9, 4, 6), has the tables at q = 0 of the base, in world, of the seven links, and of the indenter. In one array,
-as each that is handed to compiled code costs a tenth of a microsecond."""
-
 _MOUNTS: Final[Array] = np.cumsum((lbr.LINK_7_TO_FLANGE_M, lbr.FLANGE_TO_FT_M, lbr.FT_TO_INDENTER_M))
 """Flange, F/T sensor and indenter along the last link's z axis [m], shape (3,)."""
+_TOOL_M: Final = float(_MOUNTS[-1])
+_X, _Y, _Z, _ORIGIN, _AXIS, _CENTRE, _MASS = 0, 3, 6, 9, 12, 15, 18
+"""Columns of a table of links: axes and origin of the link's frame, the axis of the joint before it, which is of unit length, the
+centre of its mass, and the mass [kg]. A chain, shape (8, 19), has the base, in world, and the seven links, each at q = 0 in the
+frame before it. It is one array, as each that is handed to compiled code costs a tenth of a microsecond."""
 
 
 @compiled
-def _rotation(axis: Array, angle: float) -> Array:
-    """Rotation matrix exp([axis] angle), shape (3, 3), by Rodrigues' formula; `axis` is a unit vector."""
-    x, y, z = axis
-    c, s, d = cos(angle), sin(angle), 1.0 - cos(angle)
-    return np.array(
-        (
-            (c + d * x * x, d * x * y - s * z, d * x * z + s * y),
-            (d * x * y + s * z, c + d * y * y, d * y * z - s * x),
-            (d * x * z - s * y, d * y * z + s * x, c + d * z * z),
-        )
-    )
+def _turned(a: Vector, axis: Vector, angle: float) -> Vector:
+    """`a` turned by exp([axis] angle): Rodrigues' formula; `axis` is of unit length."""
+    c, s = cos(angle), sin(angle)
+    return add(add(scale(c, a), scale(s, cross(axis, a))), scale((1.0 - c) * dot(axis, a), axis))
 
 
 @compiled
-def _quaternion(R: Array) -> Array:
-    """Unit quaternion x, y, z, w, shape (4,), by its largest part (Shepperd 1978, doi 10.2514/3.55767b); `R` may be a pose."""
-    out = np.empty(4)
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    if trace > 0.0:
-        root = sqrt(trace + 1.0)
-        out[0], out[1], out[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-        out[:3] *= 0.5 / root
-        out[3] = 0.5 * root
-        return out
-    i = int(np.argmax(np.diag(R)[:3]))
-    j, k = (i + 1) % 3, (i + 2) % 3
-    root = sqrt(R[i, i] - R[j, j] - R[k, k] + 1.0)
-    out[i], out[j], out[k] = 0.5 * root, 0.5 / root * (R[j, i] + R[i, j]), 0.5 / root * (R[k, i] + R[i, k])
-    out[3] = 0.5 / root * (R[k, j] - R[j, k])
-    return out
+def _in_world(links: Array, i: int, a: Vector) -> Vector:
+    """A vector in the axes of frame `i` of a table of links in world."""
+    along_xy = add(scale(a[0], row(links, i, _X)), scale(a[1], row(links, i, _Y)))
+    return add(along_xy, scale(a[2], row(links, i, _Z)))
 
 
 @compiled
 def _placed(chain: Array, q: Array) -> Array:
-    """The tables of a chain in world, shape (9, 4, 6)."""
-    placed = chain.copy()
-    for i in range(1, 9):
-        if i <= 7:
-            placed[i, :3, :3] = _rotation(chain[i, :3, _AXIS], q[i - 1])
-        X_WP = np.ascontiguousarray(placed[i - 1, :, :4])
-        placed[i] = X_WP @ placed[i]
-    return placed
+    """The links of a chain in world at joint positions `q`, shape (8, 19)."""
+    links = chain.copy()
+    for i in range(1, len(links)):
+        axis = _in_world(links, i - 1, row(chain, i, _AXIS))
+        origin = add(row(links, i - 1, _ORIGIN), _in_world(links, i - 1, row(chain, i, _ORIGIN)))
+        x, y, z = row(links, i - 1, _X), row(links, i - 1, _Y), row(links, i - 1, _Z)
+        links[i, :_AXIS] = _turned(x, axis, q[i - 1]) + _turned(y, axis, q[i - 1]) + _turned(z, axis, q[i - 1]) + origin
+        links[i, _AXIS:_MASS] = axis + add(origin, _in_world(links, i, row(chain, i, _CENTRE)))
+    return links
 
 
 @compiled
-def _state(chain: Array, behind: Array, q: Array, v: Array) -> Array:
-    """See `Kinematics.state`. `behind` (7, 7) has in row i, column k the mass [kg] of link k if that is behind joint i, or 0."""
-    placed = _placed(chain, q)
-    p_WI, p_WL = placed[8, :3, _ORIGIN], placed[1:8, :3, _ORIGIN]
-    axis, centre = np.ascontiguousarray(placed[1:8, :3, _AXIS]), np.ascontiguousarray(placed[2:, :3, _CENTRE])
-    velocity = v @ np.cross(axis, p_WI - p_WL)
-    moment = behind @ centre - np.sum(behind, axis=1).reshape(7, 1) * p_WL  # mass behind each joint, times the way there
-    torque = np.sum(axis * np.cross(moment, _LIFT_W), axis=1)
-    return np.concatenate((p_WI, _quaternion(placed[8]), velocity, v @ axis, torque))
+def _quaternion(links: Array, i: int) -> tuple[float, float, float, float]:
+    """Unit quaternion x, y, z, w of frame `i`, by one of its larger parts (Shepperd 1978, doi 10.2514/3.55767b)."""
+    (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = row(links, i, _X), row(links, i, _Y), row(links, i, _Z)
+    trace = xx + yy + zz
+    largest = max(xx, yy, zz)
+    if trace > 0.0:
+        x, y, z, w = zy - yz, xz - zx, yx - xy, 1.0 + trace
+    elif largest == xx:
+        x, y, z, w = 1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz
+    elif largest == yy:
+        x, y, z, w = xy + yx, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx
+    else:
+        x, y, z, w = xz + zx, yz + zy, 1.0 - trace + 2.0 * zz, yx - xy
+    norm = sqrt(x * x + y * y + z * z + w * w)
+    return x / norm, y / norm, z / norm, w / norm
+
+
+@compiled
+def _state(chain: Array, q: Array, v: Array) -> Array:
+    """See `Kinematics.state`. From the last joint to the first, what is behind a joint grows by a link."""
+    links, torque = _placed(chain, q), np.empty(7)
+    p_WI = add(row(links, 7, _ORIGIN), scale(_TOOL_M, row(links, 7, _Z)))
+    velocity = angular_velocity = moment = (0.0, 0.0, 0.0)
+    mass = 0.0
+    for i in range(7, 0, -1):
+        axis, p_WL, qd = row(links, i, _AXIS), row(links, i, _ORIGIN), v[i - 1]
+        velocity = add(velocity, scale(qd, cross(axis, subtract(p_WI, p_WL))))
+        angular_velocity = add(angular_velocity, scale(qd, axis))
+        mass += links[i, _MASS]
+        moment = add(moment, scale(links[i, _MASS], row(links, i, _CENTRE)))
+        torque[i - 1] = dot(axis, cross(subtract(moment, scale(mass, p_WL)), _LIFT_W))
+    state = np.empty(20)
+    state[:13] = p_WI + _quaternion(links, 7) + velocity + angular_velocity
+    state[13:] = torque
+    return state
 
 
 @compiled
 def _links(chain: Array, mounts: Array, q: Array) -> Array:
     """See `Kinematics.links`. What is fixed to the last link is `mounts` (3,) along its z axis [m]."""
-    placed = _placed(chain, q)
-    out = np.empty((11, 7))
+    links = _placed(chain, q)
+    poses = np.empty((11, 7))
     for i in range(8):
-        out[i, :3], out[i, 3:] = placed[i, :3, _ORIGIN], _quaternion(placed[i])
+        poses[i] = row(links, i, _ORIGIN) + _quaternion(links, i)
     for i in range(3):
-        out[8 + i, :3], out[8 + i, 3:] = out[7, :3] + placed[7, :3, 2] * mounts[i], out[7, 3:]
-    return out
+        poses[8 + i] = add(row(links, 7, _ORIGIN), scale(mounts[i], row(links, 7, _Z))) + _quaternion(links, 7)
+    return poses
 
 
 class Kinematics:
@@ -110,16 +118,15 @@ class Kinematics:
     def __init__(self, robot: Robot) -> None:
         """For an arm on its base, with its tool. Compiles, which takes seconds the first time."""
         mass, centre = _masses(robot)
-        self._behind: Array = np.triu(np.tile(mass, (7, 1)))
-        self._chain: Array = np.zeros((9, 4, 6))
-        self._chain[:, :, :4] = np.eye(4)
-        self._chain[0, :3, :3] = _rotation(np.array((0.0, 0.0, 1.0)), robot.base_yaw_rad)
-        self._chain[0, :3, _ORIGIN] = (*robot.base_xy_m, robot.base_height_m)
-        self._chain[1:8, :3, _ORIGIN] = lbr.JOINT_ORIGIN
-        self._chain[1:8, :3, _AXIS] = lbr.JOINT_AXIS
-        self._chain[2:, :3, _CENTRE] = centre
-        self._chain[2:, 3, _CENTRE] = 1.0
-        self._chain[8, 2, _ORIGIN] = _MOUNTS[-1]
+        yaw = robot.base_yaw_rad
+        base = np.concatenate(
+            ((cos(yaw), sin(yaw), 0.0), (-sin(yaw), cos(yaw), 0.0), (0.0, 0.0, 1.0), robot.base_xy_m, (robot.base_height_m,))
+        )
+        self._chain: Array = np.zeros((8, 19))
+        self._chain[0, :_AXIS] = base
+        self._chain[1:, :_ORIGIN] = np.eye(3).ravel()
+        self._chain[1:, _ORIGIN:_MASS] = np.hstack((lbr.JOINT_ORIGIN, lbr.JOINT_AXIS, centre))
+        self._chain[1:, _MASS] = mass
         self.state(np.zeros(7), np.zeros(7))
         self.links(np.zeros(7))
 
@@ -129,7 +136,7 @@ class Kinematics:
         Position p_WI [m], orientation x, y, z, w, velocity of the sphere's centre [m/s], angular velocity [rad/s]; then the
         torques [N m].
         """
-        state: Array = _state(self._chain, self._behind, q, v)
+        state: Array = _state(self._chain, q, v)
         return state
 
     def links(self, q: Array) -> Array:

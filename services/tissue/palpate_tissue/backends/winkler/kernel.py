@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
+from palpate_models.vectors import add, divide, dot, row, scale, subtract
 from palpate_tissue.friction import Bristle, Push, Sphere, rub
 from palpate_tissue.near import RIM
-from palpate_tissue.vectors import add, divide, dot, row, scale, subtract
 
 Index = NDArray[np.uint16] | NDArray[np.uint32]
 """Unsigned: a signed index may be negative to numba, and looking each time doubles the cost of the field's step."""
