@@ -34,7 +34,8 @@ __all__ = [
 ]
 
 _LITTLE_ENDIAN = ENCAPSULATION[:2]
-_STRUCT_CODECS = STRUCT_CODECS | EXAM_CODECS
+OWN_CODECS = STRUCT_CODECS | EXAM_CODECS
+"""By message type."""
 
 Message = Any
 """A message of any class. Where the class is known, `palpate_bus.messages` has it with its fields."""
@@ -54,7 +55,7 @@ def decode(payload: bytes | memoryview, name: str) -> Message:
 def encoder(name: str) -> Callable[[Message], bytes]:
     """`encode` for one type, for hot paths."""
     message_type(name)
-    own = _STRUCT_CODECS.get(name)
+    own = OWN_CODECS.get(name)
     encode_message = own.encode if own else _rosbags_encoder(name)
 
     def encode(message: Message) -> bytes:
@@ -70,7 +71,7 @@ def encoder(name: str) -> Callable[[Message], bytes]:
 def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
     """`decode` for one type, for hot paths."""
     message_type(name)
-    own = _STRUCT_CODECS.get(name)
+    own = OWN_CODECS.get(name)
 
     def decode(payload: bytes | memoryview) -> Message:
         try:
