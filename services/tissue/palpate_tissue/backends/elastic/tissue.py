@@ -30,6 +30,8 @@ from palpate_tissue.near import Search
 
 _MARGIN_M = 0.0025
 """The vertices near the sphere are searched anew when it has moved this far."""
+PRESS_STEP_S = 0.02
+"""Step of a standard press: with the service's 1 ms what it reads differs by less than 0.1 %."""
 
 
 def update_rule(stiffness: Stiffness, dt: float) -> tuple[Array, Array]:
@@ -69,7 +71,7 @@ class ElasticTissue(TissueBackend):
         self.friction = friction.skin(stiffness.friction, model.background)
         self.disturbed = False
         """Whether anything has ever moved."""
-        self._prony_g = stiffness.prony_g
+        self._prony_g, self._stiffness = stiffness.prony_g, stiffness
         self._advance, self._feed = update_rule(stiffness, dt)
         self._excursion = 0.0
         free = compliance.free
@@ -106,6 +108,20 @@ class ElasticTissue(TissueBackend):
         self._patch = None
         self._behind += 1
         self._release()
+
+    def settle(self) -> None:
+        """See `TissueBackend`."""
+        self._state[:] = 0.0
+        self._behind, self._excursion, self._patch = 0, 0.0, None
+        self.friction.release()
+        self.disturbed = self.touching = False
+
+    def press(self, places: Array, normals: Array, radius: float) -> Array:
+        """See `TissueBackend`. In steps of PRESS_STEP_S: the step is implicit, and what is read is the end of the hold."""
+        if self.dt >= PRESS_STEP_S:
+            return super().press(places, normals, radius)
+        coarse = ElasticTissue(self.model, self.compliance, self._stiffness, dt=PRESS_STEP_S)
+        return coarse.press(places, normals, radius)
 
     def _release(self) -> None:
         if self.touching:

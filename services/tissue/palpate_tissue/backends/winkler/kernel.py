@@ -84,6 +84,35 @@ def step(
 
 
 @compiled
+def press(
+    wall: Wall,
+    patch: Patch,
+    ends: NDArray[np.int64],
+    places: Array,
+    normals: Array,
+    radius: float,
+    depths: Array,
+    forces: Array,
+) -> None:
+    """Frictionless spheres of `radius` [m] pressed into a wall at rest, all at once, to depths [m], shape (n,), a step each.
+
+    At k `places` [m] along outward `normals`, shape (k, 3); sphere j may hold the patch's vertices from ends[j - 1] to ends[j].
+    `forces` (k, n) gets the forces along the normals [N].
+    """
+    for step in range(len(depths)):
+        move_freely(wall)
+        begin = 0
+        for j in range(len(ends)):
+            own = Patch(patch.vertex[begin : ends[j]], patch.table[begin : ends[j]], patch.f[begin : ends[j]])
+            n = row(normals, j)
+            p = add(row(places, j), scale(radius - depths[step], n))
+            _, push = hold(wall, own, Sphere(p, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), radius), 0.0)
+            forces[j, step] = dot(push.force, n)
+            begin = ends[j]
+        relax(wall)
+
+
+@compiled
 def move_freely(wall: Wall) -> None:
     """The wall as it moves by itself: u += A (u - sum_k y_k)."""
     u, rate, indices = wall.u, wall.rate, wall.indices

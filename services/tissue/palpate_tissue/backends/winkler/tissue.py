@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models import press
 from palpate_models.breathing import STILL, BreathingCurve
 from palpate_models.frames import Array
 from palpate_models.patient import Stiffness
@@ -28,6 +29,11 @@ from palpate_tissue.near import Near, Search
 _NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 _MARGIN_M = 0.005
 """The vertices near the sphere are searched anew when it has moved this far."""
+
+
+_APART = 7.0
+"""Presses so many Pasternak lengths apart do not feel each other: a wall gives way as K0(r / l), less than 1e-3 of what it does at
+the rim of the contact."""
 
 
 class WinklerTissue(TissueBackend):
@@ -52,7 +58,7 @@ class WinklerTissue(TissueBackend):
         """y_k = g_k z_k [m]: what has relaxed, a row (n,) for each Prony branch."""
         self.disturbed = False
         """Whether anything has ever moved; until then the field is left at its exact rest."""
-        self._prony_g = stiffness.prony_g
+        self._prony_g, self._length_m = stiffness.prony_g, stiffness.length_m
         self._wall = self._wall_of(stiffness, h)
         self._gain = self.mechanics.damping / h
         self._excursion = 0.0
@@ -92,6 +98,29 @@ class WinklerTissue(TissueBackend):
         for k in range(1, self.substeps + 1):
             self._excursion = self.excursion(t_s - self.dt * (1 - k / self.substeps))
             self._press(self._nothing, 0.0, np.zeros(6))
+
+    def settle(self) -> None:
+        """See `TissueBackend`."""
+        self.displacement[:] = self.branches[:] = 0.0
+        self.friction.release()
+        self._excursion, self._last = 0.0, None
+        self._near, self._patch = None, self._nothing
+        self.disturbed = self.touching = False
+
+    def press(self, places: Array, normals: Array, radius: float) -> Array:
+        """See `TissueBackend`. Presses that are too far apart to feel each other go into one wall at once."""
+        depths = press.depths(press.times(self.dt / self.substeps))
+        forces = np.empty((len(places), len(depths)))
+        half_way = places + (radius - 0.5 * press.DEPTH_M) * normals
+        for together in _apart(places, _APART * self._length_m):
+            self.settle()
+            near = [self._search.around(p.tolist(), radius, press.DEPTH_M).vertex for p in half_way[together]]
+            patch = self._patch_of(self._free[np.concatenate(near)])
+            ends = np.cumsum([len(vertices) for vertices in near])
+            kernel.press(self._wall, patch, ends, places[together], normals[together], radius, depths, out := forces[together])
+            forces[together] = out
+        self.settle()
+        return forces
 
     def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
         self._excursion = excursion
@@ -156,3 +185,16 @@ class WinklerTissue(TissueBackend):
                 stretch = u - y / g
                 stored += 0.5 * g * (stretch @ (K @ stretch))
         return float(stored + self.friction.energy())
+
+
+def _apart(places: Array, distance: float) -> list[NDArray[np.intp]]:
+    """Groups of places (k, 3) of which no two are nearer to each other than `distance` [m]: each joins the first that has room."""
+    groups: list[list[int]] = []
+    for i, place in enumerate(places):
+        for group in groups:
+            if (np.linalg.norm(places[group] - place, axis=1) >= distance).all():
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    return [np.array(group) for group in groups]
