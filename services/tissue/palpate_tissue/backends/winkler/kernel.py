@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
@@ -83,32 +84,26 @@ def step(
     return touching
 
 
-@compiled
-def press(
-    wall: Wall,
-    patch: Patch,
-    ends: NDArray[np.int64],
-    places: Array,
-    normals: Array,
-    radius: float,
-    depths: Array,
-    forces: Array,
-) -> None:
-    """Frictionless spheres of `radius` [m] pressed into a wall at rest, all at once, to depths [m], shape (n,), a step each.
+def cut(wall: Wall, part: NDArray[np.intp]) -> Wall:
+    """A part of a wall, at rest: vertices in ascending order, shape (k,). Those beyond it do not move."""
+    n = len(wall.u)
+    A = sparse.csr_array((wall.rate, wall.indices.astype(np.int32), wall.indptr.astype(np.int32)), shape=(n, n))[part][:, part]
+    indptr, indices = A.indptr.astype(wall.indptr.dtype), A.indices.astype(wall.indices.dtype)
+    return Wall(np.zeros(len(part)), np.zeros((len(wall.y), len(part))), indptr, indices, A.data, wall.prony, wall.h)
 
-    At k `places` [m] along outward `normals`, shape (k, 3); sphere j may hold the patch's vertices from ends[j - 1] to ends[j].
-    `forces` (k, n) gets the forces along the normals [N].
+
+@compiled
+def press(wall: Wall, patch: Patch, at: Array, radius: float, depths: Array, forces: Array) -> None:
+    """A frictionless sphere of `radius` [m] pressed into a wall at rest, to depths [m], shape (n,), a step each.
+
+    `at` (2, 3) has the place [m] and the outward normal there as rows; `forces` (n,) gets the forces along it [N].
     """
+    n = row(at, 1)
     for step in range(len(depths)):
         move_freely(wall)
-        begin = 0
-        for j in range(len(ends)):
-            own = Patch(patch.vertex[begin : ends[j]], patch.table[begin : ends[j]], patch.f[begin : ends[j]])
-            n = row(normals, j)
-            p = add(row(places, j), scale(radius - depths[step], n))
-            _, push = hold(wall, own, Sphere(p, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), radius), 0.0)
-            forces[j, step] = dot(push.force, n)
-            begin = ends[j]
+        p = add(row(at, 0), scale(radius - depths[step], n))
+        _, push = hold(wall, patch, Sphere(p, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), radius), 0.0)
+        forces[step] = dot(push.force, n)
         relax(wall)
 
 

@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate_models import press
 from palpate_models.breathing import STILL, BreathingCurve
@@ -31,9 +32,9 @@ _MARGIN_M = 0.005
 """The vertices near the sphere are searched anew when it has moved this far."""
 
 
-_APART = 7.0
-"""Presses so many Pasternak lengths apart do not feel each other: a wall gives way as K0(r / l), less than 1e-3 of what it does at
-the rim of the contact."""
+_REACHED = 4.0
+"""A press reaches so many Pasternak lengths beyond the sphere: the wall gives way as K0(r / l), and what is left there acts back by
+its square."""
 
 
 class WinklerTissue(TissueBackend):
@@ -108,18 +109,17 @@ class WinklerTissue(TissueBackend):
         self.disturbed = self.touching = False
 
     def press(self, places: Array, normals: Array, radius: float) -> Array:
-        """See `TissueBackend`. Presses that are too far apart to feel each other go into one wall at once."""
+        """See `TissueBackend`. Each goes into the part of the wall that it reaches, cut out and held at its rim."""
         depths = press.depths(press.times(self.dt / self.substeps))
         forces = np.empty((len(places), len(depths)))
         half_way = places + (radius - 0.5 * press.DEPTH_M) * normals
-        for together in _apart(places, _APART * self._length_m):
-            self.settle()
-            near = [self._search.around(p.tolist(), radius, press.DEPTH_M).vertex for p in half_way[together]]
-            patch = self._patch_of(self._free[np.concatenate(near)])
-            ends = np.cumsum([len(vertices) for vertices in near])
-            kernel.press(self._wall, patch, ends, places[together], normals[together], radius, depths, out := forces[together])
-            forces[together] = out
-        self.settle()
+        tree = cKDTree(self.model.vertices)
+        for place, normal, middle, force in zip(places, normals, half_way, forces, strict=True):
+            part = np.sort(np.asarray(tree.query_ball_point(place, radius + _REACHED * self._length_m), dtype=np.intp))
+            near = self._free[self._search.around(middle.tolist(), radius, press.DEPTH_M).vertex]
+            near = near[np.isin(near, part)]
+            patch = self._patch_of(near)._replace(vertex=np.searchsorted(part, near).astype(np.uint32))
+            kernel.press(kernel.cut(self._wall, part), patch, np.stack((place, normal)), radius, depths, force)
         return forces
 
     def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
@@ -185,16 +185,3 @@ class WinklerTissue(TissueBackend):
                 stretch = u - y / g
                 stored += 0.5 * g * (stretch @ (K @ stretch))
         return float(stored + self.friction.energy())
-
-
-def _apart(places: Array, distance: float) -> list[NDArray[np.intp]]:
-    """Groups of places (k, 3) of which no two are nearer to each other than `distance` [m]: each joins the first that has room."""
-    groups: list[list[int]] = []
-    for i, place in enumerate(places):
-        for group in groups:
-            if (np.linalg.norm(places[group] - place, axis=1) >= distance).all():
-                group.append(i)
-                break
-        else:
-            groups.append([i])
-    return [np.array(group) for group in groups]
