@@ -29,7 +29,7 @@ def folder() -> Path:
 
 
 def content_key(kind: str, code: Iterable[Path], *parts: object) -> str:
-    """A name for a result: a hash of its kind, of the source files that make it, and of what it depends on, arrays by their bytes.
+    """A name for a result: a hash of its kind, of the source files that make it, and of what it depends on (arrays by bytes).
 
     A change of one of the files of `code` makes results anew.
     """

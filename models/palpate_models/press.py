@@ -1,7 +1,7 @@
 """The standard press, by which stiffness is compared: what an examiner's hand does at a place, and what it feels there.
 
-The indenter goes in along the inward normal from where the skin is touched, at one speed to one depth, and is held. What it feels is
-the mean force of the end of the hold: the place's apparent stiffness.
+The indenter goes in along the inward normal from where the skin is touched, at one speed to one depth, and is held. What it feels
+is the mean force of the end of the hold: the place's apparent stiffness.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DURATION_S: Final = DEPTH_M / SPEED_MPS + HOLD_S
 
 def times(step_s: float) -> Array:
     """The ends of the press's steps of `step_s` [s], from the touch [s], shape (n,)."""
-    return step_s * np.arange(1, round(DURATION_S / step_s) + 1)
+    return np.asarray(step_s * np.arange(1, round(DURATION_S / step_s) + 1), dtype=np.float64)
 
 
 def depths(times_s: Array) -> Array:

@@ -1,7 +1,8 @@
 """What can be felt of a pressed patient: apparent stiffness between the places pressed, and the areas of lumps.
 
-With the felt contrast F / F without the lump, e is its logarithm. A lump's area is the connected set about its greatest |e| in which
-e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane of A; areas are on the skin.
+The felt contrast of a lump is the force with it over the force without it, and e its logarithm. A lump's area is the connected set
+about its greatest |e| in which e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane of A;
+areas are on the skin.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Felt:
         return np.asarray(np.nan_to_num(self._limited(xy)) > 0.5)
 
     def excess(self, xy: Array) -> Array:
-        """e of all lumps together at points, shape (p,); NaN where nothing was pressed."""
+        """E of all lumps together at points, shape (p,); NaN where nothing was pressed."""
         return np.asarray(self._excess(xy))
 
     def inside(self, area: Mask, xy: Array) -> Mask:

@@ -1,6 +1,6 @@
-"""The patient pressed: a copy of the true tissue, in its own tier, felt by the standard press as it is and without what is looked for.
+"""The patient pressed: a copy of the true tissue, in its own tier, felt by the standard press with its lumps and without.
 
-The body is at rest, at the end of expiration; nothing moves but the press. What it feels without a lump, over the same places, says
+The body is at rest, at the end of expiration; nothing moves but the press. What it feels without a lump, at the same places, says
 what of the lump can be felt at all.
 """
 
@@ -33,8 +33,8 @@ PITCH_M: Final = 0.010
 FINE_PITCH_M: Final = 0.005
 """... and so far about the outline of a lump, inward and outward, where it is this one."""
 REACH_M: Final = 0.040
-"""So far beyond its outline, and for each metre of depth a metre more, a lump is not felt: K0(r / l) there is below 3 %, and it is
-felt with its square."""
+"""So far beyond its outline, and for each metre of depth a metre more, a lump is not felt: the influence K0(r / l) is below 3 %
+there, and what is felt goes with its square."""
 _OWN_FMU: Final = "winkler"
 """The tier whose equations our own FMU has."""
 
@@ -111,7 +111,7 @@ def press_patient(scenario: Scenario) -> Pressed | None:
         near = _near(places, lesions)
         healthy = force
         if near.any() and (without := patient.with_lesions(())) is not None:
-            healthy = press(without, near.any(axis=0), force)
+            healthy = press(without, np.asarray(near.any(axis=0)), force)
         alone = []
         for i, mine in enumerate(near):
             felt = np.where(mine, healthy, force)

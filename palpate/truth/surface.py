@@ -52,4 +52,4 @@ class TrueSurface:
     def steepness(self, xy: Array) -> Array:
         """Area of the surface over area in xy at points [1], shape (p,)."""
         normal = np.asarray(self._normal(xy))
-        return np.nan_to_num(np.linalg.norm(normal, axis=1) / normal[:, 2], nan=1.0)
+        return np.asarray(np.nan_to_num(np.linalg.norm(normal, axis=1) / normal[:, 2], nan=1.0))

@@ -1,8 +1,8 @@
 """Apparent stiffness from the posterior: what the standard press would feel at each node, and how sure that is.
 
-The press feels the modulus averaged over its footprint, felt(z) = (H exp(p z))^(1/p), as a sample does (inversion.py), and its force is
-that times the force over k_w of the nominal wall. What the samples leave open about single nodes mostly cancels in the average, so
-its variance is the posterior's of that average and not of the nodes.
+The press feels the modulus averaged over its footprint, felt(z) = (H exp(p z))^(1/p), as a sample does (inversion.py), and its force
+is that times the force over k_w of the nominal wall. What the samples leave open about single nodes mostly cancels in the average:
+the variance is the posterior's of that average and not of the nodes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Footprints:
         return np.asarray(np.exp(top) * (self.weights @ np.exp(POWER * (z - top))) ** (1.0 / POWER))
 
     def jacobian(self, z: Array, nodes: slice | Mask) -> Array:
-        """d log felt / dz at some of the nodes, shape (k, n); rows sum to 1."""
+        """D log felt / dz at some of the nodes, shape (k, n); rows sum to 1."""
         rows = self.weights[nodes].toarray() * np.exp(POWER * (z - z.max()))
         return np.asarray(rows / rows.sum(axis=1, keepdims=True))
 
@@ -78,8 +78,8 @@ def felt_ratio(
 ) -> tuple[float, float]:
     """Log of an area's apparent stiffness over that of its surroundings, mean over the area, and its standard deviation.
 
-    `surroundings`: the healthy part of the posterior's log-moduli, shape (n,); `lesion`: the prior of what comes on top of it, whose
-    posterior variance is the ratio's.
+    `surroundings`: log-moduli of the wall as it would be without stiff areas, shape (n,); `lesion`: the prior of what comes on top
+    of the healthy wall, whose posterior variance is the ratio's.
     """
     footprints = Footprints(grid, contact, press.DEPTH_M)
     weight = grid.area * area / float(grid.area[area].sum())

@@ -86,7 +86,8 @@ def assess(
         posterior = invert(observations, healthy + lesion, mean, posterior.mean, iterations=4)
         background = mean + healthy.times((posterior.weights @ posterior.jacobian)[None])[0]
     if refine:
-        ratio = partial(felt_ratio, posterior=posterior, surroundings=background, lesion=lesion, grid=grid, contact=contact)
+        around = surroundings(posterior.mean, observations, grid, healthy, mean, scanned)
+        ratio = partial(felt_ratio, posterior=posterior, surroundings=around, lesion=lesion, grid=grid, contact=contact)
         found = find(posterior.mean - background, grid, scanned, posterior, observations, healthy, ratio)
     rest = scanned & ~np.any([f.nodes for f in found], axis=0) if found else scanned
     pressed = apparent_stiffness(posterior, grid, contact)

@@ -118,7 +118,7 @@ def find(
     healthy: Field,
     felt: Callable[[Mask], tuple[float, float]],
 ) -> list[StiffArea]:
-    """The findings, most confident first. `felt` gives the log-ratio of an area's apparent stiffness and its standard deviation."""
+    """The findings, most confident first. `felt` gives the log of an area's ratio of apparent stiffness, and its deviation."""
     areas: list[Mask] = []
     for candidate in candidates(excess, grid, reached):
         area = outline(excess, candidate, grid) & reached

@@ -66,4 +66,6 @@ def test_the_posterior_is_that_of_the_dense_formulas() -> None:
     H, K = observations.footprint, field.times(np.eye(grid.z.size))
     gain = np.linalg.solve(H @ K @ H.T + observations.covariance, H @ K).T
     assert posterior.mean == pytest.approx(mean + gain @ (observations.value - mean), rel=1e-9)
-    assert posterior.sd_of(np.eye(len(field.variance))) ** 2 == pytest.approx(field.variance - np.einsum("ij,ji->i", gain, H @ K), rel=1e-6)
+    assert posterior.sd_of(np.eye(len(field.variance))) ** 2 == pytest.approx(
+        field.variance - np.einsum("ij,ji->i", gain, H @ K), rel=1e-6
+    )

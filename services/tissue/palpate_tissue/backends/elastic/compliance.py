@@ -42,7 +42,9 @@ POISSON = 0.49
 MOST_VERTICES = 20_000
 """The matrix of this many vertices takes 1.6 GB."""
 
-_CODE = tuple(Path(file) for file in (__file__, kernel.__file__, modulus.__file__, solid.__file__, field.__file__, friction.__file__))
+_CODE = tuple(
+    Path(file) for file in (__file__, kernel.__file__, modulus.__file__, solid.__file__, field.__file__, friction.__file__)
+)
 """On which the matrices depend."""
 
 

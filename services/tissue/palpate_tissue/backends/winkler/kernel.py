@@ -88,8 +88,8 @@ def cut(wall: Wall, part: NDArray[np.intp]) -> Wall:
     """A part of a wall, at rest: vertices in ascending order, shape (k,). Those beyond it do not move."""
     n = len(wall.u)
     A = sparse.csr_array((wall.rate, wall.indices.astype(np.int32), wall.indptr.astype(np.int32)), shape=(n, n))[part][:, part]
-    indptr, indices = A.indptr.astype(wall.indptr.dtype), A.indices.astype(wall.indices.dtype)
-    return Wall(np.zeros(len(part)), np.zeros((len(wall.y), len(part))), indptr, indices, A.data, wall.prony, wall.h)
+    u, y = np.zeros(len(part)), np.zeros((len(wall.y), len(part)))
+    return Wall(u, y, A.indptr.astype(np.uint32), A.indices.astype(np.uint32), A.data, wall.prony, wall.h)
 
 
 @compiled

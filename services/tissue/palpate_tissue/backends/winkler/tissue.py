@@ -33,8 +33,8 @@ _MARGIN_M = 0.005
 
 
 _REACHED = 4.0
-"""A press reaches so many Pasternak lengths beyond the sphere: the wall gives way as K0(r / l), and what is left there acts back by
-its square."""
+"""A press reaches so many Pasternak lengths beyond the sphere: the wall gives way as K0(r / l), and what is left there acts back
+by its square."""
 
 
 class WinklerTissue(TissueBackend):
