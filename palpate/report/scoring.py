@@ -1,8 +1,8 @@
 """Scores of findings and map against what can truly be felt. The examination sees nothing of this.
 
 A finding matches a lump when their areas overlap by a Dice coefficient of MATCHING_DICE, or its centroid lies in the lump's area;
-each counts once, so that most match and overlap best. All is compared at the places that the tool truly touched, in the xy plane of
-the abdomen frame A; areas are on the skin. The same rule holds everywhere.
+each counts once, so that most match and overlap best. All is compared at the places that the tool truly touched, in the xy plane
+of the abdomen frame A; areas are on the skin. The same rule holds everywhere.
 """
 
 from __future__ import annotations

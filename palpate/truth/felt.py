@@ -1,8 +1,8 @@
 """What can be felt of a pressed patient: apparent stiffness between the places pressed, and the areas of lumps.
 
-The felt contrast of a lump is the force with it over the force without it, and e its logarithm. A lump's area is the connected set
-about its greatest |e| in which e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane of A;
-areas are on the skin.
+The felt contrast of a lump is the force with it over the force without it, and e its logarithm. A lump's area is the connected
+set about its greatest |e| in which e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane
+of A; areas are on the skin.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Apparent stiffness from the posterior: what the standard press would feel at each node, and how sure that is.
 
-The press feels the modulus averaged over its footprint, felt(z) = (H exp(p z))^(1/p), as a sample does (inversion.py), and its force
-is that times the force over k_w of the nominal wall. What the samples leave open about single nodes mostly cancels in the average:
-the variance is the posterior's of that average and not of the nodes.
+The press feels the modulus averaged over its footprint, felt(z) = (H exp(p z))^(1/p), as a sample does (inversion.py). Its force
+is that times the force over k_w of the nominal wall. What the samples leave open about single nodes mostly cancels in the average,
+so the variance is the posterior's of that average and not of the nodes.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def felt_ratio(
 ) -> tuple[float, float]:
     """Log of an area's apparent stiffness over that of its surroundings, mean over the area, and its standard deviation.
 
-    `surroundings`: log-moduli of the wall as it would be without stiff areas, shape (n,); `lesion`: the prior of what comes on top
-    of the healthy wall, whose posterior variance is the ratio's.
+    `surroundings`: log-moduli of the wall as it would be without stiff areas, shape (n,); `lesion`: the prior of what comes on
+    top of the healthy wall, whose posterior variance is the ratio's.
     """
     footprints = Footprints(grid, contact, press.DEPTH_M)
     weight = grid.area * area / float(grid.area[area].sum())
