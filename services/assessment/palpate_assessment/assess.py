@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.spatial import cKDTree
 
-from palpate_assessment.apparent import Footprints, apparent_stiffness, felt_ratio
+from palpate_assessment.apparent import FeltRatios, Footprints, Surroundings, apparent_stiffness
 from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.findings import CANDIDATE_RATIO, StiffArea, candidates, find
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.inversion import Z90, Noise, Observations, estimate_noise, invert, observe, spread_under
 from palpate_assessment.prior import HEALTHY, LESION, Field
 from palpate_assessment.sampling import ForceSample
+from palpate_models import press
 from palpate_models.frames import Array
 
 Mask = NDArray[np.bool_]
@@ -85,24 +86,24 @@ def assess(
             observations = replace(observations, noise=estimate_noise(observations, posterior, healthy + lesion))
         posterior = invert(observations, healthy + lesion, mean, posterior.mean, iterations=4)
         background = mean + healthy.times((posterior.weights @ posterior.jacobian)[None])[0]
+    pressed = Footprints(grid, contact, press.DEPTH_M)
     if refine:
-        around = surroundings(posterior.mean, observations, grid, healthy, mean, scanned)
-        ratio = partial(felt_ratio, posterior=posterior, surroundings=around, lesion=lesion, grid=grid, contact=contact)
-        found = find(posterior.mean - background, grid, scanned, posterior, observations, healthy, ratio)
+        ratios = partial(FeltRatios(posterior, observations, healthy, grid, mean), footprints=pressed)
+        found = find(posterior.mean - background, grid, scanned, posterior, observations, healthy, ratios)
+    apparent = apparent_stiffness(posterior, grid, contact, pressed)
     rest = scanned & ~np.any([f.nodes for f in found], axis=0) if found else scanned
-    pressed = apparent_stiffness(posterior, grid, contact)
     felt = Footprints(grid, contact, contact.common_depth).felt(posterior.mean)
     kept = 1.0 - np.array([s.lost for s in good]) / contact.force(np.array([s.depth for s in good]))
     unit = float(contact.force(np.array(contact.common_depth))) * float(np.median(kept))
     return Assessment(
         grid=grid,
         force=felt * unit,
-        apparent=pressed.force,
-        lower=pressed.force * np.exp(-Z90 * pressed.sd),
-        upper=pressed.force * np.exp(Z90 * pressed.sd),
+        apparent=apparent.force,
+        lower=apparent.force * np.exp(-Z90 * apparent.sd),
+        upper=apparent.force * np.exp(Z90 * apparent.sd),
         stiffness=np.exp(posterior.mean),
         scanned=scanned,
-        background=float(np.median(pressed.force[rest])),
+        background=float(np.median(apparent.force[rest])),
         findings=found,
         noise=observations.noise,
         samples=len(good),
@@ -116,16 +117,13 @@ def surroundings(z: Array, observations: Observations, grid: MapGrid, healthy: F
     """
     level = np.full(z.size, float(np.quantile(z[scanned], 0.4)))
     H = observations.footprint
-    seen = healthy.factor(H)
-    sigma = seen @ seen.T + observations.covariance
     for _ in range(3):
         out = (z - level > np.log(CANDIDATE_RATIO)) & scanned
         wide = binary_dilation(out.reshape(grid.z.shape), iterations=max(1, round(0.005 / grid.pitch))).ravel()
         clear = H @ wide.astype(float) < 0.15
         if clear.sum() < 10:
             return level
-        weights = np.linalg.solve(sigma[np.ix_(clear, clear)], observations.value[clear] - mean)
-        level = mean + healthy.unfold((weights @ seen[clear])[None])[0]
+        level = Surroundings(clear, observations, healthy, mean).mean
     return np.asarray(level)
 
 

@@ -8,7 +8,7 @@ explains, does not count.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,9 +116,12 @@ def find(
     posterior: Posterior,
     observations: Observations,
     healthy: Field,
-    felt: Callable[[Mask], tuple[float, float]],
+    felt: Callable[[Sequence[Mask]], list[tuple[float, float]]],
 ) -> list[StiffArea]:
-    """The findings, most confident first. `felt` gives the log of an area's ratio of apparent stiffness, and its deviation."""
+    """The findings, most confident first.
+
+    `felt` gives the log of each area's ratio of apparent stiffness to its surroundings, and its standard deviation.
+    """
     areas: list[Mask] = []
     for candidate in candidates(excess, grid, reached):
         area = outline(excess, candidate, grid) & reached
@@ -128,12 +131,11 @@ def find(
         return []
     log_ratio, covariance = weigh(areas, posterior, observations, healthy)
     found = []
-    for i, area in enumerate(areas):
+    for i, (area, (middle, sd)) in enumerate(zip(areas, felt(areas), strict=True)):
         probability = confidence(float(log_ratio[i]), float(covariance[i, i]))
         if probability < CONFIDENCE or np.exp(log_ratio[i]) < FINDING_RATIO:
             continue
         weight = grid.area * area
-        middle, sd = felt(area)
         found.append(
             StiffArea(
                 nodes=area,

@@ -120,11 +120,10 @@ class Posterior:
     triangle: Array
     """Lower Cholesky factor of J K J' + R, shape (m, m); above the diagonal it is anything."""
 
-    def sd_of(self, rows: Array, component: Field | None = None) -> Array:
-        """Standard deviation of rows [k, n] times log k_w, shape (k,); or of rows times a component of the prior alone."""
-        own = (component or self.prior).factor(rows)
-        seen = self.seen if component is None else component.factor(self.jacobian)
-        half = solve_triangular(self.triangle, seen @ own.T, lower=True, overwrite_b=True)
+    def sd_of(self, rows: Array) -> Array:
+        """Standard deviation of rows [k, n] times log k_w, shape (k,)."""
+        own = self.prior.factor(rows)
+        half = solve_triangular(self.triangle, self.seen @ own.T, lower=True, overwrite_b=True)
         variance = np.einsum("ij,ij->i", own, own) - np.einsum("ij,ij->j", half, half)
         return np.asarray(np.sqrt(np.maximum(variance, 1e-8)))
 
