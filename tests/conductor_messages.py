@@ -26,6 +26,11 @@ from palpate_conductor.result import RunResult
 
 LESION, FOUND, RADIUS = (-0.05, -0.05), (-0.046, -0.05), 0.03
 P_WA = (0.56, 0.0, 0.93)
+SETTINGS = (
+    f"phantom.lesions=[{{centre_m: [{LESION[0]}, {LESION[1]}], radii_m: [{RADIUS}, {RADIUS}]}}]",
+    "phantom.edge_m=0.01",
+)
+"""Of a scenario with this lesion, whose coarse mesh is quickly pressed."""
 
 
 def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
@@ -57,18 +62,20 @@ def stiffness_map() -> Any:
     vertices, triangles = plane(0.12, 0.005)
     beyond = np.linalg.norm(vertices[:, :2] - FOUND, axis=1) - RADIUS
     stiffness = (1.7e5 * (1 + 3 * np.clip(0.5 - beyond / 0.012, 0, 1))).astype(np.float32)
+    apparent = (1e-5 * stiffness).astype(np.float32)
     return StiffnessMap(
         header=header(60_000_000_000, "abdomen"),
         vertices=vertices.astype(np.float32).ravel(),
         triangles=triangles.ravel(),
-        force=(stiffness * 1.1e-5).astype(np.float32),
+        apparent=apparent,
+        lower=(0.85 * apparent).astype(np.float32),
+        upper=(apparent / 0.85).astype(np.float32),
+        force=(1.1 * apparent).astype(np.float32),
         stiffness=stiffness,
-        stiffness_lower=(0.85 * stiffness).astype(np.float32),
-        stiffness_upper=(stiffness / 0.85).astype(np.float32),
         scanned=(np.abs(vertices[:, :2]) <= 0.105).all(axis=1),
         finding=np.where(beyond < 0, 0, -1).astype(np.int32),
         common_depth=0.01,
-        background=1.7e5,
+        background=1.7,
         samples=400,
     )
 

@@ -199,7 +199,7 @@ def test_an_examination_with_the_fmu_has_the_same_findings(with_native: Examined
     assert len(findings) == len(native_findings) >= 1
     for found, expected in zip(findings, native_findings, strict=True):
         np.testing.assert_allclose(_vector(found.centroid), _vector(expected.centroid), atol=1e-4)
-        assert found.stiffness_ratio == pytest.approx(expected.stiffness_ratio, rel=1e-2)
+        assert found.ratio == pytest.approx(expected.ratio, rel=1e-2)
         assert found.area == pytest.approx(expected.area, rel=1e-2)
 
 

@@ -83,7 +83,7 @@ def test_ones_own_assessment_finds_the_lesion(tmp_path: Path) -> None:
     ran = palpate_run("clean", tmp_path, "--composed", "--no-record", "--service", place, settings=settings)
     assert ran.status == 0, ran.output
     assert ran.report["scores"]["matched"] == 1
-    assert ran.report["scores"]["localisation_error_m"] < 0.02
+    assert ran.report["scores"]["place_error_m"] < 0.02
     assert (tmp_path / "report.html").is_file()
 
 

@@ -64,7 +64,7 @@ def test_released_it_goes_on_where_it_was() -> None:
     (found,), (expected,) = collected.findings.findings, undisturbed.findings.findings
     assert abs(found.centroid.x - expected.centroid.x) < 3e-3
     assert abs(found.centroid.y - expected.centroid.y) < 3e-3
-    assert found.stiffness_ratio == pytest.approx(expected.stiffness_ratio, rel=0.1)
+    assert found.ratio == pytest.approx(expected.ratio, rel=0.1)
 
 
 @pytest.mark.slow

@@ -76,8 +76,8 @@ def evaluate(
 def table(reports: Sequence[dict[str, Any]]) -> Table:
     """One row an examination."""
     rows = Table(
-        "scenario", "seed", "found", "missed", "false", "localised [mm]", "Dice", "band holds", "max force [N]",
-        "depth RMS [mm]", "surface RMS [mm]", "skipped", "real time", box=None,
+        "scenario", "seed", "found", "missed", "not palpable", "false", "place [mm]", "Dice", "ratio off", "band holds",
+        "in lumps", "max force [N]", "depth RMS [mm]", "surface RMS [mm]", "skipped", "real time", box=None,
     )  # fmt: skip
     for report in reports:
         if report["failure"]:
@@ -93,10 +93,13 @@ def table(reports: Sequence[dict[str, Any]]) -> Table:
             str(report["seed"]),
             str(scores["matched"]),
             str(scores["missed"]),
-            str(scores["false_positives"]),
-            figure(scores["localisation_error_m"], 1e3, ".1f"),
+            str(scores["not_palpable"]),
+            str(scores["false_findings"]),
+            figure(scores["place_error_m"], 1e3, ".1f"),
             figure(scores["dice"]),
+            figure(scores["ratio_error"]),
             figure(scores["coverage_90"]),
+            figure(scores["coverage_90_in_lumps"]),
             figure(report["max_force_N"], 1.0, ".1f"),
             figure(report["depth_rms_error_m"], 1e3),
             figure(report["surface_rms_error_m"], 1e3),

@@ -79,17 +79,17 @@ def ticks(reports: Mapping[int, dict[str, Any]]) -> str:
 
 def comparison(reports: Mapping[str, dict[str, Any]]) -> str:
     """A Markdown table of what was found, and how hard and how deep it pressed, one row a runtime."""
-    text = _row("runtime", "found, missed, false", "centre off [mm]", "Dice", "stiffness", "largest force [N]",
+    text = _row("runtime", "found, missed, false", "centre off [mm]", "Dice", "apparent stiffness", "largest force [N]",
                 "depth RMS [mm]", "exam [s]", "wall [s]")  # fmt: skip
     text += _row(*["---"] * 9)
     for name, report in reports.items():
         scores = report["scores"]
         text += _row(
             name,
-            f"{scores['matched']}, {scores['missed']}, {scores['false_positives']}",
-            "" if scores["localisation_error_m"] is None else f"{1e3 * scores['localisation_error_m']:.1f}",
+            f"{scores['matched']}, {scores['missed']}, {scores['false_findings']}",
+            "" if scores["place_error_m"] is None else f"{1e3 * scores['place_error_m']:.1f}",
             "" if scores["dice"] is None else f"{scores['dice']:.2f}",
-            ", ".join(f"{finding['stiffness_ratio']:.2f} x" for finding in report["findings"]),
+            ", ".join(f"{finding['ratio']:.2f} x" for finding in report["findings"]),
             f"{report['max_force_N']:.2f}",
             f"{1e3 * report['depth_rms_error_m']:.3f}",
             f"{report['sim_time_s']:.1f}",

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.report.archive import Evidence
-from palpate.report.evidence import truth_of
 from palpate.report.figures import FORCE_COLOURS, INK, QUIET, STIFFNESS_COLOURS, Drawing, colour_bar, panel_title
+from palpate.report.scoring import Truth
 from palpate_reproduction.render import Viewpoint, picture
 from palpate_reproduction.scene import Moment, Stage
 from palpate_validation import drop
@@ -132,28 +132,28 @@ def force_map(path: Path, evidence: Evidence, samples_xy: NDArray[np.float64]) -
     _save(figure, path)
 
 
-def correlation(path: Path, evidence: Evidence) -> float:
+def correlation(path: Path, evidence: Evidence, truth: Truth | None) -> float:
     """Figure 8: the model with its stiff area on the left, the palpation's result on the right; returns their correlation [1].
 
-    It is that of the logarithms of true and estimated stiffness over the scanned surface.
+    It is that of the logarithms of true and estimated apparent stiffness over the scanned surface.
     """
-    drawing = Drawing(evidence.stiffness_map, evidence.findings, truth_of(evidence.phantom))
+    drawing = Drawing(evidence.stiffness_map, evidence.findings, truth)
     if drawing.true is None:
         raise ValueError("the run knows no truth to compare with")
     figure = _figure(10.5, 4.6)
     left, right = figure.subplots(1, 2)
-    norm = drawing.stiffness_norm
-    image = drawing.plane(left, drawing.true * 1e-3, STIFFNESS_COLOURS, norm)
+    norm = drawing.apparent_norm
+    image = drawing.plane(left, drawing.true, STIFFNESS_COLOURS, norm)
     drawing.outlines(left, truth=True)
-    panel_title(left, "a", "The model", "true stiffness; dashed: true outline, solid: finding")
-    colour_bar(figure, image, left, "$k_w$ [kN/m³]")
-    image = drawing.plane(right, drawing.map.stiffness * 1e-3, STIFFNESS_COLOURS, norm)
+    panel_title(left, "a", "The model", "true apparent stiffness; dashed: where the lump is felt, solid: finding")
+    colour_bar(figure, image, left, "[N]")
+    image = drawing.plane(right, drawing.map.apparent, STIFFNESS_COLOURS, norm)
     drawing.outlines(right, truth=False, labels=True)
-    panel_title(right, "b", "The palpation", "estimated stiffness; solid: finding")
-    colour_bar(figure, image, right, "$k_w$ [kN/m³]")
+    panel_title(right, "b", "The palpation", "estimated apparent stiffness; solid: finding")
+    colour_bar(figure, image, right, "[N]")
     _save(figure, path)
     known = drawing.map.scanned & np.isfinite(drawing.true)
-    return float(np.corrcoef(np.log(drawing.true[known]), np.log(drawing.map.stiffness[known]))[0, 1])
+    return float(np.corrcoef(np.log(drawing.true[known]), np.log(drawing.map.apparent[known]))[0, 1])
 
 
 def coverage(path: Path, names: Sequence[str], evidence: Sequence[Evidence]) -> None:

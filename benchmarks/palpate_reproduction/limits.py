@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from palpate.report.results import Report
+from palpate.report.rows import Report
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ def limits(report: Report, deformation_mm: float, peak_ratio: float) -> list[Lim
     """
     scores, platform = report.scores, report.platform
     dice = "not known" if scores is None or scores.dice is None else f"{scores.dice:.2f}"
-    off = "not known" if scores is None or scores.localisation_error_m is None else f"{1e3 * scores.localisation_error_m:.1f} mm"
+    off = "not known" if scores is None or scores.place_error_m is None else f"{1e3 * scores.place_error_m:.1f} mm"
     held = "not known" if scores is None or scores.coverage_90 is None else f"{100 * scores.coverage_90:.0f} %"
     depth = "not known" if report.depth_rms_error_m is None else f"{1e3 * report.depth_rms_error_m:.2f} mm"
     force = "not known" if report.max_force_N is None else f"{report.max_force_N:.1f} N"

@@ -14,7 +14,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from palpate.report.archive import Evidence, read_evidence
-from palpate.report.page import read_report, sample_places
+from palpate.report.page import known_truth, read_report, sample_places
 from palpate_bus.messages import ExamState
 from palpate_dashboard.replay import recording_of
 from palpate_models.load import load_scenario
@@ -115,7 +115,7 @@ def write(
     figures.phases(images / "figure-6-phases.png", Stage(scenario, rest), shown)
     tell("figures 7 and 8: maps")
     figures.force_map(images / "figure-7-force.png", evidence[0], sample_places(folder))
-    correlation = figures.correlation(images / "figure-8-correlation.png", evidence[0])
+    correlation = figures.correlation(images / "figure-8-correlation.png", evidence[0], known_truth(scenario, evidence[0]))
     figures.coverage(images / "coverage.png", [one.name for one in ways], evidence)
     inside, outside, ratio = _forces(evidence[0])
     factor = next(one.covering_s for one in ways if one.name == "raster, point") / ways[0].covering_s
@@ -152,10 +152,10 @@ def _pressed(rest: Moment, seen: Sequence[Moment]) -> float:
 
 
 def _forces(evidence: Evidence) -> tuple[float, float, float]:
-    """Median force at depth in the findings and outside of them [N], and the highest over the median stiffness [1]."""
+    """Median force at depth in the findings and outside of them [N], and the highest over the median apparent stiffness [1]."""
     message: Any = evidence.stiffness_map
     scanned, member = np.asarray(message.scanned, dtype=np.bool_), np.asarray(message.finding) >= 0
-    force, stiffness = np.asarray(message.force), np.asarray(message.stiffness)[scanned]
+    force, apparent = np.asarray(message.force), np.asarray(message.apparent)[scanned]
     inside = force[scanned & member]
     outside = float(np.median(force[scanned & ~member]))
-    return float(np.median(inside)) if len(inside) else float("nan"), outside, float(stiffness.max() / np.median(stiffness))
+    return float(np.median(inside)) if len(inside) else float("nan"), outside, float(apparent.max() / np.median(apparent))

@@ -92,8 +92,8 @@ class Stage:
         colors = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
         known = moment.stiffness_map
         if known is not None and np.asarray(known.scanned).any():
-            scanned, mean = np.asarray(known.scanned, dtype=bool), np.asarray(known.stiffness, dtype=np.float64)
-            ratio = mean / (known.background if known.background > 0 else float(np.median(mean[scanned])))
+            scanned, apparent = np.asarray(known.scanned, dtype=bool), np.asarray(known.apparent, dtype=np.float64)
+            ratio = apparent / (known.background if known.background > 0 else float(np.median(apparent[scanned])))
             places = apply(self._X_WA, arrays.triples(known.vertices).astype(np.float64))
             skin = palette.packed(palette.SKIN)
             shades = np.where(scanned, palette.stiffness_colors(ratio), skin)

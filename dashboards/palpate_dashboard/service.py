@@ -285,24 +285,21 @@ class DashboardService(Service):
     def _stiffness(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.vertices)
         scanned = np.asarray(message.scanned, dtype=bool)
-        mean = np.asarray(message.stiffness, dtype=np.float64)
+        apparent = np.asarray(message.apparent, dtype=np.float64)
         if not scanned.any():
             return
-        background = message.background if message.background > 0 else float(np.median(mean[scanned]))
-        ratio = mean / background
-        spread = half_width(message.stiffness_lower, message.stiffness_upper)
+        background = message.background if message.background > 0 else float(np.median(apparent[scanned]))
+        ratio = apparent / background
+        spread = half_width(message.lower, message.upper)
         self._map.update(t, vertices, arrays.triples(message.triangles), ratio, spread, scanned)
         self._scene.stiffness(t, apply(self._X_WA, vertices.astype(np.float64)).astype(np.float32), ratio, scanned)
 
     def _findings(self, t: int, message: Message) -> None:
-        lines = [
-            words.finding(f.quadrant, f.stiffness_ratio, f.stiffness_ratio_lower, f.stiffness_ratio_upper, f.area, f.confidence)
-            for f in message.findings
-        ]
+        lines = [words.finding(f.quadrant, f.ratio, f.ratio_lower, f.ratio_upper, f.area, f.confidence) for f in message.findings]
         if lines != self._found:
             self._found = lines
             centroids = arrays.points(f.centroid for f in message.findings)
-            labels = [f"{f.quadrant} {f.stiffness_ratio:.1f} x" for f in message.findings]
+            labels = [f"{f.quadrant} {f.ratio:.1f} x" for f in message.findings]
             self._map.findings(t, centroids, labels)
             self._scene.findings(t, apply(self._X_WA, centroids), labels)
         if message.final:

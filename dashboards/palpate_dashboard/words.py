@@ -29,7 +29,7 @@ LEGEND = """
 
 | elsewhere | |
 |---|---|
-| stiffness map | stiffness over that of the background, seen from the front: the patient's right is on the left |
+| stiffness map | apparent stiffness over that of the background, seen from the front: the patient's right is on the left |
 | uncertainty | half width of the 90 % band over the mean |
 | force over depth | red: the last second; blue: all before; grey line: wanted depth |
 | TRUTH: patient | what no sensor tells: how far the breath lifts the wall, and how far the patient has moved |

@@ -16,6 +16,8 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.truth.pressed import Pressed
+from palpate.truth.touched import Touched
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected
@@ -80,6 +82,10 @@ class Evidence:
     findings: Any | None
     phantom: Any | None
     targets: Any | None
+    touched: Touched
+    """Where the tool was believed to touch the skin, and where it did."""
+    pressed: Pressed | None
+    """What a copy of the patient feels like; None where none can be made."""
 
     def phases(self) -> list[tuple[int, float, float]]:
         """Phase, begin and end [s], in order."""
@@ -101,8 +107,8 @@ def _events(collected: Collected) -> list[Event]:
     return sorted(events, key=lambda event: event.time_s)
 
 
-def write_evidence(path: Path, c: Collected) -> None:
-    """Writes what was collected of a run, complete or not."""
+def write_evidence(path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None) -> None:
+    """Writes what was collected of a run, complete or not, and what is known of its truth."""
     states, contacts = c.exam_states, c.indentation
     events = _events(c)
     columns: dict[str, Any] = {
@@ -124,6 +130,10 @@ def write_evidence(path: Path, c: Collected) -> None:
         message = getattr(c, name)
         if message is not None:
             columns[name] = np.frombuffer(codec.encode(message, kind), dtype=np.uint8)
+    if touched is not None:
+        columns |= {"touched_believed": touched.believed, "touched_true": touched.true}
+    if pressed is not None:
+        columns |= {f"pressed_{name}": values for name, values in vars(pressed).items()}
     np.savez_compressed(path, **columns)
 
 
@@ -161,8 +171,12 @@ def read_evidence(folder: Path) -> Evidence:
         messages: dict[str, Any] = {
             name: codec.decode(held.pop(name).tobytes(), kind) if name in held else None for name, kind in _MESSAGES.items()
         }
+        nowhere = np.empty((0, 3))
+        touched = Touched(held.pop("touched_believed", nowhere), held.pop("touched_true", nowhere))
+        felt = {name: held.pop(f"pressed_{name}") for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in held}
         columns: dict[str, Any] = {k: v.astype(np.float64) if v.dtype == np.float32 else v for k, v in held.items()}
         count = int(columns.pop("target_count"))
-        return Evidence(**columns, target_count=count, events=events, **messages)
+        known: dict[str, Any] = {"touched": touched, "pressed": Pressed(**felt) if felt else None}
+        return Evidence(**columns, **known, target_count=count, events=events, **messages)
     except (KeyError, TypeError, ValueError) as error:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error

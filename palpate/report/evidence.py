@@ -9,10 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.report.scoring import Map, Truth
+from palpate.report.scoring import Found, Map, Truth
+from palpate.truth.felt import Felt
+from palpate.truth.pressed import Pressed
+from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.touched import Touched
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.frames import Array, apply, inverse
+from palpate_models.load import exam_input
+from palpate_models.scenario import Scenario
 
 Mask = NDArray[np.bool_]
 
@@ -50,8 +56,8 @@ class ContactRecord:
     """Depth set-point [m]."""
     force: Array
     """Measured normal force [N]."""
-    position: Array
-    """True rest surface point under the indenter [m], shape (m, 3), in A."""
+    touched: Touched
+    """Rest surface points under the indenter."""
     limited: Mask
     """Depth yields to the force limit."""
 
@@ -61,28 +67,36 @@ def points(message: Any, field: str = "vertices") -> Array:
     return np.asarray(getattr(message, field), dtype=np.float64).reshape(-1, 3)
 
 
-def truth_of(message: Any) -> Truth:
+def body_of(message: Any) -> TrueBody:
     """`palpation_msgs/PhantomTruth`."""
-    return Truth(
-        vertices=points(message.surface),
-        triangles=np.asarray(message.surface.triangles, dtype=np.int32).reshape(-1, 3),
-        stiffness=np.asarray(message.stiffness, dtype=np.float64),
-        background=np.asarray(message.background, dtype=np.float64),
-        lesion=np.asarray(message.lesion, dtype=np.int32),
-        X_WA=pose_matrix(message.pose),
-    )
+    triangles = np.asarray(message.surface.triangles, dtype=np.int32).reshape(-1, 3)
+    return TrueBody(points(message.surface), triangles, pose_matrix(message.pose))
+
+
+def felt_truth(scenario: Scenario, body: TrueBody, pressed: Pressed, touched: Touched) -> Truth:
+    """What is true of a run whose patient was pressed."""
+    felt = Felt(pressed, TrueSurface(body), scenario.exam)
+    return Truth(body, felt, touched, np.array(exam_input(scenario).X_WA))
 
 
 def map_of(message: Any) -> Map:
     """`palpation_msgs/StiffnessMap`."""
     return Map(
         vertices=points(message),
-        stiffness=np.asarray(message.stiffness, dtype=np.float64),
-        lower=np.asarray(message.stiffness_lower, dtype=np.float64),
-        upper=np.asarray(message.stiffness_upper, dtype=np.float64),
+        apparent=np.asarray(message.apparent, dtype=np.float64),
+        lower=np.asarray(message.lower, dtype=np.float64),
+        upper=np.asarray(message.upper, dtype=np.float64),
         scanned=np.asarray(message.scanned, dtype=bool),
         finding=np.asarray(message.finding, dtype=np.int32),
     )
+
+
+def found_of(findings: Any | None) -> list[Found]:
+    """`palpation_msgs/Findings`."""
+    return [
+        Found(np.array((f.centroid.x, f.centroid.y, f.centroid.z)), f.area, f.ratio, (f.ratio_lower, f.ratio_upper))
+        for f in ([] if findings is None else findings.findings)
+    ]
 
 
 def samples_of(messages: list[Any]) -> Samples:
@@ -108,22 +122,20 @@ def peak_force(message: Any) -> float:
     return max(float(message.peak_force), hypot(message.normal_force, message.tangential_force))
 
 
-def centroids_of(findings: Any | None) -> Array:
-    """Centroids of `palpation_msgs/Findings` [m], shape (k, 3)."""
-    found = [] if findings is None else findings.findings
-    return np.array([(f.centroid.x, f.centroid.y, f.centroid.z) for f in found], dtype=np.float64).reshape(-1, 3)
-
-
-def steady_contact(exam_states: list[Any], indentation: list[Any], X_WA: Array) -> ContactRecord:
-    """Exam states that count, with the true contact at the same stamp. `X_WA`: true pose of A in world."""
+def steady_contact(exam_states: list[Any], indentation: list[Any], X_WA: Array, registered_X_WA: Array) -> ContactRecord:
+    """Exam states that count, with the true contact at the same stamp. Poses of A in world: the true and the registered."""
     true = {nanoseconds(m.header.stamp): m for m in indentation}
     pairs = [(s, true[t]) for s in exam_states if s.steady and (t := nanoseconds(s.header.stamp)) in true]
-    place = [(m.surface_point.x, m.surface_point.y, m.surface_point.z) for _, m in pairs]
+
+    def places(messages: list[Any], pose: Array) -> Array:
+        xyz = [(m.surface_point.x, m.surface_point.y, m.surface_point.z) for m in messages]
+        return apply(inverse(pose), np.array(xyz, dtype=np.float64).reshape(-1, 3))
+
     return ContactRecord(
         measured=np.array([s.depth for s, _ in pairs]),
         true=np.array([m.depth for _, m in pairs]),
         wanted=np.array([s.depth_setpoint for s, _ in pairs]),
         force=np.array([s.normal_force for s, _ in pairs]),
-        position=apply(inverse(X_WA), np.array(place, dtype=np.float64).reshape(-1, 3)),
+        touched=Touched(places([s for s, _ in pairs], registered_X_WA), places([m for _, m in pairs], X_WA)),
         limited=np.array([s.force_limited for s, _ in pairs], dtype=bool),
     )

@@ -19,7 +19,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullForm
 from matplotlib.tri import Triangulation
 
 from palpate.report.evidence import Samples, map_of
-from palpate.report.scoring import Map, TrueSurface, Truth
+from palpate.report.scoring import Map, Truth
 from palpate_models.band import half_width
 from palpate_models.frames import Array
 
@@ -28,7 +28,8 @@ QUIET = "#6b7a83"
 FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS = "viridis", "inferno", "cividis"
 _FINDING, _TRUE = "#18e0d0", "#ffffff"
 _SMALL = 8.5
-_LOG_TICKS = [m * 10.0**e for e in range(4) for m in (1, 1.5, 2, 3, 4, 5, 7)]
+APPARENT = "force of the standard press"
+_LOG_TICKS = [m * 10.0**e for e in range(-1, 3) for m in (1, 1.5, 2, 3, 4, 5, 7)]
 
 
 def drawable(message: Any) -> bool:
@@ -52,20 +53,21 @@ class Drawing:
         self.xyz, self.triangles = xyz, triangles
         self.tri = Triangulation(xyz[:, 0], xyz[:, 1], triangles)
         self.true: Array | None = None
-        self.lesion: Array | None = None
+        """Apparent stiffness where the tool truly touched [N], shape (n,)."""
+        self.lump: Array | None = None
+        """1 in the areas of lumps, shape (n,)."""
         if truth is not None:
-            surface = TrueSurface(truth)
-            xy = self.map.vertices[:, :2]
-            self.true = np.exp(surface.of(np.log(truth.stiffness), xy))
-            self.lesion = np.nan_to_num(surface.of((truth.lesion >= 0).astype(float), xy))
+            places = truth.touched.places(self.map.vertices[:, :2])
+            self.true = truth.felt.force(places)
+            self.lump = truth.felt.in_lump(places).astype(float)
 
     @property
-    def stiffness_norm(self) -> LogNorm:
-        """One colour scale [kN/m^3] for the estimate and the truth."""
-        shown = [self.map.stiffness[self.map.scanned]]
+    def apparent_norm(self) -> LogNorm:
+        """One colour scale [N] for the estimate and the truth."""
+        shown = [self.map.apparent[self.map.scanned]]
         if self.true is not None:
             shown.append(self.true[self.map.scanned & np.isfinite(self.true)])
-        values = np.concatenate(shown) * 1e-3
+        values = np.concatenate(shown)
         return LogNorm(float(np.quantile(values, 0.002)), float(np.quantile(values, 0.998)))
 
     def plane(self, axes: Axes, values: Array, cmap: str, norm: Normalize) -> ScalarMappable:
@@ -102,7 +104,7 @@ class Drawing:
         return member
 
     def outlines(self, axes: Axes, truth: bool, labels: bool = False) -> None:
-        """Findings, and the truth's half-contrast outline when asked for and known."""
+        """Findings, and the areas of true lumps when asked for and known."""
         for i, f in enumerate(self.findings):
             member = (self.map.finding == i).astype(float)
             if not member.any():
@@ -112,7 +114,7 @@ class Drawing:
             x, y = f.centroid.x * 1e3, f.centroid.y * 1e3
             axes.plot(x, y, "+", color=_FINDING, ms=9, mew=2, path_effects=[withStroke(linewidth=3.6, foreground=INK)])
             if labels:
-                words = f"{f.stiffness_ratio:.1f} ×\n{f.area * 1e4:.0f} cm²"
+                words = f"{f.ratio:.1f} ×\n{f.area * 1e4:.0f} cm²"
                 axes.annotate(
                     words,
                     (x, y),
@@ -124,9 +126,9 @@ class Drawing:
                     color="white",
                     path_effects=[withStroke(linewidth=2.5, foreground=INK)],
                 )
-        if truth and self.lesion is not None and self.lesion.max() > 0.5:
+        if truth and self.lump is not None and self.lump.max() > 0.5:
             contour = axes.tricontour(
-                self.tri, self.rounded(self.lesion), levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--"
+                self.tri, self.rounded(self.lump), levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--"
             )
             contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
 
@@ -186,32 +188,33 @@ def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -
     half = 100 * half_width(drawing.map.lower, drawing.map.upper)
     image = drawing.plane(spread, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
     drawing.outlines(spread, truth=False)
-    panel_title(spread, "c", "Uncertainty of the stiffness", "half width of the 90 % band")
+    panel_title(spread, "c", "Uncertainty of the apparent stiffness", "half width of the 90 % band")
     colour_bar(figure, image, spread, "± [%]")
 
 
 def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
-    norm = drawing.stiffness_norm
-    estimate = drawing.map.stiffness * 1e-3
+    norm = drawing.apparent_norm
+    estimate = drawing.map.apparent
     flat = figure.add_subplot(grid[1, 0])
     image = drawing.plane(flat, estimate, STIFFNESS_COLOURS, norm)
     drawing.outlines(flat, truth=False, labels=True)
-    level = drawing.background * 1e-3
-    panel_title(flat, "d", "Estimated stiffness $k_w$", f"background {level:.0f} kN/m³; finding outlined")
-    colour_bar(figure, image, flat, "$k_w$ [kN/m³]")
+    panel_title(
+        flat, "d", "Apparent stiffness, estimated", f"{APPARENT}; background {drawing.background:.1f} N; finding outlined"
+    )
+    colour_bar(figure, image, flat, "[N]")
     solid = figure.add_subplot(grid[1, 1], projection="3d")
     drawing.space(solid, drawing.xyz[:, 2], estimate, STIFFNESS_COLOURS, norm, "z [mm]")
     solid.set_box_aspect((1, 1, 0.45), zoom=1.14)
-    panel_title(solid, "e", "Estimated stiffness on the abdomen", "perceived surface")
+    panel_title(solid, "e", "The same on the abdomen", "perceived surface")
     true = figure.add_subplot(grid[1, 2])
     if drawing.true is None:
         true.set_axis_off()
         true.text(0.5, 0.5, "truth not known", ha="center", va="center", color=QUIET, fontsize=13)
         return
-    image = drawing.plane(true, drawing.true * 1e-3, STIFFNESS_COLOURS, norm)
+    image = drawing.plane(true, drawing.true, STIFFNESS_COLOURS, norm)
     drawing.outlines(true, truth=True)
-    panel_title(true, "f", "True stiffness $k_w$", "dashed: true half contrast; solid: finding")
-    colour_bar(figure, image, true, "$k_w$ [kN/m³]")
+    panel_title(true, "f", "Apparent stiffness, true", "dashed: where a lump is felt; solid: finding")
+    colour_bar(figure, image, true, "[N]")
 
 
 def panel_title(axes: Any, letter: str, words: str, small: str) -> None:
@@ -244,7 +247,7 @@ def _summary(drawing: Drawing) -> str:
     if not drawing.findings:
         return "no finding"
     return "; ".join(
-        f"{f.quadrant}, {f.stiffness_ratio:.1f} times stiffer "
-        f"({f.stiffness_ratio_lower:.1f} to {f.stiffness_ratio_upper:.1f}), confidence {_percent(f.confidence)}"
+        f"{f.quadrant}, {f.ratio:.1f} times as stiff "
+        f"({f.ratio_lower:.1f} to {f.ratio_upper:.1f}), confidence {_percent(f.confidence)}"
         for f in drawing.findings
     )

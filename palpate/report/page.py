@@ -18,7 +18,10 @@ from pydantic import ValidationError
 
 from palpate.report import page_figures, page_surface
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
-from palpate.report.results import FindingRow, Report
+from palpate.report.evidence import body_of, felt_truth
+from palpate.report.results import clean_words
+from palpate.report.rows import FindingRow, Report
+from palpate.report.scoring import Truth
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import ScenarioError, exam_input, load_scenario
 from palpate_models.phantom import quadrant
@@ -95,9 +98,17 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
         maps=_image(page_figures.maps(evidence, samples_xy, places)),
         record=_image(page_figures.record(evidence, scenario.limits.force_working_n)),
         force_depth=_image(page_figures.force_depth(evidence)),
-        truth=_image(page_figures.truth(evidence)),
+        truth=_image(page_figures.truth(evidence, known_truth(scenario, evidence))),
+        of_clean_world=clean_words(report),
         version=version("palpate"),
     )
+
+
+def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
+    """What can truly be felt of the patient of a run; None where that is not known."""
+    if evidence.phantom is None or evidence.pressed is None:
+        return None
+    return felt_truth(scenario, body_of(evidence.phantom), evidence.pressed, evidence.touched)
 
 
 def confidence(value: float) -> str:
@@ -122,10 +133,10 @@ def _unreached(report: Report) -> str:
 
 
 def _in_words(f: FindingRow) -> str:
-    low, high = f.stiffness_ratio_90
+    low, high = f.ratio_90
     where = QUADRANTS.get(f.quadrant, f.quadrant)
     return (
-        f"A stiff area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.stiffness_ratio:.1f} times as stiff as the rest "
+        f"A stiff area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
         f"(90 % band {low:.1f} to {high:.1f}), confidence {confidence(f.confidence)}."
     )
 

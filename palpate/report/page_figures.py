@@ -12,7 +12,6 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from palpate.report.archive import Evidence
-from palpate.report.evidence import truth_of
 from palpate.report.figures import (
     FORCE_COLOURS,
     INK,
@@ -24,6 +23,7 @@ from palpate.report.figures import (
     drawable,
     panel_title,
 )
+from palpate.report.scoring import Truth
 from palpate_bus.messages import ExamState
 from palpate_models.band import half_width
 from palpate_models.frames import Array
@@ -87,20 +87,20 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     skipped = f", {len(skipped_xy)} targets skipped (crosses)" if len(skipped_xy) else ""
     panel_title(left, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", f"{len(samples_xy)} samples (dots){skipped}")
     colour_bar(figure, image, left, "force [N]")
-    image = drawing.plane(middle, drawing.map.stiffness / drawing.background, STIFFNESS_COLOURS, _ratio_norm(drawing))
+    image = drawing.plane(middle, drawing.map.apparent / drawing.background, STIFFNESS_COLOURS, _ratio_norm(drawing))
     drawing.outlines(middle, truth=False, labels=True)
-    panel_title(middle, "b", "Stiffness", "times the background; findings outlined")
+    panel_title(middle, "b", "Apparent stiffness", "times the background; findings outlined")
     colour_bar(figure, image, middle, "times background")
     half = 100 * half_width(drawing.map.lower, drawing.map.upper)
     image = drawing.plane(right, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
     drawing.outlines(right, truth=False)
-    panel_title(right, "c", "How sure", "half width of the 90 % band of the stiffness")
+    panel_title(right, "c", "How sure", "half width of the 90 % band of the apparent stiffness")
     colour_bar(figure, image, right, "± [%]")
     return _png(figure)
 
 
 def _ratio_norm(drawing: Drawing) -> LogNorm:
-    ratio = (drawing.map.stiffness / drawing.background)[drawing.map.scanned]
+    ratio = (drawing.map.apparent / drawing.background)[drawing.map.scanned]
     return LogNorm(float(np.quantile(ratio, 0.002)), max(2.0, float(np.quantile(ratio, 0.998))))
 
 
@@ -150,25 +150,25 @@ def force_depth(evidence: Evidence) -> bytes | None:
     return _png(figure)
 
 
-def truth(evidence: Evidence) -> bytes | None:
-    """True stiffness with the findings' outlines, and the error of the depth; None when either is not known."""
+def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
+    """True apparent stiffness with the findings' outlines, and the error of the depth; None when either is not known."""
     message = evidence.stiffness_map
-    if evidence.phantom is None or message is None or not drawable(message):
+    if known is None or message is None or not drawable(message):
         return None
-    drawing = Drawing(message, evidence.findings, truth_of(evidence.phantom))
+    drawing = Drawing(message, evidence.findings, known)
     if drawing.true is None:
         return None
     figure = _figure(15.5, 5.0)
     left, middle, right = figure.subplots(1, 3)
-    image = drawing.plane(left, drawing.true * 1e-3, STIFFNESS_COLOURS, drawing.stiffness_norm)
+    image = drawing.plane(left, drawing.true, STIFFNESS_COLOURS, drawing.apparent_norm)
     drawing.outlines(left, truth=True)
-    panel_title(left, "d", "True stiffness $k_w$", "dashed: true half contrast; solid: finding")
-    colour_bar(figure, image, left, "$k_w$ [kN/m³]")
-    error = 100 * (drawing.map.stiffness / drawing.true - 1)
+    panel_title(left, "d", "Apparent stiffness, true", "dashed: where a lump is felt; solid: finding")
+    colour_bar(figure, image, left, "[N]")
+    error = 100 * (drawing.map.apparent / drawing.true - 1)
     reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
     image = drawing.plane(middle, error, "RdBu_r", Normalize(-reach, reach))
     drawing.outlines(middle, truth=True)
-    panel_title(middle, "e", "Error of the estimate", "estimated over true stiffness, less one")
+    panel_title(middle, "e", "Error of the estimate", "estimated over true apparent stiffness, less one")
     colour_bar(figure, image, middle, "[%]")
     _depth_errors(right, evidence)
     return _png(figure)

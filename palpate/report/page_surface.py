@@ -43,7 +43,7 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     shape = mapped.vertices - mapped.vertices[mapped.scanned].mean(axis=0)
     radius = 0.8 * float(np.linalg.norm(shape[:, :2], axis=1).max())
     force = np.asarray(message.force, dtype=np.float64)
-    ratio = mapped.stiffness / float(message.background)
+    ratio = mapped.apparent / float(message.background)
     known = mapped.scanned
     half = 100 * half_width(mapped.lower, mapped.upper)
     low, high = float(np.quantile(ratio[known], 0.01)), max(2.0, float(np.quantile(ratio[known], 0.99)))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 from rich.table import Table
 
@@ -15,155 +15,70 @@ from palpate.report import archive, scoring
 from palpate.report.evidence import (
     ContactRecord,
     Samples,
-    centroids_of,
+    body_of,
+    felt_truth,
+    found_of,
     map_of,
     peak_force,
     points,
     samples_of,
     steady_contact,
-    truth_of,
 )
 from palpate.report.figures import draw_map
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
+from palpate.report.rows import DepthRow, FindingRow, LumpRow, Report, ScoresRow, TruthRow
+from palpate.truth.pressed import press_patient
+from palpate.truth.surface import TrueBody
+from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunResult
 from palpate_models.frames import apply, inverse
+from palpate_models.load import exam_input
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import Scenario
 
-Point = tuple[float, ...]
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the truth of a run, as far as it is."""
+
+    body: TrueBody | None
+    contact: ContactRecord | None
+    felt: scoring.Truth | None
 
 
-class _Row(BaseModel):
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+def truth_of_run(scenario: Scenario, c: Collected) -> Known:
+    """The truth of a run. It takes seconds to press a patient for the first time."""
+    if c.phantom is None:
+        return Known(None, None, None)
+    body = body_of(c.phantom)
+    contact = steady_contact(c.exam_states, c.indentation, body.X_WA, np.array(exam_input(scenario).X_WA))
+    pressed = press_patient(scenario)
+    return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
 
 
-class FindingRow(_Row):
-    """One stiff area that the examination found."""
-
-    centroid_m: Point
-    """In the abdomen frame [m]: x to the patient's left, y to the head, z outward, from the umbilicus."""
-    quadrant: str
-    area_m2: float
-    """On the surface."""
-    stiffness_ratio: float
-    """Against the rest."""
-    stiffness_ratio_90: tuple[float, float]
-    """Its 90 % band."""
-    confidence: float
-    """Probability that the area is stiffer than healthy variation explains."""
+def clean_world(scenario: Scenario) -> bool:
+    """Whether the patient is still, and nothing is wrong with the equipment but white noise."""
+    phantom = scenario.phantom
+    still = phantom.breathing.kind == "none" and phantom.motion.kind == "none"
+    return still and scenario.errors.clean
 
 
-class LesionRow(_Row):
-    """One lesion of the truth."""
-
-    centroid_m: Point
-    """Of its half-contrast area, xy of the abdomen frame [m]."""
-    quadrant: str
-    area_m2: float
-    stiffness_ratio: float
-    """Mean in its half-contrast area against the same place without it."""
-    scanned: float
-    """Part of it that was scanned."""
-
-
-class TruthRow(_Row):
-    """What the phantom really was."""
-
-    lesions: list[LesionRow]
-
-
-class ScoresRow(_Row):
-    """Findings and map against the truth (scoring.py says how)."""
-
-    localisation_error_m: float | None
-    """Mean over matched lesions; null where there is none."""
-    dice: float | None
-    """Null where there is no lesion."""
-    matched: int
-    missed: int
-    false_positives: int
-    coverage_90: float | None
-    """Part of the scanned area on which the map's 90 % band holds the true stiffness."""
-
-
-class DepthRow(_Row):
-    """RMS depth errors in steady contact [m]; null where there was none."""
-
-    true_against_setpoint_m: float | None
-    """True depth against the set-point: regulation and perception together."""
-    true_against_setpoint_healthy_m: float | None
-    true_against_setpoint_lesion_m: float | None
-    measured_against_true_m: float | None
-    """What the examination believes against the truth: perception alone."""
-    measured_against_true_healthy_m: float | None
-    measured_against_true_lesion_m: float | None
-    force_limited: float | None
-    """Part of the steady time in which depth yielded to the force limit."""
-
-
-class Report(_Row):
-    """report.json."""
-
-    scenario: str
-    seed: int
-    runtime: str
-    """distributed, composed or wallclock."""
-    platform: dict[str, Any]
-    """Operating system, processor, Python and library versions: equal run hashes are promised on one platform only."""
-    sim_time_s: float
-    wall_time_s: float
-    """From the first tick to the last."""
-    real_time_factor: float
-    start_time_s: float
-    """Wall time from the command to the first tick."""
-    run_hash: str | None
-    digests: dict[str, str]
-    """Of each hashed topic: where two runs differ, they say in which."""
-    failure: str | None
-    """Service and cause; null when the run completed."""
-    lost: dict[str, float]
-    """Services that died, with the simulated time at which they fell silent [s]."""
-    samples: int
-    skipped_targets: int
-    max_force_N: float | None
-    """Greatest true contact force of the run, every step of the tissue counted; without a truth, the measured normal force."""
-    mean_force_N: float | None
-    """Mean measured normal force in steady contact."""
-    depth_rms_error_m: float | None
-    """RMS of the true depth against its set-point in steady contact."""
-    depth: DepthRow
-    surface_rms_error_m: float | None
-    """RMS distance of the perceived from the true rest surface in the examined region, along the normal."""
-    assessed: bool
-    """Whether there are findings that are final, though it be none."""
-    findings: list[FindingRow]
-    truth: TruthRow | None
-    scores: ScoresRow | None
-    """Null when the run ended before there was anything to score, or nothing is known of a truth."""
-    blame: dict[str, Any]
-    """Where each service's time goes."""
-    services: dict[str, Any]
-    """What each service says of itself at its end."""
-
-
-def assemble(scenario: Scenario, result: RunResult) -> Report:
+def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     """The report of a run, complete or not."""
     c = result.collected
-    truth = None if c.phantom is None else truth_of(c.phantom)
     found = None if c.stiffness_map is None else map_of(c.stiffness_map)
     final = c.findings if c.findings is not None and c.findings.final else None
-    lesions = [] if truth is None else scoring.true_lesions(truth, scoring.TrueSurface(truth), found)[0]
-    contact = None if truth is None else steady_contact(c.exam_states, c.indentation, truth.X_WA)
-    depth = _depth(contact, truth)
+    depth = _depth(known)
     scores = None
-    if truth is not None and final is not None:
-        scores = ScoresRow.model_validate(vars(scoring.score(centroids_of(final), found, truth)))
+    if known.felt is not None and final is not None:
+        scores = ScoresRow.model_validate(asdict(scoring.score(found_of(final), found, known.felt)))
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
     forces = [peak_force(m) for m in c.indentation] or [s.normal_force for s in c.exam_states if s.in_contact]
     return Report(
         scenario=scenario.name,
         seed=scenario.seed,
+        clean_world=clean_world(scenario),
         runtime=result.runtime,
         platform=fingerprint(),
         sim_time_s=result.sim_time_s,
@@ -180,10 +95,10 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
         mean_force_N=float(steady.mean()) if len(steady) else None,
         depth_rms_error_m=depth.true_against_setpoint_m,
         depth=depth,
-        surface_rms_error_m=_surface(scenario, c.surface, truth),
+        surface_rms_error_m=_surface(scenario, c.surface, known.body),
         assessed=final is not None and found is not None,
         findings=[_finding(f) for f in ([] if final is None else final.findings)],
-        truth=None if truth is None else TruthRow(lesions=[_lesion(lesion) for lesion in lesions]),
+        truth=None if known.body is None else _truth(known.felt),
         scores=scores,
         blame=result.blame,
         services=result.counters,
@@ -193,14 +108,15 @@ def assemble(scenario: Scenario, result: RunResult) -> Report:
 def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:
     """Writes report.json, samples.csv, evidence.npz and, when there is a map, map.png into a run's folder; returns the report."""
     c = result.collected
-    report = assemble(scenario, result)
+    known = truth_of_run(scenario, c)
+    report = assemble(scenario, result, known)
     samples = samples_of(c.samples)
     write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     write_samples(folder / "samples.csv", samples)
-    archive.write_evidence(folder / archive.FILE, c)
+    touched, felt = None if known.contact is None else known.contact.touched, known.felt
+    archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed)
     if c.stiffness_map is not None:
-        truth = None if c.phantom is None else truth_of(c.phantom)
-        draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, truth, f"{scenario.name}, seed {scenario.seed}")
+        draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, known.felt, f"{scenario.name}, seed {scenario.seed}")
     return report
 
 
@@ -226,16 +142,16 @@ def write_samples(path: Path, samples: Samples) -> None:
 
 
 def print_findings(console: Console, report: Report) -> None:
-    """The findings as a table, and one line of scores."""
+    """The findings as a table, and their scores in a line."""
     if report.findings:
-        table = Table("finding", "where (x, y)", "area", "stiffness", "90 % band", "confidence", box=None)
+        table = Table("finding", "where (x, y)", "area", "apparent stiffness", "90 % band", "confidence", box=None)
         for f in report.findings:
             table.add_row(
                 f.quadrant,
                 f"({f.centroid_m[0] * 1e3:+.0f}, {f.centroid_m[1] * 1e3:+.0f}) mm",
                 f"{f.area_m2 * 1e4:.1f} cm²",
-                f"{f.stiffness_ratio:.1f} x",
-                f"{f.stiffness_ratio_90[0]:.1f} to {f.stiffness_ratio_90[1]:.1f}",
+                f"{f.ratio:.1f} x",
+                f"{f.ratio_90[0]:.1f} to {f.ratio_90[1]:.1f}",
                 "over 99 %" if f.confidence > 0.99 else f"{100 * f.confidence:.0f} %",
             )
         console.print(table)
@@ -243,16 +159,28 @@ def print_findings(console: Console, report: Report) -> None:
         console.print("no finding")
     else:
         console.print("not assessed")
-    s = report.scores
-    if s is not None:
-        line = f"against the truth: {s.matched} matched, {s.missed} missed, {s.false_positives} false"
-        if s.localisation_error_m is not None:
-            line += f", localised within {s.localisation_error_m * 1e3:.1f} mm"
-        if s.dice is not None:
-            line += f", Dice {s.dice:.2f}"
-        if s.coverage_90 is not None:
-            line += f", 90 % band holds on {100 * s.coverage_90:.0f} %"
-        console.print(line, highlight=False, soft_wrap=True)
+    if report.scores is not None:
+        console.print(f"against the truth{clean_words(report)}: {in_words(report.scores)}", highlight=False, soft_wrap=True)
+
+
+def clean_words(report: Report) -> str:
+    """A warning that figures are of a clean world, where they are."""
+    return " of a clean world" if report.clean_world else ""
+
+
+def in_words(s: ScoresRow) -> str:
+    """Scores in a line."""
+    parts = [f"{s.matched} matched, {s.missed} missed"]
+    parts += [f"{s.not_palpable} not palpable"] if s.not_palpable else []
+    parts += [f"{s.false_findings} false" + (f" ({s.on_guarding} on guarding)" if s.on_guarding else "")]
+    parts += [f"place within {s.place_error_m * 1e3:.1f} mm"] if s.place_error_m is not None else []
+    parts += [f"Dice {s.dice:.2f}"] if s.dice is not None else []
+    parts += [f"size off by {100 * s.size_error:.0f} %"] if s.size_error is not None else []
+    parts += [f"ratio off by {100 * s.ratio_error:.0f} %"] if s.ratio_error is not None else []
+    if s.coverage_90 is not None:
+        inside = "" if s.coverage_90_in_lumps is None else f" ({100 * s.coverage_90_in_lumps:.0f} % in lumps)"
+        parts += [f"90 % band holds on {100 * s.coverage_90:.0f} %{inside}"]
+    return ", ".join(parts)
 
 
 def _finding(f: Any) -> FindingRow:
@@ -260,43 +188,53 @@ def _finding(f: Any) -> FindingRow:
         centroid_m=(f.centroid.x, f.centroid.y, f.centroid.z),
         quadrant=f.quadrant,
         area_m2=f.area,
-        stiffness_ratio=f.stiffness_ratio,
-        stiffness_ratio_90=(f.stiffness_ratio_lower, f.stiffness_ratio_upper),
+        ratio=f.ratio,
+        ratio_90=(f.ratio_lower, f.ratio_upper),
         confidence=f.confidence,
     )
 
 
-def _lesion(lesion: scoring.TrueLesion) -> LesionRow:
-    x, y = map(float, lesion.centroid)
-    return LesionRow(
-        centroid_m=(x, y),
-        quadrant=quadrant(x, y),
-        area_m2=lesion.area,
-        stiffness_ratio=lesion.ratio,
-        scanned=lesion.scanned,
-    )
+def _truth(truth: scoring.Truth | None) -> TruthRow:
+    if truth is None:
+        return TruthRow(felt=False, lumps=[])
+    rows = []
+    for lump in truth.felt.lumps:
+        x, y = map(float, lump.centroid)
+        rows.append(
+            LumpRow(
+                centroid_m=(x, y),
+                quadrant=quadrant(x, y),
+                area_m2=lump.area,
+                felt_contrast=lump.contrast,
+                palpable=lump.palpable,
+            )
+        )
+    return TruthRow(felt=True, lumps=rows)
 
 
-def _depth(contact: ContactRecord | None, truth: scoring.Truth | None) -> DepthRow:
-    if contact is None or truth is None or not len(contact.true):
+def _depth(known: Known) -> DepthRow:
+    contact = known.contact
+    if contact is None or not len(contact.true):
         return DepthRow(**dict.fromkeys(DepthRow.model_fields))
-    lesion = scoring.lesion_at(truth, contact.position)
-    regulation = scoring.depth_errors(contact.true, contact.wanted, lesion)
-    perception = scoring.depth_errors(contact.measured, contact.true, lesion)
+    in_lump = np.zeros(len(contact.true), dtype=bool)
+    if known.felt is not None:
+        in_lump = known.felt.felt.in_lump(contact.touched.true[:, :2])
+    regulation = scoring.depth_errors(contact.true, contact.wanted, in_lump)
+    perception = scoring.depth_errors(contact.measured, contact.true, in_lump)
     return DepthRow(
         true_against_setpoint_m=regulation["all"],
-        true_against_setpoint_healthy_m=regulation["healthy"],
-        true_against_setpoint_lesion_m=regulation["lesion"],
+        true_against_setpoint_beside_m=regulation["beside"],
+        true_against_setpoint_lump_m=regulation["lump"],
         measured_against_true_m=perception["all"],
-        measured_against_true_healthy_m=perception["healthy"],
-        measured_against_true_lesion_m=perception["lesion"],
+        measured_against_true_beside_m=perception["beside"],
+        measured_against_true_lump_m=perception["lump"],
         force_limited=float(contact.limited.mean()),
     )
 
 
-def _surface(scenario: Scenario, surface: Any | None, truth: scoring.Truth | None) -> float | None:
-    if surface is None or truth is None:
+def _surface(scenario: Scenario, surface: Any | None, body: TrueBody | None) -> float | None:
+    if surface is None or body is None:
         return None
     centre, half = np.array(scenario.exam.centre_m), 0.5 * np.array(scenario.exam.region_m)
-    perceived = apply(inverse(truth.X_WA), points(surface))
-    return scoring.surface_error(perceived, truth, centre - half, centre + half)
+    perceived = apply(inverse(body.X_WA), points(surface))
+    return scoring.surface_error(perceived, body, centre - half, centre + half)

@@ -1,48 +1,30 @@
-"""Scores of findings and map against the truth. Kept apart from whatever makes them: nothing here is seen by the examination.
+"""Scores of findings and map against what can truly be felt. The examination sees nothing of this.
 
-Everything is compared on a fine raster over the map, in the xy plane of the abdomen frame A; areas are on the true surface.
-The truth's mask of a lesion is its half-contrast area. Distances are in xy of A.
+A finding matches a lump when their areas overlap by a Dice coefficient of MATCHING_DICE, or its centroid lies in the lump's area;
+each counts once, so that most match and overlap best. All is compared at the places that the tool truly touched, in the xy plane
+of the abdomen frame A; areas are on the skin. The same rule holds everywhere.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay
 
-from palpate_models.frames import Array
+from palpate.truth.felt import Felt, Lump
+from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.touched import Touched
+from palpate_models.frames import Array, apply
 
-IntArray = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
-RASTER = 0.001
-"""Pitch of the raster [m]."""
-_EDGE_REACH = 0.01
-"""A lesion's edge runs at most so far from its labelled vertices [m]."""
-SCANNED_SHARE = 0.5
-"""A lesion counts, as matched or missed, when this part of it was scanned."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """The phantom, in A."""
-
-    vertices: Array
-    """Rest surface [m], shape (n, 3)."""
-    triangles: IntArray
-    """Shape (m, 3), counter-clockwise seen from outside."""
-    stiffness: Array
-    """k_w [N/m^3], shape (n,)."""
-    background: Array
-    """The same without lesions, shape (n,)."""
-    lesion: IntArray
-    """Index of the lesion in whose half-contrast area a vertex lies, -1 elsewhere, shape (n,)."""
-    X_WA: Array
-    """True pose of A in world, shape (4, 4)."""
+MATCHING_DICE: Final = 0.3
 
 
 @dataclass(frozen=True)
@@ -51,210 +33,218 @@ class Map:
 
     vertices: Array
     """[m], shape (n, 3)."""
-    stiffness: Array
-    """k_w [N/m^3], shape (n,)."""
+    apparent: Array
+    """Apparent stiffness [N], shape (n,)."""
     lower: Array
-    """Of its 90 % band."""
+    """Lower end of its 90 % band [N]."""
     upper: Array
     scanned: Mask
     """Within reach of a sample."""
-    finding: IntArray
+    finding: NDArray[np.int32]
     """Index of the finding that a vertex belongs to, -1 where none."""
 
 
 @dataclass(frozen=True)
-class TrueLesion:
-    """One lesion of the truth."""
+class Found:
+    """A finding as the examination reports it."""
 
     centroid: Array
-    """Of its half-contrast area [m], shape (2,), xy of A."""
+    """[m], shape (3,), in A as registered."""
     area: float
-    """[m^2] on the surface."""
+    """On the surface [m^2]."""
     ratio: float
-    """Mean stiffness in it over that without it [1]."""
-    scanned: float
-    """Part of it that was scanned [1]."""
+    """Apparent stiffness over that of the surroundings [1]."""
+    band: tuple[float, float]
+    """Its 90 % band."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of a run, for its scores."""
+
+    body: TrueBody
+    felt: Felt
+    touched: Touched
+    X_WA: Array
+    """Pose of A in world as registered, shape (4, 4)."""
+
+
+@dataclass(frozen=True)
+class FindingScore:
+    """A finding against the truth."""
+
+    lump: int | None
+    """The lump that it matches."""
+    dice: float | None
+    """Overlap with it."""
+    place_error_m: float | None
+    """Distance of its centroid, where the tool truly touched it, from the lump's, in xy of A."""
+    absolute_error_m: float | None
+    """The same where both are in world, across the outward direction: with the errors of kinematics and registration."""
+    size_error: float | None
+    """Its area over the lump's, less one."""
+    true_ratio: float | None
+    """Felt contrast of all lumps over its area, the mean in logarithms; None without a map."""
+    ratio_error: float | None
+    """Its ratio over the true one, less one."""
+    ratio_held: bool | None
+    """Whether its band holds the true ratio."""
+    on_guarding: bool
+    """Whether it is false and overlaps guarded muscle."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How good findings and map are."""
+    """How good findings and map are. Means are over matched findings, None where there is none."""
 
-    localisation_error_m: float | None
-    """Mean distance of the centroids of matched findings and lesions in xy of A; None where nothing matched."""
-    dice: float | None
-    """Of the findings' and the lesions' areas within the scanned region; None where there is neither."""
     matched: int
     missed: int
-    false_positives: int
+    not_palpable: int
+    """Lumps that nobody could feel by the standard press: neither matched nor missed."""
+    false_findings: int
+    on_guarding: int
+    """Those of them that overlap guarded muscle."""
+    place_error_m: float | None
+    absolute_error_m: float | None
+    dice: float | None
+    size_error: float | None
+    ratio_error: float | None
+    """Mean magnitudes of the errors, as those of size."""
+    ratio_coverage_90: float | None
+    """Part of the matched findings whose own band holds their true ratio."""
     coverage_90: float | None
-    """Part of the scanned area on which the 90 % band holds the true stiffness; None without a map."""
+    """Part of the scanned area on which the map's 90 % band holds the true apparent stiffness; None without a map."""
+    coverage_90_in_lumps: float | None
+    """The same within the areas of lumps."""
+    findings: tuple[FindingScore, ...]
 
 
-class TrueSurface:
-    """The outward (front) side of the true rest surface as functions of xy, in A."""
-
-    def __init__(self, truth: Truth) -> None:
-        corners = truth.vertices[truth.triangles]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        facing = normal[:, 2] > 0.1 * np.linalg.norm(normal, axis=1)
-        front = np.unique(truth.triangles[facing])
-        self._front = front
-        self._mesh = Delaunay(truth.vertices[front, :2])
-        self._height = LinearNDInterpolator(self._mesh, truth.vertices[front, 2])
-        total = np.zeros((len(truth.vertices), 3))
-        for k in range(3):
-            np.add.at(total, truth.triangles[facing, k], normal[facing])
-        self._steepness = LinearNDInterpolator(self._mesh, (np.linalg.norm(total, axis=1)[front] / total[front, 2]))
-
-    def of(self, values: Array, xy: Array) -> Array:
-        """A vertex quantity, shape (n,) or (n, k), at points xy [m], shape (p, 2); NaN off the surface."""
-        return np.asarray(LinearNDInterpolator(self._mesh, values[self._front])(xy))
-
-    def height(self, xy: Array) -> Array:
-        """Height z [m] at points, shape (p,); NaN off the surface."""
-        return np.asarray(self._height(xy))
-
-    def steepness(self, xy: Array) -> Array:
-        """Area of the surface over area in xy at points [1], shape (p,)."""
-        return np.nan_to_num(self._steepness(xy), nan=1.0)
-
-
-def raster(low: Array, high: Array) -> Array:
-    """Points of a raster of pitch RASTER over a rectangle [m], shape (p, 2)."""
-    x = np.arange(low[0] + 0.5 * RASTER, high[0], RASTER)
-    y = np.arange(low[1] + 0.5 * RASTER, high[1], RASTER)
-    xx, yy = np.meshgrid(x, y)
-    return np.column_stack((xx.ravel(), yy.ravel()))
-
-
-def true_lesions(truth: Truth, surface: TrueSurface, scanned: Map | None) -> tuple[list[TrueLesion], list[tuple[Array, Mask]]]:
-    """The truth's lesions and, for each, the raster points and its mask on them."""
-    lesions, masks = [], []
-    for index in range(int(truth.lesion.max(initial=-1)) + 1):
-        inside = truth.lesion == index
-        if not inside.any():
-            continue
-        around = truth.vertices[inside, :2]
-        points = raster(around.min(axis=0) - 0.01, around.max(axis=0) + 0.01)
-        mask = lesion_of(truth, surface, points) == index
-        weight = mask * surface.steepness(points) * RASTER**2
-        area = float(weight.sum())
-        seen = 0.0 if scanned is None else float(weight[_nearest(scanned, points, scanned.scanned)].sum()) / area
-        ratio = truth.stiffness[inside] / truth.background[inside]
-        lesions.append(TrueLesion(weight @ points / area, area, float(ratio.mean()), seen))
-        masks.append((points, np.asarray(mask)))
-    return lesions, masks
-
-
-def lesion_of(truth: Truth, surface: TrueSurface, points: Array) -> IntArray:
-    """The lesion in whose half-contrast area each point [m], shape (p, 2), lies, -1 elsewhere, shape (p,).
-
-    Half contrast: stiffness over background above halfway from 1 to the lesion's greatest. The labelled vertices say which lesion
-    a place belongs to, the interpolated stiffness where its edge runs between them.
-    """
-    owner = np.full(len(points), -1, dtype=np.int32)
-    labelled = np.flatnonzero(truth.lesion >= 0)
-    if not len(labelled):
-        return owner
-    ratio = truth.stiffness / truth.background
-    distance, nearest = cKDTree(truth.vertices[labelled, :2]).query(points, distance_upper_bound=_EDGE_REACH)
-    near = np.flatnonzero(np.isfinite(distance))
-    lesion = truth.lesion[labelled[np.asarray(nearest)[near]]]
-    half = np.zeros(int(truth.lesion.max()) + 1)
-    np.maximum.at(half, truth.lesion[labelled], 0.5 * (1.0 + ratio[labelled]))
-    inside = surface.of(ratio, points[near]) >= half[lesion]
-    owner[near[inside]] = lesion[inside]
-    return owner
-
-
-def score(centroids: Array, found: Map | None, truth: Truth) -> Scores:
-    """Scores of findings with `centroids` [m], shape (k, 2 or 3), in A, and of the map that holds their areas.
-
-    A finding matches a lesion when their areas overlap; each counts once, so that the overlap is greatest. Without a map a
-    finding is no more than a place: it matches the lesion in whose area it lies, and every lesion counts.
-    """
-    surface = TrueSurface(truth)
-    lesions, masks = true_lesions(truth, surface, found)
-    counted = [i for i, lesion in enumerate(lesions) if found is None or lesion.scanned >= SCANNED_SHARE]
-    overlap = np.zeros((len(centroids), len(lesions)))
-    for j, (points, mask) in enumerate(masks):
-        if found is None:
-            for i, centroid in enumerate(centroids):
-                overlap[i, j] = np.linalg.norm(points[mask] - centroid[:2], axis=1).min() <= RASTER
-            continue
-        area = surface.steepness(points) * RASTER**2 * mask
-        owner = _owner(found, points)
-        for i in range(len(centroids)):
-            overlap[i, j] = area[owner == i].sum()
-    rows, columns = linear_sum_assignment(-overlap)
-    pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if overlap[i, j] > 0]
-    errors = [float(np.linalg.norm(centroids[i][:2] - lesions[j].centroid)) for i, j in pairs]
-    hit = {j for _, j in pairs}
+def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores:
+    """Scores of findings and of the map that holds their areas. Without a map a finding is no more than a place."""
+    felt = truth.felt
+    owner = np.full(len(felt.raster), -1) if found_map is None else _owner(found_map, felt.raster)
+    places = truth.touched.places(felt.raster)
+    masks = [owner == i for i in range(len(found))]
+    dice = np.array([[_dice(felt, mask, places, lump) for lump in felt.lumps] for mask in masks])
+    partner = _match(found, dice, truth)
+    excess = felt.excess(places)
+    guarded = felt.inside(felt.guarded, places)
+    rows = []
+    for i, (finding, mask) in enumerate(zip(found, masks, strict=True)):
+        lump = partner.get(i)
+        known = mask & np.isfinite(excess)
+        ratio = float(np.exp(np.average(excess[known], weights=felt.cells[known]))) if known.any() else None
+        on_guarding = lump is None and bool((mask & guarded).any())
+        rows.append(_finding_score(finding, lump, None if lump is None else float(dice[i, lump]), ratio, on_guarding, truth))
+    matched = [row for row in rows if row.lump is not None]
+    palpable = sum(lump.palpable for lump in felt.lumps)
+    held = [row.ratio_held for row in matched]
+    coverage, in_lumps = (None, None) if found_map is None else _coverage(found_map, truth)
     return Scores(
-        localisation_error_m=float(np.mean(errors)) if errors else None,
-        dice=None if found is None else _dice(found, truth, surface),
-        matched=len(pairs),
-        missed=len([j for j in counted if j not in hit]),
-        false_positives=len(centroids) - len(pairs),
-        coverage_90=None if found is None else _coverage(found, truth, surface),
+        matched=len(matched),
+        missed=palpable - len(matched),
+        not_palpable=len(felt.lumps) - palpable,
+        false_findings=len(rows) - len(matched),
+        on_guarding=sum(row.on_guarding for row in rows),
+        place_error_m=_mean([row.place_error_m for row in matched]),
+        absolute_error_m=_mean([row.absolute_error_m for row in matched]),
+        dice=None if found_map is None else _mean([row.dice for row in matched]),
+        size_error=_mean([row.size_error for row in matched]),
+        ratio_error=_mean([row.ratio_error for row in matched]),
+        ratio_coverage_90=_mean([None if h is None else float(h) for h in held]),
+        coverage_90=coverage,
+        coverage_90_in_lumps=in_lumps,
+        findings=tuple(rows),
     )
 
 
-def depth_errors(depth: Array, wanted: Array, in_lesion: Mask) -> dict[str, float | None]:
-    """RMS of `depth` - `wanted` [m], over all and apart for healthy wall and lesions; None where there is nothing."""
+def depth_errors(depth: Array, wanted: Array, in_lump: Mask) -> dict[str, float | None]:
+    """RMS of `depth` - `wanted` [m], over all and apart outside and inside of lumps; None where there is nothing."""
 
     def rms(chosen: Mask) -> float | None:
         return float(np.sqrt(np.mean((depth - wanted)[chosen] ** 2))) if chosen.any() else None
 
-    return {"all": rms(np.ones(len(depth), dtype=bool)), "healthy": rms(~in_lesion), "lesion": rms(in_lesion)}
+    return {"all": rms(np.ones(len(depth), dtype=bool)), "beside": rms(~in_lump), "lump": rms(in_lump)}
 
 
-def surface_error(perceived: Array, truth: Truth, low: Array, high: Array) -> float | None:
+def surface_error(perceived: Array, body: TrueBody, low: Array, high: Array) -> float | None:
     """RMS distance [m] of perceived points, shape (n, 3), in A, from the true rest surface along its normal.
 
     Over the rectangle `low` to `high` [m] of the xy plane; None where no point lies in it.
     """
-    surface = TrueSurface(truth)
+    surface = TrueSurface(body)
     inside = perceived[np.all((perceived[:, :2] >= low) & (perceived[:, :2] <= high), axis=1)]
     rise = inside[:, 2] - surface.height(inside[:, :2])
     distance = (rise / surface.steepness(inside[:, :2]))[np.isfinite(rise)]
     return float(np.sqrt(np.mean(distance**2))) if len(distance) else None
 
 
-def lesion_at(truth: Truth, points: Array) -> Mask:
-    """Whether the vertex nearest to each point [m], shape (n, 3), in A, lies in a lesion's half-contrast area."""
-    return np.asarray(truth.lesion[cKDTree(truth.vertices).query(points)[1]] >= 0)
+def _dice(felt: Felt, mask: Mask, places: Array, lump: Lump) -> float:
+    """Overlap of a finding's area, by its raster points, with a lump's, at the places truly touched."""
+    if not lump.palpable or not mask.any():
+        return 0.0
+    both = float(felt.cells[mask & felt.inside(lump.inside, places)].sum())
+    return 2 * both / (float(felt.cells[mask].sum()) + lump.area)
 
 
-def _dice(found: Map, truth: Truth, surface: TrueSurface) -> float | None:
-    points = raster(found.vertices[:, :2].min(axis=0), found.vertices[:, :2].max(axis=0))
-    points = points[_nearest(found, points, found.scanned)]
-    area = surface.steepness(points)
-    lesion = lesion_of(truth, surface, points) >= 0
-    finding = _owner(found, points) >= 0
-    both = float(area[lesion & finding].sum())
-    total = float(area[lesion].sum() + area[finding].sum())
-    return 2 * both / total if lesion.any() else None
+def _match(found: Sequence[Found], dice: Array, truth: Truth) -> dict[int, int]:
+    """Which lump each matched finding matches."""
+    lumps = truth.felt.lumps
+    if not found or not lumps:
+        return {}
+    centroids = truth.touched.places(np.array([f.centroid[:2] for f in found]))
+    within = np.stack([truth.felt.inside(lump.inside, centroids) for lump in lumps], axis=1)
+    fits = (dice >= MATCHING_DICE) | within
+    rows, columns = linear_sum_assignment(-(fits + 1e-3 * dice))
+    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if fits[i, j]}
 
 
-def _coverage(found: Map, truth: Truth, surface: TrueSurface) -> float | None:
-    xy = found.vertices[found.scanned, :2]
-    true = np.exp(surface.of(np.log(truth.stiffness), xy))
-    weight = np.where(np.isfinite(true), surface.steepness(xy), 0.0)
-    holds = (found.lower[found.scanned] <= true) & (true <= found.upper[found.scanned])
-    return float(weight[holds].sum() / weight.sum()) if weight.sum() > 0 else None
+def _finding_score(
+    finding: Found, index: int | None, dice: float | None, true_ratio: float | None, on_guarding: bool, truth: Truth
+) -> FindingScore:
+    place = absolute = size = None
+    if index is not None:
+        lump = truth.felt.lumps[index]
+        place = float(np.linalg.norm(truth.touched.places(finding.centroid[None, :2])[0] - lump.centroid))
+        size = finding.area / lump.area - 1
+        p_AL = np.append(lump.centroid, truth.felt.surface.height(lump.centroid[None])[0])
+        off = apply(truth.X_WA, finding.centroid[None])[0] - apply(truth.body.X_WA, p_AL[None])[0]
+        outward = truth.body.X_WA[:3, 2]
+        absolute = float(np.linalg.norm(off - (off @ outward) * outward))
+    return FindingScore(
+        lump=index,
+        dice=dice,
+        place_error_m=place,
+        absolute_error_m=absolute,
+        size_error=size,
+        true_ratio=true_ratio,
+        ratio_error=None if true_ratio is None else finding.ratio / true_ratio - 1,
+        ratio_held=None if true_ratio is None else finding.band[0] <= true_ratio <= finding.band[1],
+        on_guarding=on_guarding,
+    )
 
 
-def _nearest(found: Map, points: Array, flag: Mask) -> Mask:
-    """A flag of the map's vertices at points, by the nearest vertex; false farther off than the map's own pitch."""
-    tree = cKDTree(found.vertices[:, :2])
-    pitch = float(np.median(np.asarray(tree.query(found.vertices[:, :2], k=2)[0])[:, 1]))
-    distance, index = tree.query(points)
-    return np.asarray(flag[index] & (distance <= pitch))
+def _coverage(found: Map, truth: Truth) -> tuple[float | None, float | None]:
+    """Part of the scanned area, and of what of it lies in lumps, on which the band holds the true apparent stiffness.
+
+    Where the press ended at its limit the band holds the truth when it reaches as far.
+    """
+    xy = truth.touched.places(found.vertices[found.scanned, :2])
+    true, lower, upper = truth.felt.force(xy), found.lower[found.scanned], found.upper[found.scanned]
+    holds = (upper >= true) & ((lower <= true) | truth.felt.limited(xy))
+    weight = np.where(np.isfinite(true), truth.felt.surface.steepness(xy), 0.0)
+    within = weight * truth.felt.in_lump(xy)
+    whole, part = (float(w[holds].sum() / w.sum()) if w.sum() > 0 else None for w in (weight, within))
+    return whole, part
 
 
-def _owner(found: Map, points: Array) -> IntArray:
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Of the magnitudes; None where there is none."""
+    known = [abs(value) for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _owner(found: Map, points: Array) -> NDArray[np.int32]:
     """The finding that each point belongs to, -1 where none: half level of the interpolated membership."""
     owner = np.full(len(points), -1, dtype=np.int32)
     mesh = Delaunay(found.vertices[:, :2])

@@ -5,16 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from conductor_messages import FOUND, findings, phantom, samples, stiffness_map
+import pytest
+from conductor_messages import FOUND, SETTINGS, collected, findings, samples, stiffness_map
 from matplotlib.image import imread
 
-from palpate.report.evidence import samples_of, truth_of
+from palpate.report.evidence import samples_of
 from palpate.report.figures import draw_map
+from palpate.report.results import truth_of_run
+from palpate.report.scoring import Truth
+from palpate_models.load import load_scenario
 
 
-def test_with_truth_and_finding(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def truth() -> Truth | None:
+    return truth_of_run(load_scenario("clean", SETTINGS, seed=3), collected()).felt
+
+
+def test_with_truth_and_finding(tmp_path: Path, truth: Truth | None) -> None:
     path = tmp_path / "map.png"
-    draw_map(path, stiffness_map(), findings(), samples_of(samples()), truth_of(phantom()), "clean, seed 0")
+    draw_map(path, stiffness_map(), findings(), samples_of(samples()), truth, "clean, seed 0")
     image = imread(path)
     assert image.shape[0] > 1000
     assert image.shape[1] > 1600
@@ -23,9 +32,9 @@ def test_with_truth_and_finding(tmp_path: Path) -> None:
     assert finding.sum() > 400  # outlined
 
 
-def test_without_finding_nothing_is_outlined(tmp_path: Path) -> None:
+def test_without_finding_nothing_is_outlined(tmp_path: Path, truth: Truth | None) -> None:
     path = tmp_path / "map.png"
-    draw_map(path, stiffness_map(), None, samples_of(samples()), truth_of(phantom()), "healthy")
+    draw_map(path, stiffness_map(), None, samples_of(samples()), truth, "healthy")
     image = imread(path)
     finding = np.abs(image[..., :3] - (0x18 / 255, 0xE0 / 255, 0xD0 / 255)).max(axis=-1) < 0.02
     assert finding.sum() < 50

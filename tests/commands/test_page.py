@@ -10,17 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conductor_messages import collected, findings, result
+from conductor_messages import SETTINGS, collected, findings, result
 
 from palpate.report import archive
 from palpate.report.page import verdict, write_page
-from palpate.report.results import assemble, write_results
+from palpate.report.results import Known, assemble, write_results
 from palpate.run.roles import write_scenario_files
 from palpate_models.load import load_scenario
 
 
 def run_folder(folder: Path, **what: object) -> Path:
-    scenario = load_scenario("clean", seed=3)
+    scenario = load_scenario("clean", SETTINGS, seed=3)
     write_scenario_files(scenario, folder)
     failure = what.pop("failure", None)
     ran = result(collected(**what), failure)  # type: ignore[arg-type]
@@ -84,12 +84,14 @@ def test_a_run_that_failed_says_so_first(tmp_path: Path) -> None:
 
 
 def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> None:
-    scenario = load_scenario("clean")
-    whole = assemble(scenario, result(collected(), failure=None)).model_copy(update={"findings": [], "skipped_targets": 0})
+    scenario, nothing = load_scenario("clean"), Known(None, None, None)
+    whole = assemble(scenario, result(collected(), failure=None), nothing).model_copy(
+        update={"findings": [], "skipped_targets": 0}
+    )
     assert verdict(whole) == "No area was found that is stiffer than healthy variation explains."
     blind = verdict(whole.model_copy(update={"skipped_targets": 3}))
     assert blind.endswith("; 3 targets were skipped, and nothing is known of what lies there.")
-    none = assemble(scenario, result(collected(map_too=False), failure=None))
+    none = assemble(scenario, result(collected(map_too=False), failure=None), nothing)
     assert not none.assessed
     assert verdict(none).startswith(f"Not assessed: {none.samples} samples are too few for a map")
 

@@ -1,17 +1,28 @@
-"""Scores against phantoms whose answer is known by geometry."""
+"""Scores against patients whose answer is known by geometry: what presses would feel is made up, the rules are the real ones."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from palpate.report import scoring
-from palpate.report.scoring import Map, Truth
+from palpate.report.scoring import Found, Map, Scores, Truth
+from palpate.truth.felt import Felt
+from palpate.truth.pressed import Pressed
+from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.touched import Touched
+from palpate_models.frames import Array
+from palpate_models.scenario import Exam
 
 CENTRE, RADIUS = np.array((-0.03, -0.02)), 0.03
+EXAM = Exam()
+Disc = tuple[Array, float]
+NOWHERE = Touched(np.empty((0, 3)), np.empty((0, 3)))
 
 
-def plane(half: float = 0.12, pitch: float = 0.005, slope: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def plane(half: float = 0.14, pitch: float = 0.005, slope: float = 0.0) -> tuple[Array, np.ndarray]:
     n = round(2 * half / pitch) + 1
     axis = np.linspace(-half, half, n)
     x, y = np.meshgrid(axis, axis)
@@ -22,140 +33,221 @@ def plane(half: float = 0.12, pitch: float = 0.005, slope: float = 0.0) -> tuple
     return np.column_stack((x.ravel(), y.ravel(), slope * x.ravel())), triangles.astype(np.int32)
 
 
-def disc(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    return np.linalg.norm(points[:, :2] - centre, axis=1) < radius
+def factor(xy: Array, disc: Disc, contrast: float) -> Array:
+    """e rises linearly over 10 mm, and is half of its greatest on the disc's rim."""
+    beyond = np.linalg.norm(xy - disc[0], axis=1) - disc[1]
+    return np.asarray(contrast ** np.clip(0.5 - beyond / 0.010, 0.0, 1.0))
 
 
-def truth(lesions: list[tuple[np.ndarray, float]], slope: float = 0.0, pitch: float = 0.004) -> Truth:
-    vertices, triangles = plane(0.14, pitch, slope)
-    label = np.full(len(vertices), -1, dtype=np.int32)
-    ratio = np.ones(len(vertices))
-    for i, (centre, radius) in enumerate(lesions):
-        beyond = np.linalg.norm(vertices[:, :2] - centre, axis=1) - radius
-        label[beyond < 0] = i
-        ratio = np.maximum(ratio, 1.0 + 3.0 * np.clip(0.5 - beyond / 0.008, 0.0, 1.0))
-    background = np.full(len(vertices), 1.7e5)
-    return Truth(vertices, triangles, background * ratio, background, label, np.eye(4))
+def truth(
+    lumps: Sequence[Disc],
+    contrast: float = 3.0,
+    guarded: Disc | None = None,
+    slope: float = 0.0,
+    touched: Touched = NOWHERE,
+    limited: bool = False,
+) -> Truth:
+    places, _ = plane(0.11, 0.0025, slope)
+    xy = places[:, :2]
+    factors = np.array([factor(xy, lump, contrast) for lump in lumps]).reshape(len(lumps), len(xy))
+    tense = np.ones(len(xy)) if guarded is None else factor(xy, guarded, 2.0)
+    force = 2.0 * tense * factors.prod(axis=0)
+    pressed = Pressed(places, force, np.full(len(xy), limited), 2.0 * tense, force / factors, force / tense)
+    body = TrueBody(*plane(slope=slope), np.eye(4))
+    return Truth(body, Felt(pressed, TrueSurface(body), EXAM), touched, np.eye(4))
 
 
-def found(findings: list[tuple[np.ndarray, float]], factor: float = 1.0, scanned: float = 0.10) -> Map:
+def found_map(findings: Sequence[Disc], off: float = 1.0, scanned: float = 0.10) -> Map:
     vertices, _ = plane(0.12, 0.004)
     finding = np.full(len(vertices), -1, dtype=np.int32)
     for i, (centre, radius) in enumerate(findings):
-        finding[disc(vertices, centre, radius)] = i
-    stiffness = np.full(len(vertices), 1.7e5 * factor)
+        finding[np.linalg.norm(vertices[:, :2] - centre, axis=1) < radius] = i
+    apparent = np.full(len(vertices), 2.0 * off)
     reached = (np.abs(vertices[:, :2]) <= scanned + 1e-9).all(axis=1)
-    return Map(vertices, stiffness, 0.9 * stiffness, 1.1 * stiffness, reached, finding)
+    return Map(vertices, apparent, 0.9 * apparent, 1.1 * apparent, reached, finding)
 
 
-def centroids(findings: list[tuple[np.ndarray, float]]) -> np.ndarray:
-    return np.array([(*c, 0.0) for c, _ in findings]).reshape(-1, 3)
+def found(findings: Sequence[Disc], ratio: float = 2.6) -> list[Found]:
+    return [Found(np.append(c, 0.0), np.pi * r**2, ratio, (0.9 * ratio, 1.1 * ratio)) for c, r in findings]
+
+
+def score(findings: Sequence[Disc], true: Truth) -> Scores:
+    return scoring.score(found(findings), found_map(findings), true)
 
 
 def test_a_perfect_finding() -> None:
-    areas = [(CENTRE, RADIUS)]
-    s = scoring.score(centroids(areas), found(areas), truth(areas))
-    assert (s.matched, s.missed, s.false_positives) == (1, 0, 0)
+    s = score([(CENTRE, RADIUS)], truth([(CENTRE, RADIUS)]))
+    assert (s.matched, s.missed, s.not_palpable, s.false_findings) == (1, 0, 0, 0)
     assert s.dice == pytest.approx(1.0, abs=0.04)  # the map says which vertices, not where the edge runs between
-    assert s.localisation_error_m == pytest.approx(0.0, abs=3e-4)
+    assert s.place_error_m == pytest.approx(0.0, abs=3e-4)
+    assert s.absolute_error_m == pytest.approx(0.0, abs=3e-4)
+    assert s.size_error == pytest.approx(0.0, abs=0.02)
 
 
 def test_a_shifted_finding_has_the_lens_of_two_circles() -> None:
     shift = 0.012
-    areas = [(CENTRE + np.array((shift, 0.0)), RADIUS)]
-    s = scoring.score(centroids(areas), found(areas), truth([(CENTRE, RADIUS)]))
+    s = score([(CENTRE + np.array((shift, 0.0)), RADIUS)], truth([(CENTRE, RADIUS)]))
     half = shift / 2 / RADIUS
     lens = 2 * (np.arccos(half) - half * np.sqrt(1 - half**2)) / np.pi
     assert s.dice == pytest.approx(lens, abs=0.02)
-    assert s.localisation_error_m == pytest.approx(shift, abs=5e-4)
+    assert s.place_error_m == pytest.approx(shift, abs=5e-4)
 
 
-def test_nothing_to_find_and_nothing_found() -> None:
-    s = scoring.score(centroids([]), found([]), truth([]))
-    assert (s.matched, s.missed, s.false_positives) == (0, 0, 0)
-    assert s.dice is None
-    assert s.localisation_error_m is None
+@pytest.mark.parametrize(("lumps", "missed"), [([], 0), ([(CENTRE, RADIUS)], 1)])
+def test_no_finding(lumps: list[Disc], missed: int) -> None:
+    s = score([], truth(lumps))
+    assert (s.matched, s.missed, s.false_findings) == (0, missed, 0)
+    assert (s.dice, s.place_error_m, s.size_error, s.ratio_error, s.ratio_coverage_90) == (None,) * 5
 
 
-def test_a_finding_in_a_healthy_abdomen_is_false() -> None:
-    areas = [(CENTRE, RADIUS)]
-    s = scoring.score(centroids(areas), found(areas), truth([]))
-    assert (s.matched, s.false_positives, s.dice) == (0, 1, None)
+def test_a_finding_where_no_lump_is_felt_is_false() -> None:
+    s = score([(CENTRE, RADIUS)], truth([]))
+    assert (s.matched, s.missed, s.false_findings, s.on_guarding) == (0, 0, 1, 0)
+    assert s.findings[0].true_ratio == pytest.approx(1.0)
+    assert s.findings[0].ratio_held is False
 
 
-def test_a_missed_lesion() -> None:
-    s = scoring.score(centroids([]), found([]), truth([(CENTRE, RADIUS)]))
-    assert (s.matched, s.missed, s.dice, s.localisation_error_m) == (0, 1, 0.0, None)
+def test_a_small_overlap_beside_the_area_is_no_match() -> None:
+    beside = CENTRE + np.array((1.6 * RADIUS, 0.0))
+    s = score([(beside, RADIUS)], truth([(CENTRE, RADIUS)]))
+    assert (s.matched, s.missed, s.false_findings) == (0, 1, 1)
 
 
-def test_two_findings_on_one_lesion_count_once() -> None:
+def test_a_third_of_overlap_is_a_match_though_the_centroid_lies_outside() -> None:
+    """A finding far larger than the lump, and one whose centroid is off: Dice decides."""
+    beside = CENTRE + np.array((1.05 * RADIUS, 0.0))
+    s = score([(beside, RADIUS)], truth([(CENTRE, RADIUS)]))
+    assert s.findings[0].dice == pytest.approx(0.36, abs=0.02)
+    assert s.matched == 1
+
+
+def test_a_centroid_in_the_area_is_a_match_whatever_the_overlap() -> None:
+    small = (CENTRE + np.array((0.01, 0.0)), 0.009)
+    s = score([small], truth([(CENTRE, RADIUS)]))
+    assert s.dice is not None
+    assert s.dice < scoring.MATCHING_DICE
+    assert s.matched == 1
+
+
+def test_two_findings_on_one_lump_count_once() -> None:
     areas = [(CENTRE + np.array((0.014, 0.0)), 0.012), (CENTRE - np.array((0.016, 0.0)), 0.010)]
-    s = scoring.score(centroids(areas), found(areas), truth([(CENTRE, RADIUS)]))
-    assert (s.matched, s.false_positives) == (1, 1)
-    assert s.localisation_error_m == pytest.approx(0.014, abs=1e-3)  # the one with the greater overlap
+    s = score(areas, truth([(CENTRE, RADIUS)]))
+    assert (s.matched, s.missed, s.false_findings) == (1, 0, 1)
+    assert s.place_error_m == pytest.approx(0.014, abs=1e-3)  # the one with the greater overlap
+    assert [row.lump for row in s.findings] == [0, None]
 
 
-def test_findings_are_matched_to_their_own_lesions() -> None:
-    lesions = [(CENTRE, RADIUS), (np.array((0.05, 0.05)), 0.02)]
-    areas = lesions[::-1]
-    s = scoring.score(centroids(areas), found(areas), truth(lesions))
-    assert (s.matched, s.missed, s.false_positives) == (2, 0, 0)
-    assert s.localisation_error_m == pytest.approx(0.0, abs=3e-4)
+def test_one_finding_over_two_lumps_matches_one() -> None:
+    lumps = [(CENTRE - np.array((0.02, 0.0)), 0.015), (CENTRE + np.array((0.02, 0.0)), 0.015)]
+    s = score([(CENTRE, 0.034)], truth(lumps))
+    assert (s.matched, s.missed, s.false_findings) == (1, 1, 0)
 
 
-def test_a_lesion_outside_the_scanned_region_is_not_missed() -> None:
-    s = scoring.score(centroids([]), found([], scanned=0.05), truth([(np.array((0.08, 0.08)), 0.02)]))
-    assert (s.matched, s.missed) == (0, 0)
+def test_findings_are_matched_to_their_own_lumps() -> None:
+    lumps = [(CENTRE, RADIUS), (np.array((0.05, 0.05)), 0.02)]
+    s = score(lumps[::-1], truth(lumps))
+    assert (s.matched, s.missed, s.false_findings) == (2, 0, 0)
+    assert [row.lump for row in s.findings] == [1, 0]
 
 
-@pytest.mark.parametrize(("factor", "coverage"), [(1.0, 1.0), (1.05, 1.0), (1.2, 0.0)])
-def test_coverage_is_the_area_where_the_band_holds(factor: float, coverage: float) -> None:
-    s = scoring.score(centroids([]), found([], factor), truth([]))
-    assert s.coverage_90 == pytest.approx(coverage)
+def test_a_lump_that_nobody_can_feel_is_counted_apart() -> None:
+    s = score([], truth([(CENTRE, RADIUS)], contrast=1.04))
+    assert (s.missed, s.not_palpable) == (0, 1)
+    s = score([(CENTRE, RADIUS)], truth([(CENTRE, RADIUS)], contrast=1.04))
+    assert (s.matched, s.false_findings, s.not_palpable) == (0, 1, 1)
+    assert score([], truth([(CENTRE, RADIUS)], contrast=1.07)).missed == 1
 
 
-def test_coverage_leaves_out_the_lesion_that_the_map_misses() -> None:
-    s = scoring.score(centroids([]), found([]), truth([(CENTRE, RADIUS)]))
-    assert s.coverage_90 == pytest.approx(1 - np.pi * RADIUS**2 / 0.04, abs=0.035)
+def test_a_soft_lump_is_a_lump() -> None:
+    s = score([(CENTRE, RADIUS)], truth([(CENTRE, RADIUS)], contrast=0.5))
+    assert (s.matched, s.missed) == (1, 0)
+    assert s.dice == pytest.approx(1.0, abs=0.04)
+    assert s.findings[0].true_ratio is not None
+    assert s.findings[0].true_ratio < 0.7
 
 
-def test_areas_are_on_the_surface() -> None:
-    lesions, _ = scoring.true_lesions(tilted := truth([(CENTRE, RADIUS)], slope=0.75), scoring.TrueSurface(tilted), None)
-    assert lesions[0].area == pytest.approx(1.25 * np.pi * RADIUS**2, rel=0.03)
-    assert lesions[0].centroid == pytest.approx(CENTRE, abs=3e-4)
-    assert lesions[0].ratio == pytest.approx(4.0, abs=0.4)
+def test_a_finding_on_guarding_is_false_and_told_apart() -> None:
+    guarded = (np.array((0.05, 0.0)), 0.03)
+    s = score([guarded], truth([], guarded=guarded))
+    assert (s.false_findings, s.on_guarding) == (1, 1)
+    away = (np.array((-0.05, 0.0)), 0.02)
+    assert score([away], truth([], guarded=guarded)).on_guarding == 0
+    over_both = truth([guarded], guarded=guarded)
+    assert (score([guarded], over_both).matched, score([guarded], over_both).on_guarding) == (1, 0)
+
+
+def test_findings_are_compared_where_the_tool_truly_touched() -> None:
+    """The arm is 15 mm off: what it found, it found where it was; in the room it says the wrong place."""
+    shift = np.array((0.015, 0.0, 0.0))
+    believed, _ = plane(0.1, 0.01)
+    true = truth([(CENTRE + shift[:2], RADIUS)], touched=Touched(believed, believed + shift))
+    s = score([(CENTRE, RADIUS)], true)
+    assert s.dice == pytest.approx(1.0, abs=0.04)
+    assert s.place_error_m == pytest.approx(0.0, abs=3e-4)
+    assert s.absolute_error_m == pytest.approx(0.015, abs=3e-4)
+
+
+@pytest.mark.parametrize(("off", "coverage"), [(1.0, 1.0), (1.05, 1.0), (1.2, 0.0)])
+def test_coverage_is_the_area_where_the_band_holds(off: float, coverage: float) -> None:
+    s = scoring.score([], found_map([], off), truth([]))
+    assert (s.coverage_90, s.coverage_90_in_lumps) == (pytest.approx(coverage), None)
+
+
+def test_coverage_in_lumps_is_apart() -> None:
+    s = scoring.score([], found_map([]), truth([(CENTRE, RADIUS)]))
+    assert s.coverage_90 == pytest.approx(1 - np.pi * (RADIUS + 0.004) ** 2 / 0.04, abs=0.02)
+    assert s.coverage_90_in_lumps == 0.0
+
+
+def test_a_band_above_a_press_that_ended_at_its_limit_holds() -> None:
+    assert scoring.score([], found_map([], 1.5), truth([], limited=True)).coverage_90 == 1.0
+    assert scoring.score([], found_map([], 0.5), truth([], limited=True)).coverage_90 == 0.0
+
+
+def test_the_ratio_is_held_against_the_felt_contrast_over_the_findings_own_area() -> None:
+    inner = (CENTRE, RADIUS - 0.008)  # where e has its full height
+    for ratio, held in ((3.0, True), (4.0, False)):
+        s = scoring.score(found([inner], ratio), found_map([inner]), truth([(CENTRE, RADIUS)]))
+        assert s.findings[0].true_ratio == pytest.approx(3.0, rel=1e-3)
+        assert s.ratio_error == pytest.approx(ratio / 3.0 - 1, abs=1e-3)
+        assert s.ratio_coverage_90 == float(held)
+
+
+def test_areas_are_on_the_skin() -> None:
+    (lump,) = truth([(CENTRE, RADIUS)], slope=0.75).felt.lumps
+    assert lump.area == pytest.approx(1.25 * np.pi * RADIUS**2, rel=0.01)
+    assert lump.centroid == pytest.approx(CENTRE, abs=3e-4)
+    assert lump.contrast == pytest.approx(3.0, rel=1e-3)
+
+
+def test_a_lumps_area_is_in_one_piece() -> None:
+    """Another place with as much e is not part of it."""
+    both = [(CENTRE, 0.02), (np.array((0.06, 0.05)), 0.019)]
+    true = truth(both)
+    one = Pressed(**{**vars(true.felt.pressed), "alone": true.felt.pressed.healthy[None]})
+    (lump,) = Felt(one, true.felt.surface, EXAM).lumps
+    assert lump.area == pytest.approx(np.pi * 0.02**2, rel=0.02)
+
+
+def test_without_a_map_a_finding_is_a_place_in_a_lumps_area_or_beside_it() -> None:
+    inside, beside = CENTRE + np.array((0.01, 0.0)), CENTRE + np.array((RADIUS + 0.02, 0.0))
+    s = scoring.score(found([(inside, RADIUS), (beside, RADIUS)]), None, truth([(CENTRE, RADIUS)]))
+    assert (s.matched, s.missed, s.false_findings, s.dice, s.coverage_90) == (1, 0, 1, None, None)
+    assert s.place_error_m == pytest.approx(0.01, abs=3e-4)
 
 
 def test_surface_error_is_along_the_normal() -> None:
-    tilted = truth([], slope=0.75)
-    off = tilted.vertices + np.array((0.0, 0.0, 0.001))
+    body = TrueBody(*plane(slope=0.75), np.eye(4))
+    off = body.vertices + np.array((0.0, 0.0, 0.001))
     low, high = np.array((-0.1, -0.1)), np.array((0.1, 0.1))
-    assert scoring.surface_error(off, tilted, low, high) == pytest.approx(0.0008, rel=1e-3)
-    assert scoring.surface_error(off[:0], tilted, low, high) is None
+    assert scoring.surface_error(off, body, low, high) == pytest.approx(0.0008, rel=1e-3)
+    assert scoring.surface_error(off[:0], body, low, high) is None
 
 
-def test_depth_errors_apart_for_healthy_wall_and_lesion() -> None:
+def test_depth_errors_apart_beside_and_in_lumps() -> None:
     wanted = np.full(4, 0.01)
     e = scoring.depth_errors(wanted + np.array((0.001, -0.001, 0.002, 0.002)), wanted, np.array((False, False, True, True)))
-    assert e["healthy"] == pytest.approx(0.001)
-    assert e["lesion"] == pytest.approx(0.002)
+    assert e["beside"] == pytest.approx(0.001)
+    assert e["lump"] == pytest.approx(0.002)
     assert e["all"] == pytest.approx(np.sqrt(2.5e-6))
-    assert scoring.depth_errors(wanted[:0], wanted[:0], np.zeros(0, bool)) == {"all": None, "healthy": None, "lesion": None}
-
-
-def test_the_map_grid_need_not_be_the_truths() -> None:
-    """Dice of the same disc on a 5 mm and a 2.5 mm mesh stays high: the edge is interpolated."""
-    areas = [(CENTRE, RADIUS)]
-    s = scoring.score(centroids(areas), found(areas), truth(areas, pitch=0.005))
-    assert s.dice is not None
-    assert s.dice > 0.96
-
-
-def test_without_a_map_a_finding_is_a_place_in_a_lesion_or_beside_it() -> None:
-    lesions = [(CENTRE, RADIUS)]
-    inside, beside = CENTRE + np.array((0.01, 0.0)), CENTRE + np.array((RADIUS + 0.02, 0.0))
-    s = scoring.score(centroids([(inside, RADIUS), (beside, RADIUS)]), None, truth(lesions))
-    assert (s.matched, s.missed, s.false_positives, s.dice, s.coverage_90) == (1, 0, 1, None, None)
-    assert s.localisation_error_m == pytest.approx(0.01, abs=3e-4)
-    s = scoring.score(centroids([]), None, truth(lesions))
-    assert (s.matched, s.missed, s.false_positives, s.localisation_error_m) == (0, 1, 0, None)
+    assert scoring.depth_errors(wanted[:0], wanted[:0], np.zeros(0, bool)) == {"all": None, "beside": None, "lump": None}

@@ -102,7 +102,7 @@ def assert_same_findings(run: dict[str, Any], local: dict[str, Any]) -> None:
     for found, expected in zip(run["findings"], local["findings"], strict=True):
         assert found["quadrant"] == expected["quadrant"]
         assert found["centroid_m"] == pytest.approx(expected["centroid_m"], abs=2e-3)
-        assert found["stiffness_ratio"] == pytest.approx(expected["stiffness_ratio"], rel=0.1)
+        assert found["ratio"] == pytest.approx(expected["ratio"], rel=0.1)
 
 
 @pytest.mark.docker

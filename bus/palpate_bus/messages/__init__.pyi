@@ -164,9 +164,9 @@ class Finding:
     centroid: Point
     quadrant: str
     area: float
-    stiffness_ratio: float
-    stiffness_ratio_lower: float
-    stiffness_ratio_upper: float
+    ratio: float
+    ratio_lower: float
+    ratio_upper: float
     confidence: float
 
 @dataclass
@@ -336,10 +336,11 @@ class StiffnessMap:
     header: Header
     vertices: NDArray[np.float32]
     triangles: NDArray[np.uint32]
+    apparent: NDArray[np.float32]
+    lower: NDArray[np.float32]
+    upper: NDArray[np.float32]
     force: NDArray[np.float32]
     stiffness: NDArray[np.float32]
-    stiffness_lower: NDArray[np.float32]
-    stiffness_upper: NDArray[np.float32]
     scanned: NDArray[np.bool]
     finding: NDArray[np.int32]
     common_depth: float

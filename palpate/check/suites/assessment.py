@@ -116,27 +116,31 @@ def _findings(rig: Rig, play: Examination, report: ConformanceReport) -> None:
         c = found[0].centroid
         off = float(np.hypot(c.x - STIFF_AT[0], c.y - STIFF_AT[1]))
         report.expect("where it is", off < 0.012, "within 12 mm", f"{off * 1e3:.1f} mm")
-        ratio = found[0].stiffness_ratio
-        report.expect("stiffer than the rest", 1.5 < ratio < 2 * CONTRAST, f"about {CONTRAST:g} x", f"{ratio:.2f} x")
-        band = found[0].stiffness_ratio_lower <= ratio <= found[0].stiffness_ratio_upper
+        ratio = found[0].ratio
+        report.expect("stiffer than its surroundings", 1.3 < ratio < 2 * CONTRAST, f"up to {CONTRAST:g} x", f"{ratio:.2f} x")
+        band = found[0].ratio_lower <= ratio <= found[0].ratio_upper
         report.expect(
             "with a band about its ratio",
             band,
             "lower <= ratio <= upper",
-            f"{found[0].stiffness_ratio_lower:.2f} to {found[0].stiffness_ratio_upper:.2f}",
+            f"{found[0].ratio_lower:.2f} to {found[0].ratio_upper:.2f}",
         )
     last = rig.last(MAP)
     if report.expect("a map comes with them", last is not None, "assessment/map", "there" if last is not None else "none"):
         n = len(last.vertices) // 3
         sizes = {
             n,
-            len(last.stiffness),
-            len(last.stiffness_lower),
-            len(last.stiffness_upper),
+            len(last.apparent),
+            len(last.lower),
+            len(last.upper),
             len(last.force),
             len(last.scanned),
             len(last.finding),
         }
         report.expect("one value a vertex", sizes == {n}, n, sorted(sizes))
-        ordered = bool(np.all(last.stiffness_lower <= last.stiffness)) and bool(np.all(last.stiffness <= last.stiffness_upper))
-        report.expect("bands hold their value", ordered, "lower <= stiffness <= upper", "so" if ordered else "not so")
+        ordered = bool(np.all(last.lower <= last.apparent)) and bool(np.all(last.apparent <= last.upper))
+        report.expect("bands hold their value", ordered, "lower <= apparent <= upper", "so" if ordered else "not so")
+        scanned, member = np.asarray(last.scanned, dtype=bool), np.asarray(last.finding) >= 0
+        rest = float(np.median(last.apparent[scanned & ~member]))
+        near = 0.5 * FORCE_N < rest < 2 * FORCE_N
+        report.expect("in newtons of the standard press", near, f"about {FORCE_N:g} N beside the findings", f"{rest:.2f} N")

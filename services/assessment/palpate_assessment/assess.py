@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
-from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 
-from palpate_assessment.contact import REACH, ReferenceContact
+from palpate_assessment.apparent import FeltRatios, Footprints, Surroundings, apparent_stiffness
+from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.findings import CANDIDATE_RATIO, StiffArea, candidates, find
 from palpate_assessment.grid import MapGrid
-from palpate_assessment.inversion import POWER, Z90, Noise, Observations, estimate_noise, invert, observe, spread_under
+from palpate_assessment.inversion import Z90, Noise, Observations, estimate_noise, invert, observe, spread_under
 from palpate_assessment.prior import HEALTHY, LESION, Field
 from palpate_assessment.sampling import ForceSample
+from palpate_models import press
 from palpate_models.frames import Array
 
 Mask = NDArray[np.bool_]
@@ -34,15 +36,17 @@ class Assessment:
     grid: MapGrid
     force: Array
     """Normal force at the common depth, sliding at the examination's speed [N], shape (n,)."""
-    stiffness: Array
-    """Median of k_w [N/m^3], shape (n,)."""
+    apparent: Array
+    """Apparent stiffness: median of the force of the standard press [N], shape (n,)."""
     lower: Array
-    """Lower end of the 90 % band."""
+    """Lower end of its 90 % band [N]."""
     upper: Array
+    stiffness: Array
+    """Median of k_w, from which they follow [N/m^3], shape (n,)."""
     scanned: Mask
     """Within reach of a sample, shape (n,)."""
     background: float
-    """Robust level of the unremarkable wall [N/m^3]."""
+    """Robust level of the unremarkable wall's apparent stiffness [N]."""
     findings: list[StiffArea]
     noise: Noise
     """What the samples get wrong, as estimated from themselves."""
@@ -82,20 +86,24 @@ def assess(
             observations = replace(observations, noise=estimate_noise(observations, posterior, healthy + lesion))
         posterior = invert(observations, healthy + lesion, mean, posterior.mean, iterations=4)
         background = mean + healthy.times((posterior.weights @ posterior.jacobian)[None])[0]
+    pressed = Footprints(grid, contact, press.DEPTH_M)
     if refine:
-        found = find(posterior.mean - background, grid, scanned, posterior, observations, healthy)
+        ratios = partial(FeltRatios(posterior, observations, healthy, grid, mean), footprints=pressed)
+        found = find(posterior.mean - background, grid, scanned, posterior, observations, healthy, ratios)
+    apparent = apparent_stiffness(posterior, grid, contact, pressed)
     rest = scanned & ~np.any([f.nodes for f in found], axis=0) if found else scanned
-    felt = felt_modulus(posterior.mean, grid, contact)
+    felt = Footprints(grid, contact, contact.common_depth).felt(posterior.mean)
     kept = 1.0 - np.array([s.lost for s in good]) / contact.force(np.array([s.depth for s in good]))
     unit = float(contact.force(np.array(contact.common_depth))) * float(np.median(kept))
     return Assessment(
         grid=grid,
         force=felt * unit,
+        apparent=apparent.force,
+        lower=apparent.force * np.exp(-Z90 * apparent.sd),
+        upper=apparent.force * np.exp(Z90 * apparent.sd),
         stiffness=np.exp(posterior.mean),
-        lower=np.exp(posterior.mean - Z90 * posterior.sd),
-        upper=np.exp(posterior.mean + Z90 * posterior.sd),
         scanned=scanned,
-        background=float(np.exp(np.median(posterior.mean[rest]))),
+        background=float(np.median(apparent.force[rest])),
         findings=found,
         noise=observations.noise,
         samples=len(good),
@@ -109,16 +117,13 @@ def surroundings(z: Array, observations: Observations, grid: MapGrid, healthy: F
     """
     level = np.full(z.size, float(np.quantile(z[scanned], 0.4)))
     H = observations.footprint
-    seen = healthy.factor(H)
-    sigma = seen @ seen.T + observations.covariance
     for _ in range(3):
         out = (z - level > np.log(CANDIDATE_RATIO)) & scanned
         wide = binary_dilation(out.reshape(grid.z.shape), iterations=max(1, round(0.005 / grid.pitch))).ravel()
         clear = H @ wide.astype(float) < 0.15
         if clear.sum() < 10:
             return level
-        weights = np.linalg.solve(sigma[np.ix_(clear, clear)], observations.value[clear] - mean)
-        level = mean + healthy.unfold((weights @ seen[clear])[None])[0]
+        level = Surroundings(clear, observations, healthy, mean).mean
     return np.asarray(level)
 
 
@@ -132,15 +137,3 @@ def lesion_envelope(excess: Array, grid: MapGrid, scanned: Mask) -> Array:
     about = binary_dilation(about, iterations=max(1, round(0.012 / grid.pitch)))
     soft = gaussian_filter(about.astype(float), 0.006 / grid.pitch)
     return np.asarray(_QUIET + (1.0 - _QUIET) * soft.ravel())
-
-
-def felt_modulus(z: Array, grid: MapGrid, contact: ReferenceContact) -> Array:
-    """The modulus that the indenter's footprint averages at each node [N/m^3], shape (n,)."""
-    n = int(np.ceil(REACH / grid.pitch))
-    axis = np.arange(-n, n + 1) * grid.pitch
-    r, weight = contact.footprint(contact.common_depth, grid.pitch)
-    kernel = np.interp(np.hypot(*np.meshgrid(axis, axis)), r, weight, right=0.0)
-    power = np.exp(POWER * z).reshape(grid.z.shape)
-    padded = np.pad(power, n, mode="edge")
-    total: Array = fftconvolve(padded, np.asarray(kernel / kernel.sum(), dtype=np.float64), mode="valid")
-    return np.asarray(total.ravel() ** (1.0 / POWER))

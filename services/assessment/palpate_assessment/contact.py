@@ -14,8 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
+from scipy.signal import lfilter
 from scipy.special import k0, k0e, k1, k1e
 
+from palpate_models import press
 from palpate_models.frames import Array
 from palpate_models.patient import Stiffness
 
@@ -23,6 +25,9 @@ _PIXEL = 0.0005
 """Raster on which footprints and overlaps are integrated [m]; halving it changes them by less than 0.5 %."""
 REACH = 0.048
 """Radius beyond which a footprint is cut [m]: it holds more than 99.5 % of it at 20 mm depth."""
+
+_PRESS_STEP_S = 0.001
+"""Step in which the relaxation under a press is summed [s]."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +126,21 @@ class ReferenceContact:
         flat = np.exp(np.interp(np.log(d), self._log_depths, self._log_force))
         exponent = np.interp(d, self._depths, self._radius_exponent)
         return np.asarray(flat * np.maximum(1.0 + self.sphere * np.asarray(curvature), 0.5) ** -exponent)
+
+    def press_force(self, curvature: Array) -> Array:
+        """What the standard press feels, over k_w [m^3], on a surface of mean curvature [1/m], shape (n,).
+
+        The instantaneous force at its depth, less what the wall has relaxed on the way there and while it was held:
+        1 - sum g_i / tau_i int exp(-(t - s) / tau_i) f(d(s)) / f(d) ds, the mean over the time in which it is read.
+        """
+        at = press.times(_PRESS_STEP_S)
+        pressed = self.force(press.depths(at)) / self.force(np.array(press.DEPTH_M))
+        lost = np.zeros_like(at)
+        for g, tau in zip(self.material.prony_g, self.material.prony_tau_s, strict=True):
+            decay = np.exp(-_PRESS_STEP_S / tau)
+            lost += lfilter([g * (1 - decay)], [1, -decay], pressed)
+        read = at > press.DURATION_S - press.READ_S
+        return self.force(np.array(press.DEPTH_M), curvature) * float((pressed - lost)[read].mean())
 
     def exponent(self, depth: Array) -> Array:
         """Local exponent d log F / d log depth [1]."""

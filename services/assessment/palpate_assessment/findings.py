@@ -8,6 +8,7 @@ explains, does not count.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ Mask = NDArray[np.bool_]
 CANDIDATE_RATIO = 1.5
 """Stiffness over the local background from which an area is looked at."""
 FINDING_RATIO = 1.8
-"""Stiffness over the local background that a finding must have: 2.5 healthy standard deviations and more above it."""
+"""Modulus over the local background that a finding must have: 2.5 healthy standard deviations and more above it."""
 SMALLEST = 2.5e-4
 """Area of the smallest finding [m^2], 9 mm in radius: smaller ones are below what the footprint (14 mm) lets be told."""
 CONFIDENCE = 0.95
@@ -53,7 +54,7 @@ class StiffArea:
     area: float
     """On the surface [m^2]."""
     ratio: float
-    """Stiffness against the rest [1]."""
+    """Apparent stiffness against the surroundings [1]."""
     ratio_lower: float
     """Lower end of the 90 % band."""
     ratio_upper: float
@@ -109,9 +110,18 @@ def confidence(log_ratio: float, variance: float) -> float:
 
 
 def find(
-    excess: Array, grid: MapGrid, reached: Mask, posterior: Posterior, observations: Observations, healthy: Field
+    excess: Array,
+    grid: MapGrid,
+    reached: Mask,
+    posterior: Posterior,
+    observations: Observations,
+    healthy: Field,
+    felt: Callable[[Sequence[Mask]], list[tuple[float, float]]],
 ) -> list[StiffArea]:
-    """The findings, most confident first."""
+    """The findings, most confident first.
+
+    `felt` gives the log of each area's ratio of apparent stiffness to its surroundings, and its standard deviation.
+    """
     areas: list[Mask] = []
     for candidate in candidates(excess, grid, reached):
         area = outline(excess, candidate, grid) & reached
@@ -121,9 +131,8 @@ def find(
         return []
     log_ratio, covariance = weigh(areas, posterior, observations, healthy)
     found = []
-    for i, area in enumerate(areas):
-        sd = float(np.sqrt(covariance[i, i]))
-        probability = confidence(float(log_ratio[i]), sd**2)
+    for i, (area, (middle, sd)) in enumerate(zip(areas, felt(areas), strict=True)):
+        probability = confidence(float(log_ratio[i]), float(covariance[i, i]))
         if probability < CONFIDENCE or np.exp(log_ratio[i]) < FINDING_RATIO:
             continue
         weight = grid.area * area
@@ -132,9 +141,9 @@ def find(
                 nodes=area,
                 centroid=weight @ grid.nodes / weight.sum(),
                 area=float(weight.sum()),
-                ratio=float(np.exp(log_ratio[i])),
-                ratio_lower=float(np.exp(log_ratio[i] - Z90 * sd)),
-                ratio_upper=float(np.exp(log_ratio[i] + Z90 * sd)),
+                ratio=float(np.exp(middle)),
+                ratio_lower=float(np.exp(middle - Z90 * sd)),
+                ratio_upper=float(np.exp(middle + Z90 * sd)),
                 confidence=probability,
             )
         )

@@ -120,11 +120,12 @@ class Posterior:
     triangle: Array
     """Lower Cholesky factor of J K J' + R, shape (m, m); above the diagonal it is anything."""
 
-    @cached_property
-    def sd(self) -> Array:
-        """Shape (n,). It costs as much as an iteration, and only a map that is shown wants it."""
-        half = solve_triangular(self.triangle, self.prior.unfold(self.seen), lower=True, overwrite_b=True)
-        return np.asarray(np.sqrt(np.maximum(self.prior.variance - np.einsum("ij,ij->j", half, half), 1e-8)))
+    def sd_of(self, rows: Array) -> Array:
+        """Standard deviation of rows [k, n] times log k_w, shape (k,)."""
+        own = self.prior.factor(rows)
+        half = solve_triangular(self.triangle, self.seen @ own.T, lower=True, overwrite_b=True)
+        variance = np.einsum("ij,ij->i", own, own) - np.einsum("ij,ij->j", half, half)
+        return np.asarray(np.sqrt(np.maximum(variance, 1e-8)))
 
 
 def reference_force(samples: Sequence[ForceSample], contact: ReferenceContact, curvature: Array) -> Array:

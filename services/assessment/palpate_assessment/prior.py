@@ -55,14 +55,11 @@ class Field:
         """`envelope`: factor on the standard deviation at each node, shape (ny * nx,)."""
         self._shape = grid.z.shape
         self._parts = [_Part(grid, components, envelope)]
-        squared = np.ones(grid.z.size) if envelope is None else envelope**2
-        self.variance: Array = sum(c.sd**2 for c in components) * squared
 
     def __add__(self, other: Field) -> Field:
         """The sum of two independent fields on the same grid."""
         both = copy(self)
         both._parts = self._parts + other._parts
-        both.variance = self.variance + other.variance
         return both
 
     def times(self, rows: Array) -> Array:

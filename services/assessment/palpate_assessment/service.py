@@ -157,17 +157,18 @@ def sample_message(sample: ForceSample) -> Message:
 
 def map_message(t: int, result: Assessment, common_depth: float) -> Message:
     """`palpation_msgs/StiffnessMap`."""
-    finding = np.full(len(result.stiffness), -1, dtype=np.int32)
+    finding = np.full(len(result.apparent), -1, dtype=np.int32)
     for i, area in enumerate(result.findings):
         finding[area.nodes] = i
     return StiffnessMap(
         header=header(t, FRAME),
         vertices=result.grid.nodes.astype(np.float32).reshape(-1),
         triangles=result.grid.triangles.reshape(-1),
+        apparent=result.apparent.astype(np.float32),
+        lower=result.lower.astype(np.float32),
+        upper=result.upper.astype(np.float32),
         force=result.force.astype(np.float32),
         stiffness=result.stiffness.astype(np.float32),
-        stiffness_lower=result.lower.astype(np.float32),
-        stiffness_upper=result.upper.astype(np.float32),
         scanned=result.scanned,
         finding=finding,
         common_depth=common_depth,
@@ -188,8 +189,8 @@ def finding_message(area: StiffArea) -> Message:
         centroid=Point(x, y, z),
         quadrant=quadrant(x, y),
         area=area.area,
-        stiffness_ratio=area.ratio,
-        stiffness_ratio_lower=area.ratio_lower,
-        stiffness_ratio_upper=area.ratio_upper,
+        ratio=area.ratio,
+        ratio_lower=area.ratio_lower,
+        ratio_upper=area.ratio_upper,
         confidence=area.confidence,
     )

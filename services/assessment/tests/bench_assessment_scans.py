@@ -15,15 +15,18 @@ import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from palpate.report.evidence import centroids_of, map_of
+from palpate.report.evidence import felt_truth, found_of, map_of
 from palpate.report.scoring import Scores, Truth, score
+from palpate.truth.pressed import press_patient
+from palpate.truth.surface import TrueBody
+from palpate.truth.touched import Touched
 from palpate_assessment.service import AssessmentService
 from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.stamps import header
 from palpate_models.frames import Array, apply, matrix
 from palpate_models.load import exam_input, true_pose
 from palpate_models.patient import Lesion, Phantom
-from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.phantom import build_phantom
 from palpate_models.phantom.field import gaussian_field
 from palpate_models.scenario import Mode, Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue as Tissue
@@ -51,18 +54,22 @@ class FakeInbox:
 
 @dataclass(frozen=True)
 class Scan:
-    """Measured states of one examination, and the truth."""
+    """Measured states of one examination."""
 
     scenario: Scenario
     surface: Any
     """`perception/surface`."""
     states: list[Any]
     """`exam/state` each 10 ms, the last in phase ASSESS."""
-    truth: Truth
 
 
-def phantom_truth(model: PhantomModel, X_WA: Array) -> Truth:
-    return Truth(model.vertices, model.triangles, model.stiffness, model.background, model.lesion, X_WA)
+def truth_of(scenario: Scenario) -> Truth:
+    """What can truly be felt. The sphere is laterally where it is believed to be."""
+    model = build_phantom(scenario.phantom, scenario.seed)
+    body = TrueBody(model.vertices, model.triangles, matrix(true_pose(scenario)))
+    pressed = press_patient(scenario)
+    assert pressed is not None
+    return felt_truth(scenario, body, pressed, Touched(np.empty((0, 3)), np.empty((0, 3))))
 
 
 def snake(region: tuple[float, float], spacing: float, speed: float, dt: float) -> Iterator[tuple[Array, Array]]:
@@ -146,7 +153,7 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
             tissue.step(float(times[-1] + tissue.dt * k), p[-1] + n[-1] * 0.1, zero, robot.indenter_radius_m)
         states.append(_state(times[-1] + 0.05, p[-1], n[-1], -0.08, 0.0, False, X_WA))
     states.append(_state(times[-1] + 1.0, p[-1], n[-1], -0.08, 0.0, False, X_WA, phase=ExamState.PHASE_ASSESS))
-    return Scan(scenario, surface, states, phantom_truth(model, X_WA))
+    return Scan(scenario, surface, states)
 
 
 def _state(
@@ -193,7 +200,7 @@ def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
 def scored(data: Scan) -> Scores:
     """The scores of what the service makes of a scan."""
     stiffness_map, findings, _ = examine(data)
-    return score(centroids_of(findings), None if stiffness_map is None else map_of(stiffness_map), data.truth)
+    return score(found_of(findings), None if stiffness_map is None else map_of(stiffness_map), truth_of(data.scenario))
 
 
 def scenario_with(lesions: tuple[Lesion, ...], seed: int) -> Scenario:
@@ -227,17 +234,20 @@ def main(seeds: int) -> None:
             s = scored(scan(scenario_with(lesions(seed), seed)))
             rows.append(s)
             print(f"{kind:9} {seed:3}  {s}  {time.process_time() - begin:.1f} s", flush=True)
-        errors = [s.localisation_error_m for s in rows if s.localisation_error_m is not None]
-        dices = [s.dice for s in rows if s.dice is not None]
         print(
-            f"== {kind}: {seeds} scans, missed {sum(s.missed for s in rows)}, "
-            f"false positives {sum(s.false_positives for s in rows)}, "
-            f"localisation {1e3 * np.mean(errors or [np.nan]):.1f} mm (worst {1e3 * np.max(errors or [np.nan]):.1f}), "
-            f"Dice {np.mean(dices or [np.nan]):.3f} (worst {np.min(dices or [np.nan]):.3f}), "
-            f"coverage {np.mean([s.coverage_90 for s in rows]):.3f} "
-            f"({np.min([s.coverage_90 for s in rows]):.2f} to {np.max([s.coverage_90 for s in rows]):.2f})",
+            f"== {kind}: {seeds} scans, missed {sum(s.missed for s in rows)}, false {sum(s.false_findings for s in rows)}, "
+            f"place {_spread([s.place_error_m for s in rows], 1e3)} mm, Dice {_spread([s.dice for s in rows])}, "
+            f"ratio off {_spread([s.ratio_error for s in rows])}, band holds {_spread([s.coverage_90 for s in rows])}, "
+            f"in lumps {_spread([s.coverage_90_in_lumps for s in rows])}, "
+            f"own ratio {_spread([s.ratio_coverage_90 for s in rows])}",
             flush=True,
         )
+
+
+def _spread(values: list[float | None], scale: float = 1.0) -> str:
+    """Mean, least and greatest."""
+    known = [scale * value for value in values if value is not None]
+    return f"{np.mean(known):.3g} ({min(known):.3g} to {max(known):.3g})" if known else "-"
 
 
 if __name__ == "__main__":

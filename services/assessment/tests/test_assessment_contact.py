@@ -9,6 +9,7 @@ from palpate_assessment.contact import REACH, ReferenceContact, static_contact
 from palpate_assessment.memory import PathMemory
 from palpate_models.patient import Lesion, Stiffness
 from palpate_models.phantom.flat import flat_phantom
+from palpate_models.press import apparent_stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue as Tissue
 
 K_W = 1.7e5
@@ -103,6 +104,15 @@ def test_the_wall_forgets_what_was_far_away() -> None:
     for k in range(1, 101):
         memory.add(0.01 * k, 0.01, np.zeros(3), 0.010)
     assert memory.lost(1.0, np.array((0.1, 0.0, 0.0))) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_nominal_press_is_what_the_real_wall_answers() -> None:
+    wall = Tissue(flat_phantom(0.10))
+    felt = apparent_stiffness(wall.press(np.zeros((1, 3)), np.array(((0.0, 0.0, 1.0),)), 0.015))[0]
+    flat = ReferenceContact(0.015, 0.010).press_force(np.zeros(1))
+    assert K_W * flat == pytest.approx(felt, rel=0.02)
+    convex = ReferenceContact(0.015, 0.010).press_force(np.array((5.0,)))
+    assert convex < flat
 
 
 def test_footprint_predicts_what_a_lesion_does_to_the_force() -> None:

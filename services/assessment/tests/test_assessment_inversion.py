@@ -70,7 +70,7 @@ def test_the_band_holds_the_truth_as_often_as_it_says() -> None:
         prior = Field(grid, (BACKGROUND, *LESION[1:]))
         posterior = invert(observe(noisy, grid, CONTACT, noise), prior, MEAN, iterations=12)
         inside = np.abs(grid.nodes[:, :2]).max(axis=1) < 0.05
-        holds.append((np.abs(posterior.mean - z) < 1.6449 * posterior.sd)[inside].mean())
+        holds.append((np.abs(posterior.mean - z) < 1.6449 * posterior.sd_of(np.eye(len(z))))[inside].mean())
     assert 0.85 < np.mean(holds) < 0.95
 
 

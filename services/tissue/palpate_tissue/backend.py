@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models import press
 from palpate_models.breathing import BreathingCurve
 from palpate_models.frames import Array
 from palpate_models.guarding import Activation
@@ -42,6 +43,28 @@ class TissueBackend(ABC):
     @abstractmethod
     def idle(self, t_s: float) -> None:
         """Advances by one period to time `t_s` [s] with no sphere anywhere."""
+
+    @abstractmethod
+    def settle(self) -> None:
+        """Brings the body to rest: as if nothing had ever touched it."""
+
+    def press(self, places: Array, normals: Array, radius: float) -> Array:
+        """Standard presses with a sphere of `radius` [m], each into the body at rest: forces along the normals [N], shape (k, n).
+
+        `places` [m] on the skin at rest and outward unit `normals` there, shape (k, 3); n are the press's steps. The body is at
+        rest afterwards. Faster ways to do the same are the subclass's.
+        """
+        at = press.times(self.dt)
+        depths = press.depths(at)
+        speeds = np.diff(depths, prepend=0.0) / self.dt
+        forces = np.empty((len(places), len(at)))
+        for k, (place, normal) in enumerate(zip(places, normals, strict=True)):
+            self.settle()
+            for i, depth in enumerate(depths):
+                force, _ = self.step(float(at[i]), place + (radius - depth) * normal, -speeds[i] * normal, radius)
+                forces[k, i] = force @ normal
+        self.settle()
+        return forces
 
     @property
     @abstractmethod

@@ -35,7 +35,8 @@ class TissueService(Service):
 
     def __init__(self, backend: TissueBackend, truth: PhantomModel, pose: Pose, facts: Mapping[str, Any]) -> None:
         """A tissue whose true stiffness is that of `truth`, at its true pose in world; `facts` are for log and report."""
-        self._tissue = backend
+        self.backend = backend
+        """The physics."""
         self._truth = truth
         self._facts = {"vertices": len(truth.vertices), **facts}
         topics = contract().topics
@@ -88,7 +89,7 @@ class TissueService(Service):
             outbox["truth/indentation"] = self._indentation(t, tool, F_W[:3])
             self._peak_n, self._recent_peak_n = max(self._peak_n, self._recent_peak_n), 0.0
         if t % self._patient_period == 0:
-            outbox["truth/patient"] = PatientTruth(header(t, "world"), self._tissue.excursion(t / NS), self._lies)
+            outbox["truth/patient"] = PatientTruth(header(t, "world"), self.backend.excursion(t / NS), self._lies)
         if outbox:
             yield outbox
 
@@ -104,20 +105,20 @@ class TissueService(Service):
     def _wrench(self, t: int, tool: Message | None) -> Array:
         """Steps the tissue to `t` [ns]; force [N] and torque [N m] on the indenter, about its centre, world axes, shape (6,)."""
         if tool is None:
-            self._tissue.idle(t / NS)
+            self.backend.idle(t / NS)
             return np.zeros(6)
         p, v, w = tool.pose.position, tool.twist.linear, tool.twist.angular
         motion_W = np.array((p.x, p.y, p.z, 1.0, v.x, v.y, v.z, 0.0, w.x, w.y, w.z, 0.0)).reshape(3, 4)
         self._p_A, v_A, w_A = motion_W.dot(self._transposed_X_AW)  # `dot` takes a third of the time of `@`
-        F_A = self._tissue.step(t / NS, self._p_A, v_A, float(tool.radius), w_A)
-        if not self._tissue.touching:
+        F_A = self.backend.step(t / NS, self._p_A, v_A, float(tool.radius), w_A)
+        if not self.backend.touching:
             return np.zeros(6)
         F_W: Array = np.array(F_A).dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
         return F_W
 
     def _count(self, F_W: Array) -> None:
         """Counts the step and the force on the indenter."""
-        touching = self._tissue.touching
+        touching = self.backend.touching
         if touching:
             self._contact_steps += 1
             self._onsets += not self._touching
@@ -126,7 +127,7 @@ class TissueService(Service):
         self._touching = touching
 
     def _surface_message(self, t: int) -> Message:
-        inward = self._tissue.inward
+        inward = self.backend.inward
         vertices_W = self._vertices_W - inward * self._normals_W
         normals_W = self._R_WA @ self._surface.normals(inward)
         return SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_W), self._triangles)
@@ -135,7 +136,7 @@ class TissueService(Service):
         """Where the indenter is against the rest surface, and the force on it along the normal there and across."""
         if tool is None:
             return IndentationTruth(header(t, "world"), self._out_of_reach, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
-        under = self._surface.nearest(self._p_A, self._tissue.excursion(t / NS))
+        under = self._surface.nearest(self._p_A, self.backend.excursion(t / NS))
         n_W, p_W = self._R_WA @ under.normal, self._R_WA @ under.position + self._p_WA
         normal_force = float(f_W @ n_W)
         return IndentationTruth(
@@ -144,7 +145,7 @@ class TissueService(Service):
             normal_force=max(normal_force, 0.0),
             tangential_force=hypot(*(f_W - normal_force * n_W).tolist()),
             peak_force=self._recent_peak_n,
-            contacts=len(self._tissue.contacts),
+            contacts=len(self.backend.contacts),
             surface_point=Point(*p_W.tolist()),
             stiffness=under.stiffness,
         )

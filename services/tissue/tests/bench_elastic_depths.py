@@ -19,42 +19,36 @@ from palpate_models.load import load_scenario
 from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_tissue.backends.elastic.compliance import compliance
-from palpate_tissue.backends.elastic.equivalent import with_equivalent_stiffness
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 
 DEPTHS_MM = (10, 20, 30, 40)
 
 
 def measure(depth_mm: float, seed: int = 0, settings: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A scan of the whole region, its truth on the skin, findings and scores."""
+    """A scan of the whole region, what can truly be felt, findings and scores."""
     scenario = load_scenario("deep_lesion", (f"phantom.lesions.0.depth_m={depth_mm / 1e3}", *settings), seed)
     model = build_phantom(scenario.phantom, scenario.seed)
-    body, healthy = compliance(model, scenario.phantom.lesions), compliance(model)
-    shown = with_equivalent_stiffness(
-        model, scenario.phantom.lesions, body, healthy, scenario.robot.indenter_radius_m, scenario.exam.depth_m
-    )
+    body = compliance(model, scenario.phantom.lesions)
 
     def tissue(_: PhantomModel, stiffness: Stiffness) -> ElasticTissue:
         return ElasticTissue(model, body, stiffness)
 
     scans.Tissue = tissue  # type: ignore[misc, assignment]
-    scans.phantom_truth = lambda _, X_WA: scans.Truth(  # type: ignore[assignment]
-        shown.vertices, shown.triangles, shown.stiffness, shown.background, shown.lesion, X_WA
-    )
-    data = scans.scan(scenario)
+    data, truth = scans.scan(scenario), scans.truth_of(scenario)
     stiffness_map, findings, _ = scans.examine(data)
-    found = scans.centroids_of(findings)
-    s = scans.score(found, scans.map_of(stiffness_map), data.truth)
+    found = scans.found_of(findings)
+    s = scans.score(found, scans.map_of(stiffness_map), truth)
     lesion = np.asarray(scenario.phantom.lesions[0].centre_m)
     return {
         "depth_mm": depth_mm,
-        "shown_ratio": float((shown.stiffness / shown.background).max()),
+        "felt_contrast": truth.felt.lumps[0].contrast,
         "found": s.matched,
         "missed": s.missed,
-        "false": s.false_positives,
-        "ratio": [round(float(f.stiffness_ratio), 2) for f in findings.findings],
-        "localisation_mm": None if s.localisation_error_m is None else 1e3 * s.localisation_error_m,
-        "from_lump_axis_mm": [round(1e3 * float(np.linalg.norm(f[:2] - lesion)), 1) for f in found],
+        "not_palpable": s.not_palpable,
+        "false": s.false_findings,
+        "ratio": [round(f.ratio, 2) for f in found],
+        "place_mm": None if s.place_error_m is None else 1e3 * s.place_error_m,
+        "from_lump_axis_mm": [round(1e3 * float(np.linalg.norm(f.centroid[:2] - lesion)), 1) for f in found],
         "dice": s.dice,
         "coverage_90": s.coverage_90,
     }

@@ -13,12 +13,8 @@ from palpate_bus.messages.stamps import header
 from palpate_models.load import load_scenario
 from palpate_models.patient import Lesion
 from palpate_models.phantom import flat_phantom
-from palpate_tissue.backends.elastic import cache
-from palpate_tissue.backends.elastic.cache import content_key, remembered
 from palpate_tissue.backends.elastic.compliance import compliance
-from palpate_tissue.backends.elastic.equivalent import pressed_forces, with_equivalent_stiffness
 from palpate_tissue.backends.elastic.service import create
-from palpate_tissue.backends.elastic.slab import sphere_force
 
 COARSE = ("phantom.edge_m=0.012", "phantom.lesions.0.depth_m=0.02", "phantom.lesions.0.radii_m=[0.06, 0.05]")
 
@@ -70,9 +66,7 @@ def test_it_publishes_what_the_contract_says_and_presses_back():
     rest = decode(encode(service.start()["truth/phantom"], "palpation_msgs/msg/PhantomTruth"), "palpation_msgs/msg/PhantomTruth")
     moved = vertices - rest.surface.vertices.reshape(-1, 3) - (0.56, 0.0, 0.93)
     assert 0.003 < np.linalg.norm(moved, axis=1).max() < 0.0105
-    assert rest.lesion.max() == 0  # the lesion shows on the skin
-    ratio = rest.stiffness / rest.background
-    assert 1.05 < ratio.max() < 6  # by less than its contrast, for it lies below
+    assert rest.lesion.max() == 0  # labelled where it lies
     facts = service.finish()
     assert facts["contact_onsets"] == 1
     assert facts["lesion_depths_m"] == [0.02]
@@ -103,52 +97,3 @@ def test_a_second_start_reads_the_cache(monkeypatch):
     np.testing.assert_array_equal(compliance(model, (lesion,), 0.05, pitch_m=0.02).matrix, first.matrix)
     with pytest.raises(AssertionError, match="computed again"):
         compliance(model, (lesion.model_copy(update={"depth_m": 0.011}),), 0.05, pitch_m=0.02)
-
-
-def test_the_cache_survives_a_broken_file_and_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    key = content_key("test", np.arange(3.0), (1, "a"))
-    assert key != content_key("test", np.arange(3.0), (1, "b"))
-    assert remembered(key, lambda: np.ones(3)).tolist() == [1, 1, 1]
-    assert remembered(key, lambda: np.zeros(3)).tolist() == [1, 1, 1]
-    (cache.folder() / f"{key}.npy").write_bytes(b"broken")
-    assert remembered(key, lambda: np.full(3, 2.0)).tolist() == [2, 2, 2]
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert remembered(key, lambda: np.zeros(3)).tolist() == [0, 0, 0]
-
-
-def test_the_cache_forgets_what_was_not_used_for_longest(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cache, "MOST_BYTES", 3000)
-    for k in range(6):
-        remembered(f"k{k}", lambda: np.zeros(100))
-    assert len(list(cache.folder().glob("*.npy"))) <= 3
-    assert (cache.folder() / "k5.npy").exists()
-
-
-def test_a_uniform_body_shows_its_own_stiffness_and_sneddons_force():
-    model = flat_phantom(0.045, 0.0025)
-    body = compliance(model, (), np.inf)
-    middle = np.linalg.norm(model.vertices[body.free], axis=1).argmin()
-    force = pressed_forces(model, body, 0.015, 0.008)[middle]
-    assert force == pytest.approx(sphere_force(1e4, 0.49, 0.015, 0.008), rel=0.02)
-
-
-def test_the_truth_of_a_lesion_is_what_the_skin_shows():
-    model = flat_phantom(0.06, 0.006)
-    lesions = [Lesion(centre_m=(0.0, 0.0), radii_m=(0.02, 0.02), contrast=6, depth_m=depth) for depth in (0.005, 0.02)]
-    healthy = compliance(model, (), 0.05)
-    shown = []
-    for lesion in lesions:
-        body = compliance(model, (lesion,), 0.05, pitch_m=0.02)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("palpate_tissue.backends.elastic.equivalent.uniform_compliance", lambda _: (healthy, 1.7e5))
-            shown.append(with_equivalent_stiffness(model, (lesion,), body, healthy, 0.015, 0.010))
-    peaks = [(m.stiffness / m.background).max() for m in shown]
-    assert peaks[0] > peaks[1] > 1.02
-    assert np.linalg.norm(model.vertices[(shown[0].stiffness / shown[0].background).argmax()]) < 0.008
-    inside = shown[0].lesion == 0
-    assert 3 < inside.sum() < 0.5 * len(inside)
-    assert (shown[0].stiffness / shown[0].background)[inside].min() >= 1 + 0.5 * (peaks[0] - 1) - 1e-9
-    np.testing.assert_allclose(shown[0].background, 1.7e5, rtol=1e-4)

@@ -15,16 +15,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
+from palpate_models.cache import content_key, remembered
 from palpate_models.frames import Array
 from palpate_models.patient import Lesion
-from palpate_models.phantom import PhantomModel
-from palpate_tissue.backends.elastic.cache import content_key, remembered
+from palpate_models.phantom import PhantomModel, field
+from palpate_tissue import friction
+from palpate_tissue.backends.elastic import kernel, modulus, solid
 from palpate_tissue.backends.elastic.kernel import LayerKernel
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W, ModulusField
 from palpate_tissue.backends.elastic.solid import Grid, graded_grid, skin_compliance
@@ -38,6 +41,11 @@ GRID_HALF_M = 0.13
 POISSON = 0.49
 MOST_VERTICES = 20_000
 """The matrix of this many vertices takes 1.6 GB."""
+
+_CODE = tuple(
+    Path(file) for file in (__file__, kernel.__file__, modulus.__file__, solid.__file__, field.__file__, friction.__file__)
+)
+"""On which the matrices depend."""
 
 
 class SizeError(ValueError):
@@ -80,14 +88,6 @@ def compliance(
     return Compliance(_Body(model, free, thickness, poisson, pitch_m).matrix(tuple(lesions)), free, young)
 
 
-def uniform_compliance(model: PhantomModel, poisson: float = POISSON) -> tuple[Compliance, float]:
-    """That of a uniform body under the same skin, and its foundation modulus [N/m^3]."""
-    free = np.flatnonzero(~model.fixed)
-    body = _Body(model, free, float(np.ptp(model.vertices[:, 2])), poisson, PITCH_M)
-    young = body.uniform()
-    return Compliance(body.layer().astype(np.float32), free, np.full(len(free), young)), young / YOUNG_OVER_K_W
-
-
 @dataclass(frozen=True)
 class _Body:
     model: PhantomModel
@@ -104,7 +104,7 @@ class _Body:
         if not math.isfinite(self.thickness):
             raise ValueError("a half-space has to be uniform: give the layer a finite thickness_m")
         arrays = (model.vertices, model.normals, model.areas, model.background, model.fixed)
-        key = content_key("compliance", *arrays, lesions, self.thickness, self.poisson, self.pitch)
+        key = content_key("compliance", _CODE, *arrays, lesions, self.thickness, self.poisson, self.pitch)
         return remembered(key, lambda: self._changed(lesions))
 
     def _changed(self, lesions: tuple[Lesion, ...]) -> Array32:
@@ -122,7 +122,7 @@ class _Body:
             uniform = self.uniform()
             scale = np.sqrt(uniform / young)
             grid = self._grid()
-            key = content_key("uniform", grid.x, grid.y, grid.depth, self.poisson)
+            key = content_key("uniform", _CODE, grid.x, grid.y, grid.depth, self.poisson)
             elements = remembered(key, lambda: skin_compliance(grid, lambda points: np.ones(len(points)), self.poisson)) / uniform
         base *= scale[:, None] * scale
         x, y = grid.skin

@@ -10,7 +10,6 @@ from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
-from palpate_tissue.backends.elastic.equivalent import with_equivalent_stiffness
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.moving import carried
 from palpate_tissue.service import TissueService
@@ -20,13 +19,10 @@ def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
     """The elastic tissue of a scenario. The first time takes half a minute; the result is kept in the user's cache folder.
 
     `pitch_m` is that of the finite elements.
-
-    Its truth is the stiffness that the skin shows at the exam's depth under the robot's indenter.
     """
     phantom = scenario.phantom
     model = build_phantom(phantom, scenario.seed)
     body = compliance(model, phantom.lesions, pitch_m=pitch_m)
-    healthy = compliance(model, pitch_m=pitch_m)
     tissue = ElasticTissue(
         model,
         body,
@@ -34,13 +30,9 @@ def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
         BreathingCurve(phantom.breathing, scenario.seed),
         contract().roles[TissueService.role].period / NS,
     )
-    shown = with_equivalent_stiffness(
-        model, phantom.lesions, body, healthy, scenario.robot.indenter_radius_m, scenario.exam.depth_m
-    )
     facts = {
         "physics": "elastic solid",
         "free_vertices": len(body.free),
         "lesion_depths_m": [lesion.depth_m for lesion in phantom.lesions],
-        "equivalent_stiffness_ratio": round(float((shown.stiffness / shown.background).max()), 3),
     }
-    return carried(TissueService(tissue, shown, true_pose(scenario), facts), scenario)
+    return carried(TissueService(tissue, model, true_pose(scenario), facts), scenario)

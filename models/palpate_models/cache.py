@@ -6,8 +6,8 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
-from importlib import metadata, resources
+from collections.abc import Callable, Iterable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,30 +17,25 @@ from numpy.typing import NDArray
 MOST_BYTES = 2_000_000_000
 """Beyond this, what was not used for longest is removed."""
 
-
-_CODE = {
-    "palpate_tissue.backends.elastic": ("compliance.py", "contact.py", "equivalent.py", "kernel.py", "modulus.py", "solid.py"),
-    "palpate_models.phantom": ("field.py",),
-    "palpate_tissue": ("friction.py",),
-}
-"""Modules on which results depend: a change of one makes them anew."""
 _PARTIAL = ".part"
 _STALE_S = 3600.0
 """A partial file that is so much older than the newest result was left by a process that was killed [s]."""
 
 
 def folder() -> Path:
-    """Where results are kept: `palpate/elastic` in XDG_CACHE_HOME or ~/.cache."""
+    """Where results are kept: `palpate/computed` in XDG_CACHE_HOME or ~/.cache."""
     root = os.environ.get("XDG_CACHE_HOME") or (Path.home() / ".cache")
-    return Path(root) / "palpate" / "elastic"
+    return Path(root) / "palpate" / "computed"
 
 
-def content_key(kind: str, *parts: object) -> str:
-    """A name for a result: a hash of its kind, of what it depends on (arrays by their bytes), and of the code that makes it."""
+def content_key(kind: str, code: Iterable[Path], *parts: object) -> str:
+    """A name for a result: a hash of its kind, of the source files that make it, and of what it depends on (arrays by bytes).
+
+    A change of one of the files of `code` makes results anew.
+    """
     key = hashlib.sha256(f"{kind} numpy {metadata.version('numpy')} scipy {metadata.version('scipy')}".encode())
-    for package, names in _CODE.items():
-        for name in names:
-            key.update(resources.files(package).joinpath(name).read_bytes())
+    for path in code:
+        key.update(path.read_bytes())
     for part in parts:
         if isinstance(part, np.ndarray):
             key.update(f"{part.dtype}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())

@@ -1,0 +1,156 @@
+"""What report.json says of a run: models that write it and read it back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+Point = tuple[float, ...]
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+
+class FindingRow(_Row):
+    """One stiff area that the examination found."""
+
+    centroid_m: Point
+    """In the abdomen frame [m]: x to the patient's left, y to the head, z outward, from the umbilicus."""
+    quadrant: str
+    area_m2: float
+    """On the surface."""
+    ratio: float
+    """Apparent stiffness against the surroundings."""
+    ratio_90: tuple[float, float]
+    """Its 90 % band."""
+    confidence: float
+    """Probability that the area is stiffer than healthy variation explains."""
+
+
+class LumpRow(_Row):
+    """What can truly be felt of a lump."""
+
+    centroid_m: Point
+    """Of its area, xy of the abdomen frame [m]; where it is felt most when it is not palpable."""
+    quadrant: str
+    area_m2: float
+    """Where its effect is at least half of its greatest; 0 when it is not palpable."""
+    felt_contrast: float
+    """Apparent stiffness with it over that without it, where it is felt most."""
+    palpable: bool
+
+
+class TruthRow(_Row):
+    """What can truly be felt of the patient, found out by pressing a copy of him."""
+
+    felt: bool
+    """Whether a copy could be made: not of somebody else's FMU, nor of what is real. Without it nothing is scored."""
+    lumps: list[LumpRow]
+
+
+class FindingScoreRow(_Row):
+    """A finding against the truth (scoring.py says how)."""
+
+    lump: int | None
+    dice: float | None
+    place_error_m: float | None
+    absolute_error_m: float | None
+    size_error: float | None
+    true_ratio: float | None
+    ratio_error: float | None
+    ratio_held: bool | None
+    on_guarding: bool
+
+
+class ScoresRow(_Row):
+    """Findings and map against the truth (scoring.py says how). Errors are mean magnitudes over matched findings."""
+
+    matched: int
+    missed: int
+    not_palpable: int
+    """Lumps that nobody could feel: neither matched nor missed."""
+    false_findings: int
+    on_guarding: int
+    """False findings over guarded muscle."""
+    place_error_m: float | None
+    """Compared at the places that the tool truly touched."""
+    absolute_error_m: float | None
+    """In world."""
+    dice: float | None
+    size_error: float | None
+    """Of the area, relative."""
+    ratio_error: float | None
+    """Relative."""
+    ratio_coverage_90: float | None
+    """Part of the matched findings whose own band holds their true ratio."""
+    coverage_90: float | None
+    """Part of the scanned area on which the map's 90 % band holds the true apparent stiffness."""
+    coverage_90_in_lumps: float | None
+    findings: list[FindingScoreRow]
+    """One a finding, in their order."""
+
+
+class DepthRow(_Row):
+    """RMS depth errors in steady contact [m]; null where there was none."""
+
+    true_against_setpoint_m: float | None
+    """True depth against the set-point: regulation and perception together."""
+    true_against_setpoint_beside_m: float | None
+    """Outside of lumps."""
+    true_against_setpoint_lump_m: float | None
+    """In their areas."""
+    measured_against_true_m: float | None
+    """What the examination believes against the truth: perception alone."""
+    measured_against_true_beside_m: float | None
+    measured_against_true_lump_m: float | None
+    force_limited: float | None
+    """Part of the steady time in which depth yielded to the force limit."""
+
+
+class Report(_Row):
+    """report.json."""
+
+    scenario: str
+    seed: int
+    clean_world: bool
+    """Whether the patient was still and nothing was set wrong with registration: then figures are not those of the real world."""
+    runtime: str
+    """distributed, composed or wallclock."""
+    platform: dict[str, Any]
+    """Operating system, processor, Python and library versions: equal run hashes are promised on one platform only."""
+    sim_time_s: float
+    wall_time_s: float
+    """From the first tick to the last."""
+    real_time_factor: float
+    start_time_s: float
+    """Wall time from the command to the first tick."""
+    run_hash: str | None
+    digests: dict[str, str]
+    """Of each hashed topic: where two runs differ, they say in which."""
+    failure: str | None
+    """Service and cause; null when the run completed."""
+    lost: dict[str, float]
+    """Services that died, with the simulated time at which they fell silent [s]."""
+    samples: int
+    skipped_targets: int
+    max_force_N: float | None
+    """Greatest true contact force of the run, every step of the tissue counted; without a truth, the measured normal force."""
+    mean_force_N: float | None
+    """Mean measured normal force in steady contact."""
+    depth_rms_error_m: float | None
+    """RMS of the true depth against its set-point in steady contact."""
+    depth: DepthRow
+    surface_rms_error_m: float | None
+    """RMS distance of the perceived from the true rest surface in the examined region, along the normal."""
+    assessed: bool
+    """Whether there are findings that are final, though it be none."""
+    findings: list[FindingRow]
+    truth: TruthRow | None
+    scores: ScoresRow | None
+    """Null when the run ended before there was anything to score, or nothing is known of what could be felt."""
+    blame: dict[str, Any]
+    """Where each service's time goes."""
+    services: dict[str, Any]
+    """What each service says of itself at its end."""

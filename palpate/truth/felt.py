@@ -1,0 +1,112 @@
+"""What can be felt of a pressed patient: apparent stiffness between the places pressed, and the areas of lumps.
+
+The felt contrast of a lump is the force with it over the force without it, and e its logarithm. A lump's area is the connected
+set about its greatest |e| in which e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane
+of A; areas are on the skin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import label
+from scipy.spatial import Delaunay
+
+from palpate.truth.pressed import Pressed
+from palpate.truth.surface import TrueSurface
+from palpate_models.frames import Array
+from palpate_models.scenario import Exam
+
+Mask = NDArray[np.bool_]
+
+RASTER_M: Final = 0.001
+"""Pitch of the raster on which areas are compared."""
+PALPABLE: Final = 0.05
+"""A lump whose |e| is smaller everywhere in the examined region is not palpable."""
+
+
+@dataclass(frozen=True)
+class Lump:
+    """What can be felt of a lump."""
+
+    palpable: bool
+    contrast: float
+    """Felt contrast where |e| is greatest [1]; below 1 where the lump is softer than what is around it."""
+    centroid: Array
+    """Of its area [m], shape (2,); where |e| is greatest if it is not palpable."""
+    area: float
+    """[m^2]; 0 if it is not palpable."""
+    inside: Mask
+    """Its area on the raster, shape (ny, nx)."""
+
+
+class Felt:
+    """What the standard press feels over the examined region and a border about it."""
+
+    def __init__(self, pressed: Pressed, surface: TrueSurface, exam: Exam) -> None:
+        mesh = Delaunay(pressed.places[:, :2])
+
+        def between(values: Array) -> LinearNDInterpolator:
+            return LinearNDInterpolator(mesh, values)
+
+        self.pressed, self.surface = pressed, surface
+        self._force = between(np.log(pressed.force))
+        self._limited = between(pressed.limited.astype(float))
+        self._excess = between(np.log(pressed.force / pressed.healthy))
+        low, high = pressed.places[:, :2].min(axis=0), pressed.places[:, :2].max(axis=0)
+        self._x, self._y = (np.arange(a + 0.5 * RASTER_M, b, RASTER_M) for a, b in zip(low, high, strict=True))
+        xx, yy = np.meshgrid(self._x, self._y)
+        self.raster = np.column_stack((xx.ravel(), yy.ravel()))
+        """Points of a raster over all of it [m], shape (ny nx, 2)."""
+        self.cells = surface.steepness(self.raster) * RASTER_M**2
+        """Area of the skin that belongs to each of them [m^2], shape (ny nx,)."""
+        half = 0.5 * np.asarray(exam.region_m)
+        self._examined = (np.abs(self.raster - exam.centre_m) <= half).all(axis=1).reshape(xx.shape)
+        self.lumps = tuple(self._lump(between(np.log(pressed.force / alone))) for alone in pressed.alone)
+        guard = np.nan_to_num(between(np.log(pressed.force / pressed.relaxed))(self.raster)).reshape(xx.shape)
+        self.guarded: Mask = guard >= max(0.5 * float(guard.max()), PALPABLE)
+        """Where guarding is felt: at least half as much as where it is felt most, shape (ny, nx)."""
+
+    def force(self, xy: Array) -> Array:
+        """Apparent stiffness [N] at points [m], shape (p, 2) -> (p,); NaN where nothing was pressed."""
+        return np.asarray(np.exp(self._force(xy)))
+
+    def limited(self, xy: Array) -> Mask:
+        """Whether the press ended at its limit there, so that the apparent stiffness is more than `force` says, shape (p,)."""
+        return np.asarray(np.nan_to_num(self._limited(xy)) > 0.5)
+
+    def excess(self, xy: Array) -> Array:
+        """E of all lumps together at points, shape (p,); NaN where nothing was pressed."""
+        return np.asarray(self._excess(xy))
+
+    def inside(self, area: Mask, xy: Array) -> Mask:
+        """Whether points [m], shape (p, 2), lie in an area of the raster, shape (p,)."""
+        j = np.floor((xy[:, 1] - self._y[0]) / RASTER_M + 0.5).astype(np.intp)
+        i = np.floor((xy[:, 0] - self._x[0]) / RASTER_M + 0.5).astype(np.intp)
+        there = (i >= 0) & (i < len(self._x)) & (j >= 0) & (j < len(self._y))
+        found = np.zeros(len(xy), dtype=bool)
+        found[there] = area[j[there], i[there]]
+        return found
+
+    def in_lump(self, xy: Array) -> Mask:
+        """Whether points [m], shape (p, 2), lie in the area of any lump, shape (p,)."""
+        found = np.zeros(len(xy), dtype=bool)
+        for lump in self.lumps:
+            found |= self.inside(lump.inside, xy)
+        return found
+
+    def _lump(self, excess: LinearNDInterpolator) -> Lump:
+        e = np.nan_to_num(excess(self.raster)).reshape(self._examined.shape)
+        peak = int(np.argmax(np.abs(e) * self._examined))
+        greatest = float(e.ravel()[peak])
+        if abs(greatest) < PALPABLE:
+            return Lump(False, float(np.exp(greatest)), self.raster[peak], 0.0, np.zeros(e.shape, dtype=bool))
+        parts, _ = label(e * np.sign(greatest) >= 0.5 * abs(greatest))
+        inside = parts == parts.ravel()[peak]
+        weight = self.cells * inside.ravel()
+        area = float(weight.sum())
+        return Lump(True, float(np.exp(greatest)), weight @ self.raster / area, area, inside)

@@ -1,0 +1,55 @@
+"""The true rest surface as functions of place in the xy plane of the abdomen frame A."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay
+
+from palpate_models.frames import Array
+
+
+@dataclass(frozen=True)
+class TrueBody:
+    """The body at rest."""
+
+    vertices: Array
+    """[m], shape (n, 3), in A."""
+    triangles: NDArray[np.int32]
+    """Shape (m, 3), counter-clockwise seen from outside."""
+    X_WA: Array
+    """True pose of A in world, shape (4, 4)."""
+
+
+class TrueSurface:
+    """The outward (front) side of the true rest surface as functions of xy, in A."""
+
+    def __init__(self, body: TrueBody) -> None:
+        corners = body.vertices[body.triangles]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        facing = normal[:, 2] > 0.1 * np.linalg.norm(normal, axis=1)
+        front = np.unique(body.triangles[facing])
+        mesh = Delaunay(body.vertices[front, :2])
+        total = np.zeros((len(body.vertices), 3))
+        for k in range(3):
+            np.add.at(total, body.triangles[facing, k], normal[facing])
+        unit = total[front] / np.linalg.norm(total[front], axis=1, keepdims=True)
+        self._height = LinearNDInterpolator(mesh, body.vertices[front, 2])
+        self._normal = LinearNDInterpolator(mesh, unit)
+
+    def points(self, xy: Array) -> tuple[Array, Array]:
+        """Points of the surface [m] and outward unit normals there, each of shape (p, 3); NaN off the surface."""
+        normal = np.asarray(self._normal(xy))
+        return np.column_stack((xy, self.height(xy))), normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def height(self, xy: Array) -> Array:
+        """Height z [m] at points, shape (p,); NaN off the surface."""
+        return np.asarray(self._height(xy))
+
+    def steepness(self, xy: Array) -> Array:
+        """Area of the surface over area in xy at points [1], shape (p,)."""
+        normal = np.asarray(self._normal(xy))
+        return np.asarray(np.nan_to_num(np.linalg.norm(normal, axis=1) / normal[:, 2], nan=1.0))

@@ -1,0 +1,177 @@
+"""The truth by pressing: a copy of the patient, felt with its lumps and without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.truth import pressed
+from palpate.truth.felt import Felt
+from palpate.truth.pressed import Patient, Pressed, press_patient
+from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.touched import Touched
+from palpate_models.load import load_scenario
+from palpate_models.patient import Lesion
+from palpate_models.phantom import flat_phantom
+from palpate_models.press import LIMIT_N, apparent_stiffness
+from palpate_models.scenario import Scenario
+from palpate_tissue.backend import TissueBackend
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+
+FLAT = """
+from palpate_models.phantom import flat_phantom
+from palpate_models.section import Pose
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_tissue.service import TissueService
+
+def create(scenario):
+    model = flat_phantom(0.12, 0.006, scenario.phantom.stiffness.k_w_n_per_m3, scenario.phantom.lesions)
+    return TissueService(WinklerTissue(model, scenario.phantom.stiffness), model, Pose(), {})
+"""
+LESION = Lesion(centre_m=(0.005, 0.0), radii_m=(0.015, 0.015), contrast=4.0)
+REGION = "exam.region_m=[0.08, 0.08]"
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+
+
+def flat(folder: Path, *lesions: Lesion, k_w: float = 1.7e5) -> Scenario:
+    file = folder / "flat.py"
+    file.write_text(FLAT, encoding="utf-8")
+    scenario = load_scenario("healthy", [f"services.tissue={file}", REGION, f"phantom.stiffness.k_w_n_per_m3={k_w}"])
+    return scenario.model_copy(update={"phantom": scenario.phantom.model_copy(update={"lesions": lesions})})
+
+
+def felt(scenario: Scenario) -> tuple[Pressed, Felt]:
+    found = press_patient(scenario)
+    tissue = Patient(scenario).with_lesions(())
+    assert found is not None
+    assert tissue is not None
+    surface = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4)))
+    return found, Felt(found, surface, scenario.exam)
+
+
+def test_felt_contrast_is_that_of_a_direct_pair_of_presses(tmp_path: Path) -> None:
+    """On the whole wall, with its friction, step by step, as the service presses it."""
+    found, _ = felt(flat(tmp_path, LESION))
+    places = [
+        int(np.argmin(np.linalg.norm(found.places[:, :2] - xy, axis=1))) for xy in ((0.005, 0.0), (0.02, 0.0), (-0.03, 0.02))
+    ]
+    forces = []
+    for lesions in ((LESION,), ()):
+        wall = WinklerTissue(flat_phantom(0.12, 0.006, lesions=lesions))
+        alone = TissueBackend.press(wall, found.places[places], np.tile((0.0, 0.0, 1.0), (3, 1)), 0.015)
+        forces.append(apparent_stiffness(alone)[0])
+    assert found.force[places] == pytest.approx(forces[0], rel=2e-3)
+    assert (found.force / found.healthy)[places] == pytest.approx(forces[0] / forces[1], rel=2e-3)
+    assert forces[0][0] / forces[1][0] > 2.0
+
+
+def test_a_lump_is_felt_about_where_it_is(tmp_path: Path) -> None:
+    _, what = felt(flat(tmp_path, LESION))
+    (lump,) = what.lumps
+    assert lump.palpable
+    assert lump.centroid == pytest.approx(LESION.centre_m, abs=0.002)
+    assert np.pi * 0.014**2 < lump.area < np.pi * 0.021**2
+    assert what.in_lump(np.array([LESION.centre_m, (0.035, 0.03)])).tolist() == [True, False]
+
+
+def test_a_soft_lump(tmp_path: Path) -> None:
+    _, what = felt(flat(tmp_path, LESION.model_copy(update={"contrast": 0.4})))
+    (lump,) = what.lumps
+    assert lump.palpable
+    assert 0.4 < lump.contrast < 0.7
+    assert lump.centroid == pytest.approx(LESION.centre_m, abs=0.003)
+
+
+def test_of_a_pair_each_is_removed_alone(tmp_path: Path) -> None:
+    left, right = (Lesion(centre_m=(x, 0.0), radii_m=(0.010, 0.010), contrast=5.0) for x in (-0.016, 0.016))
+    found, what = felt(flat(tmp_path, left, right))
+    centres = [lump.centroid[0] for lump in what.lumps]
+    assert centres == pytest.approx([-0.016, 0.016], abs=0.003)
+    middle = int(np.argmin(np.linalg.norm(found.places[:, :2], axis=1)))
+    assert found.healthy[middle] < found.alone[0][middle] < found.force[middle]
+    single, _ = felt(flat(tmp_path, right))
+    there = int(np.argmin(np.linalg.norm(found.places[:, :2] - (0.015, 0.0), axis=1)))
+    same = int(np.argmin(np.linalg.norm(single.places - found.places[there], axis=1)))
+    assert found.alone[0][there] == pytest.approx(single.force[same], rel=1e-6)
+
+
+def test_a_lump_that_is_hardly_stiffer_is_not_palpable(tmp_path: Path) -> None:
+    _, what = felt(flat(tmp_path, LESION.model_copy(update={"contrast": 1.04})))
+    (lump,) = what.lumps
+    assert (lump.palpable, lump.area) == (False, 0.0)
+    assert 1.0 < lump.contrast < np.exp(0.05)
+
+
+def test_a_press_ends_at_its_limit(tmp_path: Path) -> None:
+    found, _ = felt(flat(tmp_path, LESION, k_w=6e5))
+    stiffest = found.force.argmax()
+    assert found.limited[stiffest]
+    assert found.force[stiffest] == LIMIT_N
+    assert not found.limited.all()
+    assert (found.force <= LIMIT_N).all()
+
+
+def test_it_is_pressed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = press_patient(flat(tmp_path, LESION))
+    assert first is not None
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("pressed again")
+
+    monkeypatch.setattr(WinklerTissue, "press", refuse)
+    again = press_patient(flat(tmp_path, LESION))
+    assert again is not None
+    assert np.array_equal(again.force, first.force)
+    with pytest.raises(AssertionError, match="pressed again"):
+        press_patient(flat(tmp_path, LESION.model_copy(update={"contrast": 3.0})))
+
+
+def test_no_copy_can_be_made_of_what_is_somebody_elses_or_real(tmp_path: Path) -> None:
+    assert press_patient(load_scenario("healthy", ["services.tissue=none"])) is None
+    assert press_patient(load_scenario("healthy", ["services.tissue=fmu", "tissue.fmu=theirs.fmu"])) is None
+    file = tmp_path / "own.py"
+    file.write_text(
+        "from palpate_bus.service import Service\n\nclass Own(Service):\n    role = 'tissue'\n\n"
+        "    def step(self, t, inbox):\n        return {}\n\ndef create(scenario):\n    return Own()\n",
+        encoding="utf-8",
+    )
+    assert press_patient(load_scenario("healthy", [f"services.tissue={file}"])) is None
+
+
+def test_our_own_fmu_is_pressed_as_the_tier_whose_equations_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        pressed, "_places", lambda skin, *_: tuple(a[:2] for a in skin.points(np.array(((0.0, 0.0), (0.03, 0.0)))))
+    )
+    settings = ["phantom.edge_m=0.012", REGION]
+    native, fmu = (press_patient(load_scenario("healthy", [*settings, f"services.tissue={name}"])) for name in ("winkler", "fmu"))
+    assert native is not None
+    assert fmu is not None
+    assert np.array_equal(native.force, fmu.force)
+
+
+def test_places_are_fine_about_the_outline_and_cover_the_region(tmp_path: Path) -> None:
+    found, _ = felt(flat(tmp_path, LESION))
+    xy = found.places[:, :2]
+    assert xy.min() == pytest.approx(-0.05)
+    assert xy.max() == pytest.approx(0.05)
+    nearest = np.sort(np.linalg.norm(xy[:, None] - xy, axis=2), axis=1)[:, 1]
+    rim = np.abs(np.linalg.norm(xy - LESION.centre_m, axis=1) - 0.015) < 0.004
+    assert nearest[rim].max() == pytest.approx(0.005)
+    assert nearest.max() == pytest.approx(0.010)
+
+
+def test_where_the_tool_truly_touched() -> None:
+    believed = np.array([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.1, 0.1, 0.0), (0.05, 0.05, 0.0)])
+    shift = np.array((0.004, -0.002, 0.0))
+    places = Touched(believed, believed + shift).places(np.array(((0.02, 0.03), (0.0, 0.0))))
+    assert places == pytest.approx(np.array(((0.024, 0.028), (0.004, -0.002))))
+    turned = Touched(believed, believed * (1.1, 1.0, 1.0))
+    assert turned.places(np.array(((0.1, 0.0),)))[0] == pytest.approx((0.11, 0.0), abs=1e-4)
+    nowhere = Touched(np.empty((0, 3)), np.empty((0, 3)))
+    assert nowhere.places(np.array(((0.02, 0.03),))).tolist() == [[0.02, 0.03]]
