@@ -82,16 +82,16 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
 
 
 def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
-    """The wall of somebody whose logarithms of k_w, length and stiffening are given; relaxation and friction vary [A]."""
+    """The wall of somebody whose ln k_w, ln length and stiffening are given; relaxation and friction vary [A]."""
     usual = Stiffness()
-    k_w, length, stiffening = np.exp(people).tolist()
+    k_w, length = np.exp(people[:2]).tolist()
     relaxing = np.array(usual.prony_g) * np.exp(0.2 * rng.standard_normal(len(usual.prony_g)))
     relaxing *= min(1.0, 0.8 / relaxing.sum())
     times = np.array(usual.prony_tau_s) * np.exp(0.3 * rng.standard_normal(len(usual.prony_tau_s)))
     return Stiffness(
         k_w_n_per_m3=k_w,
         length_m=length,
-        stiffening_per_m=stiffening,
+        stiffening_per_m=max(float(people[2]), 0.0),
         prony_g=tuple(relaxing.tolist()),
         prony_tau_s=tuple(times.tolist()),
         dashpot_s=usual.dashpot_s,
@@ -144,4 +144,4 @@ def _muscles(rng: np.random.Generator) -> Muscles:
 def _variation(statistics: WallStatistics) -> Variation:
     stiffness, stiffening = np.sqrt(np.diag(statistics.places)).tolist()
     correlation = statistics.places[0, 1] / (stiffness * stiffening)
-    return Variation(stiffness=stiffness, stiffening=stiffening, correlation=float(np.clip(correlation, -1, 1)))
+    return Variation(stiffness=stiffness, stiffening_per_m=stiffening, correlation=float(np.clip(correlation, -1, 1)))
