@@ -1,4 +1,4 @@
-"""The patient of a scenario: shape, wall, lesions, breathing. Reaches only the tissue and scoring."""
+"""The patient of a scenario: shape, wall, lesions, guarding, breathing. Reaches only the tissue and scoring."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from palpate_models.anatomy import Anatomy
 from palpate_models.breathing import Breathing
 from palpate_models.draw import Build, Draw
+from palpate_models.guarding import Guarding
 from palpate_models.section import Length, NonNegative, Pose, Positive, Section, Vec2
 
 
@@ -101,8 +102,15 @@ class Phantom(Section):
     stiffness: Stiffness = Stiffness()
     background: Background = Background()
     lesions: tuple[Lesion, ...] = ()
+    guarding: tuple[Guarding, ...] = ()
     breathing: Breathing = Breathing()
     pose: Registration = Registration()
+
+    @model_validator(mode="after")
+    def _guarding(self) -> Self:
+        if len({area.kind for area in self.guarding}) > 1:
+            raise ValueError("guarding: all areas of a patient are of one kind, voluntary or involuntary")
+        return self
 
     @model_validator(mode="after")
     def _mesh(self) -> Self:
@@ -118,6 +126,8 @@ class Phantom(Section):
             if set_here:
                 raise ValueError(f"{set_here[0]} belongs to kind: person, not to kind: {self.kind}")
         elif self.anatomy is None:
+            if self.guarding and self.draw.guarding != "none":
+                raise ValueError("draw.guarding is for a person without guarding: leave one of them out")
             for name in ("size_m", "stiffness", "background"):
                 if getattr(self, name) != usual[name]:
                     raise ValueError(f"{name} of kind: person is drawn from the seed: leave it out")

@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate_models.anatomy import Anatomy, Muscles, Skeleton, Variation
-from palpate_models.draw import Build
+from palpate_models.draw import Build, Draw
 from palpate_models.frames import Array
+from palpate_models.guarding import Guarding
 from palpate_models.lumps import drawn_lumps
 from palpate_models.patient import Background, Phantom, Stiffness
+from palpate_models.remus2024 import fitted
 from palpate_models.seeds import generator
 from palpate_models.wall_statistics import WallStatistics, wall_statistics
 
@@ -77,6 +79,7 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
             "background": Background(cv=0, margins=1),
             "anatomy": anatomy,
             "lesions": phantom.lesions + lumps,
+            "guarding": phantom.guarding + _guarding(phantom.draw, generator(seed, "guarding")),
         }
     )
 
@@ -139,6 +142,17 @@ def _muscles(rng: np.random.Generator) -> Muscles:
         linea_alba=rng.uniform(0.9, 1.4),
         rectus=rng.uniform(1.0, 1.4),
     )
+
+
+def _guarding(draw: Draw, rng: np.random.Generator) -> tuple[Guarding, ...]:
+    """A contracted area with the ratio of force tensed to force at rest of a measured place [C], place and size [A]."""
+    if draw.guarding == "none":
+        return ()
+    ratios = [fit.activated_ratio for fit in fitted().values()]
+    x, y = (rng.uniform(-0.3, 0.3, 2) * np.array(draw.region_m)).tolist()
+    a, b = rng.uniform(0.045, 0.08, 2).tolist()
+    ratio = float(np.quantile(ratios, rng.random()))
+    return (Guarding(centre_m=(x, y), radii_m=(a, b), ratio=ratio, kind=draw.guarding),)
 
 
 def _variation(statistics: WallStatistics) -> Variation:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.frames import Array
+from palpate_models.guarding import Guarding
 from palpate_models.patient import Background, Lesion
 from palpate_models.phantom.buried import at_skin
 from palpate_models.seeds import generator
@@ -51,10 +52,10 @@ def background_factor(points: Array, background: Background, half_length: float,
     return np.asarray(variation * margin)
 
 
-def edge_distance(xy: Array, lesion: Lesion) -> Array:
-    """Distance [m] of points (n, 2) from a lesion's half-contrast ellipse, to first order; negative inside; (n,)."""
-    offset = xy - np.asarray(lesion.centre_m)
-    radii = np.asarray(lesion.radii_m)
+def edge_distance(xy: Array, area: Lesion | Guarding) -> Array:
+    """Distance [m] of points (n, 2) from an area's elliptic outline, to first order; negative inside; (n,)."""
+    offset = xy - np.asarray(area.centre_m)
+    radii = np.asarray(area.radii_m)
     rho = np.sqrt(((offset / radii) ** 2).sum(axis=1))
     slope = np.sqrt(((offset / radii**2) ** 2).sum(axis=1))
     return np.asarray(np.where(rho > 1e-6, (rho - 1) * rho / np.maximum(slope, 1e-9), -radii.min()))

@@ -17,6 +17,7 @@ from palpate_models.phantom.field import background_factor, lesion_field
 from palpate_models.phantom.healthy import healthy_wall
 from palpate_models.phantom.mesh import MeshError, boundary_vertices, load_mesh, vertex_normals
 from palpate_models.phantom.parametric import parametric_surface
+from palpate_models.phantom.tension import tension_field
 
 IntArray = NDArray[np.int32]
 
@@ -52,6 +53,8 @@ class PhantomModel:
     """Vertices that do not move: the border of the examined body, and its back on the table; shape (n,)."""
     breathing: Array
     """Part of the breathing excursion at each vertex, 1 about the umbilicus, 0 where fixed; shape (n,)."""
+    voluntary: bool = False
+    """Whether the tension fades under gentle pressure: see `palpate_models.guarding.Activation`."""
 
 
 def quadrant(x: float, y: float) -> str:
@@ -93,6 +96,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
             f"phantom.lesions[{index}]: centre_m {centre}, radii_m {radii}: no point of the abdomen's front belongs to it "
             "(want metres from the umbilicus; a stiffer lesion may cover it)"
         )
+    tension = tension_field(vertices[:, :2], phantom.guarding, phantom.stiffness, front=normals[:, 2] > 0)
     return PhantomModel(
         vertices=vertices,
         triangles=triangles,
@@ -102,10 +106,11 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         stiffness=background * contrast,
         background=background,
         stiffening=stiffening,
-        tension=np.zeros(len(vertices)),
+        tension=tension,
         lesion=lesion,
         fixed=fixed,
         breathing=_breathing_profile(vertices, normals, half_length, fixed),
+        voluntary=any(area.kind == "voluntary" for area in phantom.guarding),
     )
 
 

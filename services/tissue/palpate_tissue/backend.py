@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from palpate_models.breathing import BreathingCurve
 from palpate_models.frames import Array
+from palpate_models.guarding import Activation
 from palpate_models.phantom import PhantomModel
 
 
@@ -27,6 +28,7 @@ class TissueBackend(ABC):
         """Period of a step [s]."""
         self.breathing = breathing
         """How the body breathes."""
+        self._guarding = Activation(model.voluntary, dt)
 
     @abstractmethod
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
@@ -48,6 +50,11 @@ class TissueBackend(ABC):
 
     @property
     @abstractmethod
+    def indentation(self) -> Array:
+        """How far each vertex in contact is displaced along its inward normal [m], shape (k,)."""
+
+    @property
+    @abstractmethod
     def inward(self) -> Array:
         """How far each vertex is from its place at rest [m] along its inward normal, breathing included, shape (n,)."""
 
@@ -55,6 +62,14 @@ class TissueBackend(ABC):
     def deformed_vertices(self) -> Array:
         """The surface as it is now [m], shape (n, 3)."""
         return self.model.vertices - self.inward[:, None] * self.model.normals
+
+    def guard(self, v_A: Array) -> None:
+        """Advances `activation` by a period, from how the sphere of velocity `v_A` [m/s] holds the skin: how each step ends."""
+        if self._guarding.voluntary and self.touching:
+            indentation = self.indentation
+            deepest = int(indentation.argmax())
+            normal = self.model.normals[self.contacts[deepest]]
+            self.activation = self._guarding.after(self.activation, float(indentation[deepest]), -float(v_A @ normal))
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""

@@ -79,6 +79,7 @@ class WinklerTissue(TissueBackend):
         wrench = np.zeros(6)
         if self.substeps == 1:
             self._substep(self.excursion(t_s), end, radius, wrench)
+            self.guard(v_A)
             return wrench[:3], wrench[3:]
         part = np.zeros(6)
         for k in range(1, self.substeps + 1):
@@ -87,6 +88,7 @@ class WinklerTissue(TissueBackend):
             part[:] = 0.0
             self._substep(self.excursion(t_s - self.dt * (1 - share)), at, radius, part)
             wrench += part / self.substeps
+        self.guard(v_A)
         return wrench[:3], wrench[3:]
 
     def idle(self, t_s: float) -> None:
@@ -154,6 +156,11 @@ class WinklerTissue(TissueBackend):
     def contact_forces(self) -> Array:
         """Their contact forces f > 0 along their inward normals [N], shape (k,)."""
         return self._patch.f[self._patch.f > 0] if self.touching else np.empty(0)
+
+    @property
+    def indentation(self) -> Array:
+        """How far each vertex in contact is displaced along its inward normal [m], shape (k,)."""
+        return self.displacement[self.contacts]
 
     @property
     def inward(self) -> Array:
