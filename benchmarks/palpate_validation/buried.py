@@ -82,9 +82,9 @@ def section(found: Array | None = None) -> Section:
     error = np.log(found / elastic)
     skin = np.array([lump.depth_m == 0 for lump in ELASTIC_TIER])
     checks = (
-        Check("error of the felt ratio, RMS, lumps from 5 mm below the skin", _percent(error[~skin]), "%", high=6.0,
+        Check("error of the felt ratio, RMS, lumps from 5 mm below the skin", _percent(error[~skin]), "%", high=4.0,
               against="elastic tier"),
-        Check("largest error there", 100 * float(np.abs(error[~skin]).max()), "%", high=15.0, against="elastic tier"),
+        Check("largest error there", 100 * float(np.abs(error[~skin]).max()), "%", high=10.0, against="elastic tier"),
         Check("largest error of lumps that touch the skin", 100 * float(np.abs(error[skin]).max()), "%", against="elastic tier"),
         Check("lumps that are felt to the same side of 1", float((np.sign(np.log(found)) == np.sign(np.log(elastic))).mean()),
               "of all", low=1.0, against="elastic tier"),
