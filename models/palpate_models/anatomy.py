@@ -46,10 +46,10 @@ class Variation(Section):
 
     stiffness: NonNegative = 0.2
     """Standard deviation of the logarithm of the foundation modulus between places over the belly, muscles included [C]."""
-    stiffening: NonNegative = 0.2
-    """That of the logarithm of the stiffening [C]."""
+    stiffening_per_m: NonNegative = 30.0
+    """That of the stiffening itself [C]."""
     correlation: Correlation = 0.0
-    """Correlation of both logarithms [C]."""
+    """Correlation of the two [C]."""
     length_m: tuple[Length, Length] = (0.010, 0.150)
     """Shortest and longest length over which the wall varies [A]."""
 

@@ -100,7 +100,7 @@ class Phantom(Section):
     motion: Motion = Motion()
 
     @model_validator(mode="after")
-    def _guarding(self) -> Phantom:
+    def _guarding(self) -> Self:
         if len({area.kind for area in self.guarding}) > 1:
             raise ValueError("guarding: all areas of a patient are of one kind, voluntary or involuntary")
         return self
@@ -119,6 +119,8 @@ class Phantom(Section):
             if set_here:
                 raise ValueError(f"{set_here[0]} belongs to kind: person, not to kind: {self.kind}")
         elif self.anatomy is None:
+            if self.guarding and self.draw.guarding != "none":
+                raise ValueError("draw.guarding is for a person without guarding: leave one of them out")
             for name in ("size_m", "stiffness", "background"):
                 if getattr(self, name) != usual[name]:
                     raise ValueError(f"{name} of kind: person is drawn from the seed: leave it out")

@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate_models.anatomy import Anatomy, Muscles, Skeleton, Variation
-from palpate_models.draw import Build
+from palpate_models.draw import Build, Draw
 from palpate_models.frames import Array
+from palpate_models.guarding import Guarding
 from palpate_models.lumps import drawn_lumps
 from palpate_models.patient import Background, Phantom, Stiffness
+from palpate_models.remus2024 import fitted
 from palpate_models.seeds import generator
 from palpate_models.wall_statistics import WallStatistics, wall_statistics
 
@@ -77,21 +79,22 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
             "background": Background(cv=0, margins=1),
             "anatomy": anatomy,
             "lesions": phantom.lesions + lumps,
+            "guarding": phantom.guarding + _guarding(phantom.draw, generator(seed, "guarding")),
         }
     )
 
 
 def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
-    """The wall of somebody whose logarithms of k_w, length and stiffening are given; relaxation and friction vary [A]."""
+    """The wall of somebody whose ln k_w, ln length and stiffening are given; relaxation and friction vary [A]."""
     usual = Stiffness()
-    k_w, length, stiffening = np.exp(people).tolist()
+    k_w, length = np.exp(people[:2]).tolist()
     relaxing = np.array(usual.prony_g) * np.exp(0.2 * rng.standard_normal(len(usual.prony_g)))
     relaxing *= min(1.0, 0.8 / relaxing.sum())
     times = np.array(usual.prony_tau_s) * np.exp(0.3 * rng.standard_normal(len(usual.prony_tau_s)))
     return Stiffness(
         k_w_n_per_m3=k_w,
         length_m=length,
-        stiffening_per_m=stiffening,
+        stiffening_per_m=max(float(people[2]), 0.0),
         prony_g=tuple(relaxing.tolist()),
         prony_tau_s=tuple(times.tolist()),
         dashpot_s=usual.dashpot_s,
@@ -141,7 +144,18 @@ def _muscles(rng: np.random.Generator) -> Muscles:
     )
 
 
+def _guarding(draw: Draw, rng: np.random.Generator) -> tuple[Guarding, ...]:
+    """A contracted area with the ratio of force tensed to force at rest of a measured place [C], place and size [A]."""
+    if draw.guarding == "none":
+        return ()
+    ratios = [fit.activated_ratio for fit in fitted().values()]
+    x, y = (rng.uniform(-0.3, 0.3, 2) * np.array(draw.region_m)).tolist()
+    a, b = rng.uniform(0.045, 0.08, 2).tolist()
+    ratio = float(np.quantile(ratios, rng.random()))
+    return (Guarding(centre_m=(x, y), radii_m=(a, b), ratio=ratio, kind=draw.guarding),)
+
+
 def _variation(statistics: WallStatistics) -> Variation:
     stiffness, stiffening = np.sqrt(np.diag(statistics.places)).tolist()
     correlation = statistics.places[0, 1] / (stiffness * stiffening)
-    return Variation(stiffness=stiffness, stiffening=stiffening, correlation=float(np.clip(correlation, -1, 1)))
+    return Variation(stiffness=stiffness, stiffening_per_m=stiffening, correlation=float(np.clip(correlation, -1, 1)))

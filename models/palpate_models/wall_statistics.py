@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate_models.frames import Array
-from palpate_models.remus2024 import FOLDER
-
-COLUMNS = ("k_w_n_per_m3", "length_m", "stiffening_per_m")
-"""Of `fitted.csv`, in the order of every vector here."""
+from palpate_models.remus2024 import fitted
 
 
 @dataclass(frozen=True)
 class WallStatistics:
-    """Moments of the natural logarithms of k_w [N/m^3], length [m] and stiffening [1/m]."""
+    """Moments of a place's ln k_w [N/m^3], ln length [m] and stiffening [1/m], in this order.
+
+    Some of the fitted places do not stiffen at all, so the stiffening has no logarithm.
+    """
 
     mean: Array
     """Over people, shape (3,)."""
@@ -29,26 +29,25 @@ class WallStatistics:
 
 @cache
 def wall_statistics() -> WallStatistics:
-    """The statistics of the fitted places."""
-    with (FOLDER / "fitted.csv").open(encoding="ascii", newline="") as file:
-        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    values = np.log([[float(row[name]) for name in COLUMNS] for row in rows])
-    return moments(values, np.array([row["person"] for row in rows]))
+    """The statistics of the measured places, `fitted.csv`."""
+    walls = [fit.wall for fit in fitted().values()]
+    values = np.array([(np.log(wall.k_w_n_per_m3), np.log(wall.length_m), wall.stiffening_per_m) for wall in walls])
+    return moments(values, np.array([person for _, person in fitted()]))
 
 
-def moments(values: Array, person: np.ndarray) -> WallStatistics:
+def moments(values: Array, person: NDArray[np.str_]) -> WallStatistics:
     """Moments of `values` (n, 3), each a place of a `person` (n,), by the analysis of variance.
 
-    The covariance of the means over a person's places holds a part of that between places, which is taken away. A person's wall has
-    one length; what the other two vary by at that length is their covariance given the length.
+    The covariance of the means over a person's places holds a part of that between places, which is taken away. A person's wall
+    has one length; what the other two vary by at that length is their covariance given the length.
     """
     people = [values[person == one] for one in np.unique(person)]
     means = np.array([rows.mean(axis=0) for rows in people])
-    within = sum((len(rows) - 1) * np.cov(rows.T) for rows in people) / (len(values) - len(people))
-    repeats = np.mean([1 / len(rows) for rows in people])
-    between = np.cov(means.T) - repeats * within
-    least, axes = np.linalg.eigh(between)
-    between = axes @ np.diag(np.maximum(least, 0)) @ axes.T
+    scatter = [(rows - mean).T @ (rows - mean) for rows, mean in zip(people, means, strict=True)]
+    within = np.sum(scatter, axis=0) / (len(values) - len(people))
+    repeats = float(np.mean([1 / len(rows) for rows in people]))
+    variances, axes = np.linalg.eigh(np.cov(means.T) - repeats * within)
+    between = (axes * np.maximum(variances, 0)) @ axes.T
     rest, length = [0, 2], 1
     places = within[np.ix_(rest, rest)] - np.outer(within[rest, length], within[rest, length]) / within[length, length]
     return WallStatistics(means.mean(axis=0), between, places)

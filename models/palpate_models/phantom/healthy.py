@@ -51,8 +51,8 @@ def muscle_factor(x: Array, y: Array, muscles: Muscles) -> Array:
 def healthy_wall(points: Array, size_m: tuple[float, float, float], anatomy: Anatomy, stiffening: float, seed: int) -> Wall:
     """The wall of a person at points (n, 3) of A [m], whose mean `stiffening` [1/m] is given.
 
-    Over the belly the logarithms have the mean 0 and the deviations and correlation that `anatomy.variation` says: what the
-    muscles do not account for is a random field. The wall over bone comes on top.
+    Over the belly the logarithm of the first has the mean 0, and both have the deviations and the correlation that
+    `anatomy.variation` says: what the muscles do not account for is a random field. The wall over bone comes on top.
     """
     variation = anatomy.variation
     reference = belly(size_m, anatomy)
@@ -65,9 +65,9 @@ def healthy_wall(points: Array, size_m: tuple[float, float, float], anatomy: Ana
     total = np.sqrt(random**2 + at_belly.var())
     rho = variation.correlation
     shared = rho * log_level / total if total > 0 else 0.0
-    log_stiffening = variation.stiffening * (shared + np.sqrt(1 - rho**2) * other(points))
+    local = np.maximum(stiffening + variation.stiffening_per_m * (shared + np.sqrt(1 - rho**2) * other(points)), 0.0)
     bone = bone_share(x, y, anatomy.skeleton)
     return Wall(
         np.exp(log_level) * (1 + (anatomy.bone - 1) * bone),
-        (stiffening * np.exp(log_stiffening)) ** (1 - bone) * anatomy.bone_stiffening_per_m**bone,
+        (1 - bone) * local + bone * anatomy.bone_stiffening_per_m,
     )
