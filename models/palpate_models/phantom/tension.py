@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 from scipy.optimize import brentq
 
+from palpate_models import wall
 from palpate_models.frames import Array
 from palpate_models.guarding import Guarding
 from palpate_models.patient import Stiffness
@@ -60,7 +61,8 @@ def pressed_force(stiffness: Stiffness, tension: float) -> float:
         left (u - l^2 lap u) + drag u + sigma(u) + tension u = p / k_w,   p >= 0,  u >= w,  p (u - w) = 0
 
     is solved on rings about the axis. `left` is what has not relaxed after a displacement that rose evenly for
-    DEPTH_M / SPEED_MPS, `drag` the dashpot's share. Contact by a primal-dual active set in which sigma is linearised anew each round (Newton).
+    DEPTH_M / SPEED_MPS, `drag` the dashpot's share. Contact by a primal-dual active set in which
+    sigma is linearised anew each round (Newton).
     """
     seconds = DEPTH_M / SPEED_MPS
     g, tau = np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
@@ -70,6 +72,7 @@ def pressed_force(stiffness: Stiffness, tension: float) -> float:
     r = (np.arange(_RINGS) + 0.5) * width
     area = 2 * np.pi * r * width
     tie = 2 * np.pi * np.arange(1, _RINGS) * left * stiffness.length_m**2  # between a ring and the next
+    stiffening = np.full(_RINGS, stiffness.stiffening_per_m)
     linear = area * (left + drag + tension)
     linear[:-1] += tie
     linear[1:] += tie
@@ -77,7 +80,7 @@ def pressed_force(stiffness: Stiffness, tension: float) -> float:
     u = np.maximum(w, 0.0)
     held = w > 0.5 * DEPTH_M
     for _ in range(_MOST_ROUNDS):
-        sigma, slope = _stiffening(u, stiffness.stiffening_per_m)
+        sigma, slope = wall.stress(u, stiffening), wall.slope(u, stiffening)
         bands = np.zeros((3, _RINGS))
         bands[0, 1:], bands[1], bands[2, :-1] = -tie, linear + area * slope, -tie
         load = area * (slope * u - sigma)
@@ -94,9 +97,3 @@ def pressed_force(stiffness: Stiffness, tension: float) -> float:
             return float(stiffness.k_w_n_per_m3 * force[held].sum())
         held = touching
     raise RuntimeError(f"the press on a flat wall did not settle in {_MOST_ROUNDS} rounds: {stiffness}, tension = {tension}")
-
-
-def _stiffening(u: Array, per_m: float) -> tuple[Array, Array]:
-    """sigma(u) [m] and its slope [1]."""
-    slope = per_m * np.maximum(u, 0.0)
-    return 0.5 * slope * u, slope

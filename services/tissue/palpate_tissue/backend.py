@@ -18,6 +18,8 @@ class TissueBackend(ABC):
 
     touching: bool = False
     """Whether the sphere holds a vertex after the step."""
+    activation: float = 1.0
+    """How far guarding muscles are contracted, from 0 to 1: the a of `palpate_models.wall`."""
 
     def __init__(self, model: PhantomModel, breathing: BreathingCurve, dt: float) -> None:
         self.model = model
@@ -26,8 +28,6 @@ class TissueBackend(ABC):
         """Period of a step [s]."""
         self.breathing = breathing
         """How the body breathes."""
-        self.activation = 1.0
-        """How far guarding muscle is contracted, in [0, 1]: the a of `palpate_models.wall`, by which `tension` is multiplied."""
         self._guarding = Activation(model.voluntary, dt)
 
     @abstractmethod

@@ -78,6 +78,20 @@ def test_it_publishes_what_the_contract_says_and_presses_back():
     assert facts["lesion_depths_m"] == [0.02]
 
 
+def test_the_wall_of_a_scenario_stiffens_and_is_guarded():
+    def force(*settings):
+        service = create(load_scenario("deep_lesion", (*COARSE, *settings)), pitch_m=0.025)
+        inbox = OneTopic()
+        for k in range(201):
+            inbox.message = tool_state(k * MS, (0.56 + 0.06, 0.06, 0.93 + 0.015 - 1e-4 * k))
+            out = service.step(k * MS, inbox)
+        return out["sim/contact_wrench"].wrench.force.z
+
+    plain = force()
+    assert force("phantom.stiffness.stiffening_per_m=150") > 1.1 * plain
+    assert force("phantom.guarding=[{centre_m: [0.06, 0.06]}]") > 1.8 * plain
+
+
 def test_a_second_start_reads_the_cache(monkeypatch):
     def refuse(*_):
         raise AssertionError("computed again")

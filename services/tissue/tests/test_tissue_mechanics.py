@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -13,7 +12,6 @@ from scipy.sparse import csr_array
 
 from palpate_models import phantom as phantoms
 from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.guarding import FADING_S
 from palpate_models.patient import Lesion, Phantom, Stiffness
 from palpate_models.phantom import build_phantom
 from palpate_tissue.backends.winkler import kernel
@@ -398,22 +396,3 @@ def test_friction_is_the_bristle_of_its_docstring(friction):
         np.testing.assert_allclose(bristle.stretch, stretch, atol=1e-15)
         np.testing.assert_allclose(wrench, np.concatenate((force + pull, np.cross(arm, pull))), rtol=1e-9, atol=1e-12)
     assert slipped > 0
-
-
-def test_voluntary_guarding_feels_how_it_is_pressed():
-    """10 mm slowly, nothing for a while, then a quick press."""
-    tissue = WinklerTissue(replace(flat_phantom(0.06), voluntary=True), Stiffness())
-
-    def press(speed, seconds):
-        for k in range(round(seconds / tissue.dt)):
-            depth = speed * k * tissue.dt
-            tissue.step(0.0, np.array((0.0, 0.0, 0.015 - depth)), np.array((0.0, 0.0, -speed)), 0.015)
-
-    press(0.005, 2.0)
-    slow = tissue.activation
-    assert slow == pytest.approx(math.exp(-2 / FADING_S), rel=0.01)
-    for k in range(500):
-        tissue.idle(k * 1e-3)
-    assert tissue.activation == slow
-    press(0.1, 0.2)
-    assert tissue.activation > 0.9

@@ -52,6 +52,8 @@ class Compliance:
     """S [m/N] on the free vertices, shape (f, f), symmetric and positive definite."""
     free: NDArray[np.intp]
     """Which vertices those are, ascending, shape (f,)."""
+    young: Array
+    """Instantaneous Young's modulus of the solid there [Pa], shape (f,)."""
 
 
 def compliance(
@@ -74,14 +76,16 @@ def compliance(
             "(phantom.edge_m), or services.tissue = winkler"
         )
     thickness = float(np.ptp(model.vertices[:, 2])) if thickness_m is None else thickness_m
-    return Compliance(_Body(model, free, thickness, poisson, pitch_m).matrix(tuple(lesions)), free)
+    young = ModulusField(model, lesions).at_skin()[free]
+    return Compliance(_Body(model, free, thickness, poisson, pitch_m).matrix(tuple(lesions)), free, young)
 
 
 def uniform_compliance(model: PhantomModel, poisson: float = POISSON) -> tuple[Compliance, float]:
     """That of a uniform body under the same skin, and its foundation modulus [N/m^3]."""
     free = np.flatnonzero(~model.fixed)
     body = _Body(model, free, float(np.ptp(model.vertices[:, 2])), poisson, PITCH_M)
-    return Compliance(body.layer().astype(np.float32), free), body.uniform() / YOUNG_OVER_K_W
+    young = body.uniform()
+    return Compliance(body.layer().astype(np.float32), free, np.full(len(free), young)), young / YOUNG_OVER_K_W
 
 
 @dataclass(frozen=True)

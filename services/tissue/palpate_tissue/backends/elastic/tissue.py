@@ -3,11 +3,14 @@
 State of every free vertex: displacement u along its inward rest normal [m] and a relaxed part y_k a Prony branch. With S the
 instantaneous compliance,
 
-    S f = u - sum_k y_k + tau_d u',     y_k' = (g_k u - y_k) / tau_k,     f >= 0,  u >= w,  f (u - w) = 0
+    S (f - q(u)) = u - sum_k y_k + tau_d u',     y_k' = (g_k u - y_k) / tau_k,     f >= 0,  u >= w,  f (u - w) = 0
+
+q is the resistance of springs that stiffen with depth and of contracted muscle, where the model has any (`Springs`).
 
 The coefficients are the same at every vertex, so a step is a small matrix M and a vector b, the same everywhere:
-(u, y_1, ..)+ = M (u, y_1, ..) + b (S f). So only the vertices near the sphere are stepped each millisecond, and the others follow
-when they are asked for: by M^N for N steps, and by S times what the forces since then left behind, which the same M accumulates.
+(u, y_1, ..)+ = M (u, y_1, ..) + b S (f - q). So only the vertices near the sphere are stepped each millisecond, and the others
+follow when they are asked for: by M^N for N steps, and by S times what the forces since then left behind, which the same M
+accumulates.
 """
 
 from __future__ import annotations
@@ -24,12 +27,18 @@ from palpate_models.phantom import PhantomModel
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance
+from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
 from palpate_tissue.backends.elastic.patch import ElasticPatch
+from palpate_tissue.backends.elastic.springs import Springs
 from palpate_tissue.friction import Sphere, rub
 from palpate_tissue.near import Search
 
 _MARGIN_M = 0.0025
 """The vertices near the sphere are searched anew when it has moved this far."""
+_BESIDE_M = 0.025
+"""Springs act on the vertices under the sphere and this far beside it: what lies further adds less than 1 % to the force."""
+_DEEPER_M = 0.005
+"""How much deeper than now the skin may be pressed before the vertices near the sphere are searched anew."""
 
 
 def update_rule(stiffness: Stiffness, dt: float) -> tuple[Array, Array]:
@@ -74,7 +83,12 @@ class ElasticTissue(TissueBackend):
         self._excursion = 0.0
         free = compliance.free
         self._breathing = model.breathing[free]
-        self._search = Search(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M)
+        self._springs = Springs(
+            compliance.young / YOUNG_OVER_K_W * model.areas[free], model.stiffening[free], model.tension[free]
+        )
+        self._resists = bool(model.stiffening.any() or model.tension.any())
+        beside = _BESIDE_M if self._resists else 0.0
+        self._search = Search(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M, beside)
         self._state = np.zeros((len(self._feed), len(free)))
         """u and y_k of the free vertices as they were `_behind` steps ago."""
         self._behind = 0
@@ -89,9 +103,13 @@ class ElasticTissue(TissueBackend):
         patch = self._patch
         if patch is None or not patch.near.holds(p, radius):
             patch = self._gather(p, radius)
+        w = patch.hold(p_A, self._excursion)
+        if w.max(initial=0.0) > patch.deepest:
+            patch = self._gather(p, radius)
+            w = patch.hold(p_A, self._excursion)
         self._behind += 1
         wrench = np.zeros(6)
-        if len(patch.near.vertex) and patch.step(patch.hold(p_A, self._excursion), self._advance, self._feed):
+        if len(patch.near.vertex) and patch.step(w, self._advance, self._feed, self.activation):
             self.touching = self.disturbed = True
             sphere = Sphere(tuple(p), tuple(v_A.tolist()), (0.0, 0.0, 0.0) if w_A is None else tuple(w_A.tolist()), radius)
             rub(self.friction, sphere, patch.push(), self.dt, wrench)
@@ -139,6 +157,9 @@ class ElasticTissue(TissueBackend):
         index = near.vertex
         local = self._feed[0] * self.compliance.matrix[np.ix_(index, index)].astype(np.float64)
         self._patch = patch = ElasticPatch(near, self._breathing[index], self._state[:, index].copy(), local)
+        if self._resists and len(index):
+            w = patch.hold(np.array(p), self._excursion)
+            patch.resist(self._springs.at(index), max(deepest, float(w.max())) + _DEEPER_M)
         if old is not None and self.touching:
             patch.solver.begin_with(np.isin(index, old.near.vertex[old.solver.active]))
         return patch
@@ -182,11 +203,15 @@ class ElasticTissue(TissueBackend):
         return u - self._excursion * self.model.breathing if self._excursion else u
 
     def energy(self) -> float:
-        """Elastic energy [J] stored in the solid, the Maxwell branches' included. Factorises S: not for every step."""
+        """Elastic energy [J] stored in the solid, the Maxwell branches' included, and in the springs near the sphere.
+
+        Factorises S: not for every step.
+        """
         self._catch_up()
         u, *branches = self._state
         fields = [np.sqrt(1 - sum(self._prony_g)) * u]
         fields += [np.sqrt(g) * (u - y / g) for g, y in zip(self._prony_g, branches, strict=True) if g > 0]
         stack = np.stack(fields, axis=1)
         stored = 0.5 * float((stack * np.linalg.solve(self.compliance.matrix.astype(np.float64), stack)).sum())
-        return stored + self.friction.energy()
+        springs = 0.0 if self._patch is None else self._patch.spring_energy(self.activation)
+        return stored + springs + self.friction.energy()

@@ -1,0 +1,168 @@
+"""Stiffening and guarding in the elastic tissue: against an independent solution, what they do to the force, energy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from palpate_models import wall
+from palpate_models.guarding import FADING_S
+from palpate_models.patient import Lesion, Stiffness
+from palpate_models.phantom import PhantomModel, flat_phantom
+from palpate_models.phantom.tension import tension_of_ratio
+from palpate_tissue.backends.elastic.compliance import Compliance, compliance
+from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
+from palpate_tissue.backends.elastic.tissue import ElasticTissue
+
+STILL = np.zeros(3)
+ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
+RADIUS_M = 0.010
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def model(stiffening: float = 0.0, tension: float = 0.0, voluntary: bool = False, half_m: float = 0.045) -> PhantomModel:
+    plain = plane(half_m)
+    each = np.ones(len(plain.vertices))
+    return replace(plain, stiffening=stiffening * each, tension=tension * each, voluntary=voluntary)
+
+
+@cache
+def plane(half_m: float) -> PhantomModel:
+    return flat_phantom(half_m, 0.005)
+
+
+@cache
+def layer(half_m: float = 0.045) -> Compliance:
+    return compliance(plane(half_m), (), 0.2)
+
+
+def press(tissue: ElasticTissue, depth: float, speed: float = 0.005) -> float:
+    """Force at the end of an even press from the untouched skin."""
+    v, force = np.array((0.0, 0.0, -speed)), STILL
+    for k in range(1, round(depth / speed / tissue.dt) + 1):
+        force, _ = tissue.step(k * tissue.dt, np.array((0.0, 0.0, RADIUS_M - speed * k * tissue.dt)), v, RADIUS_M)
+    return float(force[2])
+
+
+@pytest.mark.parametrize(("stiffening", "tension"), [(120.0, 0.0), (0.0, 5.0), (400.0, 2.0)])
+def test_the_step_settles_where_the_energy_is_least(stiffening: float, tension: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against the minimum of solid's and springs' energy over all displacements that leave the sphere alone."""
+    monkeypatch.setattr("palpate_tissue.backends.elastic.tissue._BESIDE_M", 0.1)
+    tissue = ElasticTissue(model(stiffening, tension), layer(), ELASTIC)
+    p = np.array((0.0, 0.0, RADIUS_M - 0.008))
+    for k in range(1500):
+        force, _ = tissue.step(k * 1e-3, p, STILL, RADIUS_M)
+    xyz, free = tissue.model.vertices, tissue.compliance.free
+    r = np.linalg.norm(xyz[free, :2], axis=1)
+    rim = r < 0.97 * RADIUS_M
+    w = np.where(rim, 0.008 - RADIUS_M + np.sqrt(np.maximum(RADIUS_M**2 - r**2, 0.0)), -1.0)
+    solid = np.linalg.inv(layer().matrix.astype(np.float64))
+    gain = 1.7e5 * tissue.model.areas[free]
+
+    def energy(u: np.ndarray) -> tuple[float, np.ndarray]:
+        pressed = np.maximum(u, 0.0)
+        b = np.full(len(u), stiffening)
+        stored = 0.5 * u @ solid @ u + gain @ (wall.stored(u, b) + 0.5 * tension * pressed**2)
+        return 1e3 * stored, 1e3 * (solid @ u + gain * (wall.stress(u, b) + tension * pressed))
+
+    least = minimize(
+        energy, np.maximum(w, 0.0), jac=True, method="L-BFGS-B", bounds=[(x, None) for x in w],
+        options={"maxiter": 5000, "maxfun": 20_000, "ftol": 1e-15, "gtol": 1e-9},
+    )  # fmt: skip
+    np.testing.assert_allclose(tissue.displacement[free], least.x, atol=2e-6)
+    assert force[2] == pytest.approx(1e-3 * energy(least.x)[1][least.x <= w + 1e-12].sum(), rel=2e-3)
+
+
+def test_springs_far_from_the_sphere_hardly_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    near = [press(ElasticTissue(model(*law, half_m=0.1), layer(0.1)), 0.010, 0.02) for law in ((150.0, 0.0), (0.0, 1.0))]
+    monkeypatch.setattr("palpate_tissue.backends.elastic.tissue._BESIDE_M", 0.06)
+    wide = [press(ElasticTissue(model(*law, half_m=0.1), layer(0.1)), 0.010, 0.02) for law in ((150.0, 0.0), (0.0, 1.0))]
+    np.testing.assert_allclose(near, wide, rtol=0.01)
+
+
+def test_force_rises_with_stiffening_the_more_the_deeper() -> None:
+    linear = [press(ElasticTissue(model(), layer()), d) for d in (0.005, 0.010)]
+    bent = [press(ElasticTissue(model(150.0), layer()), d) for d in (0.005, 0.010)]
+    shallow, deep = (b / a for a, b in zip(linear, bent, strict=True))
+    assert 1 < shallow < 1.04
+    assert deep > 1.08
+
+
+@pytest.mark.parametrize("ratio", [1.5, 2.6, 5.2])
+def test_contracted_muscle_makes_nearly_the_ratio_of_the_scenario(ratio: float) -> None:
+    """Nearly: the tension is that of a foundation, and the solid spreads the load a little wider."""
+    tension = tension_of_ratio(ratio, Stiffness())
+    relaxed = press(ElasticTissue(model(half_m=0.08), layer(0.08)), 0.010)
+    contracted = press(ElasticTissue(model(0.0, tension, half_m=0.08), layer(0.08)), 0.010)
+    assert 0.9 * ratio < contracted / relaxed < ratio
+
+
+def test_voluntary_guarding_fades_under_a_slow_press_and_involuntary_stays() -> None:
+    relaxed, voluntary, involuntary = (
+        ElasticTissue(model(0.0, tension, kind), layer()) for tension, kind in ((0.0, False), (5.0, True), (5.0, False))
+    )
+    forces = []
+    for tissue in (relaxed, voluntary, involuntary):
+        pressed = [press(tissue, 0.010)]
+        for k in range(8000):
+            force, _ = tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.0)), STILL, RADIUS_M)
+        forces.append((*pressed, force[2]))
+    ratios = np.array(forces[1:]) / forces[0]
+    assert ratios[0, 0] < 0.9 * ratios[1, 0]
+    assert ratios[0, 1] == pytest.approx(1, abs=0.12)
+    assert ratios[1, 1] > 2.3
+    assert voluntary.activation == pytest.approx(math.exp(-10 / FADING_S), rel=0.02)
+    assert involuntary.activation == 1
+
+
+def test_springs_are_as_stiff_as_the_skin_of_a_lesion() -> None:
+    column = Lesion(centre_m=(0.0, 0.0), radii_m=(0.02, 0.02), contrast=4)
+    deep = column.model_copy(update={"depth_m": 0.02})
+    skin = [compliance(plane(0.045), (lesion,), 0.05, pitch_m=0.02).young for lesion in (column, deep)]
+    assert skin[0].max() == pytest.approx(4 * 1.7e5 * YOUNG_OVER_K_W)
+    np.testing.assert_allclose(skin[1], 1.7e5 * YOUNG_OVER_K_W)
+
+
+@pytest.mark.parametrize("dashpot_s", [0.05, 1e-4])
+@pytest.mark.parametrize(("stiffening", "tension"), [(300.0, 0.0), (0.0, 20.0), (300.0, 5.0)])
+def test_no_closed_cycle_yields_work(stiffening: float, tension: float, dashpot_s: float) -> None:
+    """A wandering path that dips in and out, on a plane so wide that springs come within reach and leave it."""
+    stiffness = Stiffness(friction=0.0, dashpot_s=dashpot_s)
+    tissue = ElasticTissue(model(stiffening, tension, half_m=0.08), layer(0.08), stiffness)
+    t = np.linspace(0, 2 * np.pi, 1001)
+    path = np.column_stack(
+        (0.03 * np.sin(t), 0.02 * np.sin(2 * t + 0.3), RADIUS_M + 0.004 - 0.006 * (1 - np.cos(t)) * (1 + 0.4 * np.cos(5 * t)))
+    )
+    work = touched = 0.0
+    for k, (a, b) in enumerate(pairwise(path)):
+        force, _ = tissue.step(0, b, (b - a) / tissue.dt, RADIUS_M)
+        work -= force @ (b - a)
+        touched += tissue.touching
+        if k % 20 == 0:
+            assert tissue.energy() <= 1.001 * work + 1e-6  # never more than was put in
+    assert touched > 500
+    assert work > 0
+
+
+def test_left_alone_it_only_loses_energy() -> None:
+    tissue = ElasticTissue(model(300.0, 5.0), layer(), Stiffness(friction=0.0))
+    press(tissue, 0.012, 0.05)
+    energies = []
+    for k in range(300):
+        tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.020)), STILL, RADIUS_M)
+        assert not tissue.touching
+        energies.append(tissue.energy())
+    assert (np.diff(energies) <= 1e-12).all()
+    assert energies[-1] < 0.5 * energies[0]
