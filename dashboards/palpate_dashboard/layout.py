@@ -97,6 +97,7 @@ def blueprint(
             rrb.StateTimelineView(name="Health", origin="/health"),
             rrb.TextLogView(name="Log", origin="/log"),
             rrb.TextDocumentView(name="Legend", origin="/text/legend"),
+            rrb.TextDocumentView(name="TRUTH", origin="/text/truth"),
         ),
         rrb.StateTimelineView(name="Phase and driver", origin="/state"),
         _plot("Normal force [N]", "/plots/force", -1.0, 1.1 * force_limit_n),

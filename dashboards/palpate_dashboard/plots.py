@@ -57,14 +57,15 @@ Series = tuple[str, tuple[int, int, int]]
 class Plots:
     """Draws the curves and words into a recording."""
 
-    def __init__(self, recording: rr.RecordingStream, columns: Columns, force_limit_n: float, legend: str) -> None:
-        """`force_limit_n`: the working limit [N], drawn as a line; `legend`: markdown, what the colours mean."""
+    def __init__(self, recording: rr.RecordingStream, columns: Columns, force_limit_n: float, legend: str, truth: str) -> None:
+        """`force_limit_n`: the working limit [N], drawn as a line; `legend` and `truth`: pages in markdown."""
         self._recording = recording
         self._columns = columns
         self._limit = np.array([force_limit_n])
         self._states: dict[str, str] = {}
         self._texts: dict[str, str] = {}
-        recording.log("text/legend", rr.TextDocument(legend, media_type=rr.MediaType.MARKDOWN), static=True)
+        for name, page in (("legend", legend), ("truth", truth)):
+            recording.log(f"text/{name}", rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
         self._series("plots/force/measured", [("measured [N]", (255, 110, 110))])
         self._series("plots/force/true", [("true [N]", (150, 110, 240))])
         self._series("plots/force/limit", [("working limit [N]", (240, 200, 60))], width=1.0)

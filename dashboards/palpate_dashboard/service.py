@@ -20,7 +20,7 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_matrix, transform_matrix
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
-from palpate_dashboard import arrays, palette, patient, plots, words
+from palpate_dashboard import arrays, palette, patient, plots, truth, words
 from palpate_dashboard.columns import Columns
 from palpate_dashboard.force_depth import ForceDepth, ForceDepthPlane
 from palpate_dashboard.geometry import VertexNormals, creased, level_lines
@@ -72,7 +72,7 @@ class DashboardService(Service):
     role = "dashboard"
 
     def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True) -> None:
-        """Uses the exam's input and the robot of `scenario`, not its phantom; `paced`: whether the pace is worth showing.
+        """Of the truth in `scenario` it makes a page, no more; `paced`: whether the pace is worth showing.
 
         Without a `path` nothing is kept in a file.
 
@@ -92,7 +92,7 @@ class DashboardService(Service):
         self._columns = Columns(self._recording)
         self._scene = SceneView(self._recording, self._columns)
         self._map = MapView(self._recording, exam.region_m, exam.centre_m)
-        self._plots = Plots(self._recording, self._columns, limit, words.LEGEND)
+        self._plots = Plots(self._recording, self._columns, limit, words.LEGEND, truth.page(scenario))
         self._shapes = dict(_shapes(given.robot))
         for box in table.boxes(given.robot):
             self._scene.box(box.name, box.X_WB, box.size, FURNITURE.get(box.name, palette.STEEL))

@@ -100,13 +100,8 @@ def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
     assert {"/world/patient/drape", "/world/patient/head", "/world/furniture/tripod"} <= recording.static
     for box in ("table_top", "table_column", "robot_base"):
         assert f"/world/furniture/{box}" in recording.static
-    assert {
-        "/world/truth/lesions",
-        "/world/truth/axes",
-        "/map/mean/truth",
-        "/map/mean/legend",
-        "/world/camera",
-    } <= recording.static
+    assert {"/world/truth/lesions", "/world/truth/axes", "/map/mean/truth", "/text/truth"} <= recording.static
+    assert {"/map/mean/legend", "/world/camera"} <= recording.static
 
 
 def test_the_only_timeline_is_simulated_time(whole: tuple[Recording, dict[str, Any]]) -> None:
@@ -313,7 +308,7 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
             for name, message in new.items():
                 writer.add_message(ids[name], t, codec.encode(message, contract().topics[name].type), t)
         writer.finish()
-    with pytest.raises(FileNotFoundError, match=r"exam\.yaml"):
+    with pytest.raises(FileNotFoundError, match=r"scenario\.yaml"):
         replay.main(tmp_path)
     (tmp_path / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
     again = Recording(replay.main(tmp_path))

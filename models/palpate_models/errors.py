@@ -28,7 +28,8 @@ Level = Literal["none", "typical", "poor"]
 LEVEL: Final[Level] = "none"
 """What a scenario that says nothing gets."""
 MOMENT_PER_FORCE_M: Final = 5 / 145
-"""What an F/T sensor gets wrong in moment [N m] over what it gets wrong in force [N]: the ratio of its ranges (ATI Mini45 SI-145-5)."""
+"""What an F/T sensor gets wrong in moment [N m] over what it gets wrong in force [N]: the ratio of its ranges, as of an ATI
+Mini45 SI-145-5."""
 FIELD_WAVES: Final = 4
 """The camera's bias field is made of so many cosines along each side of the image."""
 SPREAD: Final = 0.4

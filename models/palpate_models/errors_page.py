@@ -1,4 +1,4 @@
-"""docs/errors.md, made from the fields in `errors.py` and the table in `error_levels.yaml`: `python -m palpate_models.errors_page`."""
+"""docs/errors.md, from the fields in `errors.py` and the table in `error_levels.yaml`: `python -m palpate_models.errors_page`."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ Made from [`errors.py`](../models/palpate_models/errors.py) and
     palpate run --set errors=typical                              a level: none, typical or poor; {LEVEL} is the default
     palpate run --set errors=poor --set errors.force.tare_n=0.1   a level, and a field of one's own
 
-From the seed of the scenario one set of equipment is drawn for each patient: the errors below are standard deviations or bounds of
-what is drawn, as each field says. Simulated robot, tool, sensor and camera, and the true pose of the patient, have these errors.
-Control, planning, perception, assessment and supervisor have the nominal equipment, as on hardware, and are told neither the errors
-nor the seed. Drivers of real hardware (`lbr`, `ros`) ignore this section; the emulator of the LBR has it.
+From the seed of the scenario one set of equipment is drawn for each patient: the errors below are standard deviations or bounds
+of what is drawn, as each field says. Simulated robot, tool, sensor and camera, and the true pose of the patient, have these
+errors. Control, planning, perception, assessment and supervisor have the nominal equipment, as on hardware, and are told neither
+the errors nor the seed. Drivers of real hardware (`lbr`, `ros`) ignore this section; the emulator of the LBR has it.
 
 The level `none` is a clean world for tests: the white noise of good sensors, and the constant bias of a force/torque sensor,
 which every examination tares. A pose's `offset` adds an error of one's own choice to what is drawn.
 
-Marks of certainty: V read in the source (mostly abstracts and threads of issues; "name #n" is one of that repository), S second-hand,
-C computed by us, A assumed. A mark in brackets inside a source holds for the words before it.
+Marks of certainty: V read in the source (mostly abstracts and threads of issues; "name #n" is one of that repository), S
+second-hand, C computed by us, A assumed. A mark in brackets inside a source holds for the words before it.
 
-Not modelled: tool and flange that are mounted askew, bent joint axes, motor dynamics of a flexible joint, distortion of the
-camera's lens, errors of depth that grow with distance, hysteresis of the force/torque sensor, moments that a temperature gradient makes.
+Not modelled: a tool that is mounted askew, bent joint axes, motor dynamics of a flexible joint, distortion of the camera's lens,
+errors of depth that grow with distance, hysteresis of the force/torque sensor.
 """
 
 

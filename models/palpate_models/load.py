@@ -24,9 +24,13 @@ HIDDEN: Mapping[View, dict[str, Any]] = {
     "exam": {**_PATIENT, "seed": True, "errors": True},
 }
 """What is left out: of the plant's view what tells of the patient, of the exam's also what the truth could be drawn from."""
-_VIEWS: Mapping[str, View] = dict.fromkeys(("tissue", "dashboard", "recorder"), "scenario") | dict.fromkeys(
-    ("robot", "camera"), "plant"
-)
+_VIEWS: Mapping[str, View] = {
+    "tissue": "scenario",
+    "dashboard": "scenario",
+    "recorder": "scenario",
+    "robot": "plant",
+    "camera": "plant",
+}
 _MERGE = "tag:yaml.org,2002:merge"
 
 

@@ -12,6 +12,7 @@ from palpate.check.report import ConformanceReport, Verdict
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
 from palpate.check.suites import SUITES, check
+from palpate.check.suites.tissue import STILL
 from palpate.command_line import refuse
 from palpate.live.connection import Connect
 from palpate.live.console import EXIT_TROUBLE, command, console, print_json, table
@@ -34,7 +35,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
         str | None,
         typer.Option(metavar="NAME_OR_FILE", help="Check an installed one or a Python file in this process, in simulated time."),
     ] = None,
-    scenario: Annotated[str, typer.Option(help="What it was configured with.")] = "rlq_guarding",
+    scenario: Annotated[str, typer.Option(help="What it was configured with; its patient holds the breath.")] = "rlq_guarding",
     motion: Annotated[bool, typer.Option("--motion", help="It may move: needed for most of the robot's checks.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
     slack: Annotated[float, typer.Option(help="Milliseconds that transport and scheduler may add to a reaction.")] = 150.0,
@@ -51,7 +52,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
         if role not in SUITES:
             raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
         try:
-            settings = RigSettings(load_scenario(scenario), slack, motion or role != "robot" or service is not None)
+            settings = RigSettings(load_scenario(scenario, STILL), slack, motion or role != "robot" or service is not None)
             report = None if service is None else _check_here(role, service, settings)
         except (ScenarioError, ChoiceError) as error:
             refuse(error)

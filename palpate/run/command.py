@@ -149,8 +149,10 @@ def prepare(
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     settings: Settings = None,
 ) -> None:
-    """Write scenario.yaml (for tissue, observers and scoring), plant.yaml (for robot and camera) and exam.yaml (for everybody
-    else): the first step of a run in containers."""
+    """Write the scenario files of a run in containers, its first step.
+
+    scenario.yaml is for tissue, observers and scoring, plant.yaml for robot and camera, exam.yaml for everybody else.
+    """
     write_scenario_files(usable(scenario, settings, seed, elsewhere=True), out)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,14 @@ from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
 from palpate.check.suites import SUITES, check
+from palpate.check.suites.tissue import STILL
 from palpate_bus.implementations import create, names
-from palpate_bus.messages import JointTorqueCommand
+from palpate_bus.messages import JointTorqueCommand, Point, Pose
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.load import load_scenario
 
-SCENARIO = load_scenario("rlq_guarding")
+SCENARIO = load_scenario("rlq_guarding", STILL)
 HARDWARE = {"robot.lbr", "camera.ros", "camera.replay"}
 """By the wall clock only: `palpate check` takes them live; and the replay, whose own tests check it on a recorded plane."""
 SLOW = {"robot.mujoco", "supervisor.default", "tissue.elastic"}
@@ -102,6 +104,12 @@ def wrong_torque_sign(t: int, outbox: dict[str, Any]) -> None:
     outbox["control/joint_torque"] = JointTorqueCommand(command.header, -command.torque, command.valid_for, command.problem)
 
 
+def elsewhere(t: int, outbox: dict[str, Any]) -> None:
+    if "truth/patient" in outbox:
+        patient = outbox["truth/patient"]
+        outbox["truth/patient"] = replace(patient, pose=Pose(Point(0.0, 0.0, 1.0), patient.pose.orientation))
+
+
 def millimetres(t: int, outbox: dict[str, Any]) -> None:
     image = outbox.get("camera/depth/image_raw")
     if image is not None:
@@ -126,6 +134,7 @@ SPOILT = [
     ("robot", never_holds, "holds safely when commands cease"),
     ("robot", degrees, "joints within their limits"),
     ("tissue", pulls, "a pressed surface pushes back, outward"),
+    ("tissue", elsewhere, "truth/patient: lies where truth/phantom says"),
     ("control", never_expires, "stops commanding when set-points cease"),
     ("control", wrong_torque_sign, "mode CARTESIAN: the torques of stiffness times offset, J^T F"),
     ("camera", millimetres, "a level plane is where it is"),

@@ -1,4 +1,4 @@
-"""Role tissue: the suite moves an indenter over it: above, pressed in, sliding, out again."""
+"""Role tissue: the suite moves an indenter over it: above, pressed in, sliding, out again. The patient holds the breath."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from palpate_models.frames import Array
 
 WRENCH = "sim/contact_wrench"
 TRUTH = "truth/indentation"
+PATIENT = "truth/patient"
+STILL = ("phantom.breathing.kind=none", "phantom.motion.kind=none")
+"""Settings of a scenario whose patient neither breathes nor moves: what is felt comes from the indenter alone."""
 SPEED = 0.02
 DEPTH = 0.008
 CLEARANCE = 0.01
@@ -66,6 +69,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
         return
     p_W, n_W = _spot(truth, report)
     radius = rig.settings.scenario.robot.indenter_radius_m
+    _check_patient(rig, truth, report)
     report.section("contact")
     touch = p_W + n_W * radius
     tool = PressingTool(touch + n_W * CLEARANCE, radius)
@@ -110,6 +114,21 @@ def _spot(truth: Any, report: ConformanceReport) -> tuple[Array, Array]:
     R_WA, p_WA = rotation(truth.pose.orientation), vector(truth.pose.position)
     top = np.argmin(np.hypot(vertices[:, 0], vertices[:, 1]) - 1e-3 * vertices[:, 2])
     return R_WA @ vertices[top] + p_WA, R_WA @ normals[top]
+
+
+def _check_patient(rig: Rig, phantom: Any, report: ConformanceReport) -> None:
+    patient = rig.last(PATIENT)
+    if patient is None:
+        return
+    apart = float(np.linalg.norm(vector(patient.pose.position) - vector(phantom.pose.position)))
+    turned = rotation(phantom.pose.orientation).T @ rotation(patient.pose.orientation)
+    report.expect(
+        "truth/patient: lies where truth/phantom says",
+        apart < 1e-6 and float(np.trace(turned)) > 3 - 1e-9,
+        "the same pose",
+        f"{1e3 * apart:.3g} mm apart",
+    )
+    report.expect("truth/patient: holds the breath", patient.excursion == 0, "0 mm", f"{1e3 * patient.excursion:.2f} mm")
 
 
 def _check_free(heard: list[HeardMessage], report: ConformanceReport, name: str) -> None:

@@ -36,8 +36,7 @@ def photograph(frames: int = 1, seed: int = 0, **given: float) -> np.ndarray:
     """Depth images [m] of a flat patient on the table, shape (frames, height, width)."""
     errors = Errors(level="none", camera=CameraErrors(**given))
     camera, inbox = CameraService(plant_input(Scenario(seed=seed, errors=errors))), HandInbox()
-    corners = np.array([(-0.15, -0.15), (0.15, -0.15), (0.15, 0.15), (-0.15, 0.15)]) + (0.56, 0.0)
-    vertices = np.column_stack((corners, np.full(4, 0.9))).astype(np.float32)
+    vertices = np.array([(0.41, -0.15, 0.9), (0.71, -0.15, 0.9), (0.71, 0.15, 0.9), (0.41, 0.15, 0.9)], np.float32)
     surface = SurfaceMesh(header(0, "world"), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]))
     inbox.receive({"sim/surface": surface, "planning/camera_trigger": CameraTrigger(header(0), frames)})
     sent: list[Any] = [camera.step(0, inbox)]

@@ -27,8 +27,10 @@ _NOISE_BLOCK: Final = 1024
 
 @compiled
 def _read(table: Array, q: Array, v: Array, torque: Array, dt: float) -> Array:
-    """Readings of position and velocity, shape (2, 7). `table` (5, 7): zero, compliance, amplitude, phase, and d, which is moved on
-    by `dt` [s]."""
+    """Readings of position and velocity, shape (2, 7), after a step of `dt` [s].
+
+    `table`, shape (5, 7), has zero, compliance, amplitude, phase, and d, which is moved on.
+    """
     out = np.empty((2, 7))
     for i in range(7):
         rate = (table[1, i] * torque[i] - table[4, i]) / SETTLING_S

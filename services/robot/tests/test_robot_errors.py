@@ -39,7 +39,7 @@ def arm(seed: int = 0, **given: float) -> DrawnArm:
     return draw_errors(Errors(level="none", arm=ArmErrors(**{**STILL, **given})), seed).arm
 
 
-def readings(drawn: DrawnForce, n: int, period_s: float = DT, seed: int = 1, wrench: Any = np.zeros(6)) -> Array:
+def readings(drawn: DrawnForce, n: int, period_s: float = DT, seed: int = 1, wrench: Any = (0.0,) * 6) -> Array:
     """Shape (n, 6)."""
     sensor = FtSensor(drawn, rng(seed), period_s)
     return np.array([sensor.read(wrench) for _ in range(n)])

@@ -31,7 +31,7 @@ from palpate_models.scenario import Robot
 from palpate_models.table import boxes
 from palpate_robot.backends.dart.clearance import Clearance
 from palpate_robot.backends.dart.kinematics import Kinematics
-from palpate_robot.plant import DT, NOMINAL_ARM, END_STOP_MARGIN_RAD, FIXED_LINKS, STICK_RADPS, Wrench
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM, STICK_RADPS, Wrench
 
 LEAST_CLEARANCE_RAD: Final = 0.01
 """Closer than this, in angle, DART looks for contacts: far more than a step turns."""

@@ -17,7 +17,7 @@ from palpate_models.frames import Array
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot
 from palpate_models.table import boxes
-from palpate_robot.plant import DT, NOMINAL_ARM, END_STOP_MARGIN_RAD, FIXED_LINKS
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM
 
 SUBSTEPS: Final = 2
 """Integration steps a millisecond: another step size than the DART plant's, so that what depends on it shows."""
@@ -74,7 +74,10 @@ def _add_shape(body: Any, capsule: lbr.Capsule) -> None:
 
 
 def build(robot: Robot, drawn: DrawnArm = NOMINAL_ARM) -> Any:
-    """The compiled model of the nominal robot with an arm that differs as `drawn` says: bodies named as in `lbr.LINK_NAMES`, seven joints, force and torque sensors at the measuring face."""
+    """The compiled model of the nominal `robot` with an arm that differs from it as `drawn` says.
+
+    Bodies are named as in `lbr.LINK_NAMES`; it has seven joints, and force and torque sensors at the measuring face.
+    """
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.compiler.balanceinertia = False

@@ -1,0 +1,68 @@
+"""What no sensor tells of a run, in markdown: how the patient breathes and moves, and what was drawn of the errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate_models.breathing import BreathingCurve
+from palpate_models.errors import DrawnErrors, draw_errors
+from palpate_models.frames import Array
+from palpate_models.motion import BodyMotion
+from palpate_models.scenario import Scenario
+
+
+def page(scenario: Scenario) -> str:
+    """The page on the truth behind a scenario that is simulated. Observers alone may see it."""
+    drawn = draw_errors(scenario.errors, scenario.seed)
+    rows = [*_patient(scenario), *_equipment(drawn)]
+    return "\n".join((
+        "**TRUTH, which none of those who examine knows.** What was drawn for this patient and simulated equipment, "
+        f"from seed {scenario.seed}.",
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in rows),
+    ))  # fmt: skip
+
+
+def _patient(scenario: Scenario) -> list[tuple[str, str]]:
+    breathing, phantom = BreathingCurve(scenario.phantom.breathing, scenario.seed), scenario.phantom
+    motion = BodyMotion(phantom.motion, scenario.seed)
+    breaths = breathing.table
+    breath = "none"
+    if len(breaths):
+        rate = 60 * len(breaths) / breathing.repeats_s
+        breath = f"{phantom.breathing.kind}, {rate:.1f} a minute, {1e3 * breaths[:, 4].mean():.1f} mm, at most "
+        breath += f"{1e3 * breathing.largest_m:.1f} mm"
+    moves = f"{phantom.motion.kind} from {motion.at_s:.1f} s to {motion.until_s:.1f} s" if motion.moves else "none"
+    if motion.moves:
+        moves += f": {_offset(motion.pose(motion.until_s))}"
+    return [("breathing", breath), ("motion", moves)]
+
+
+def _equipment(drawn: DrawnErrors) -> list[tuple[str, str]]:
+    force, camera, arm = drawn.force, drawn.camera, drawn.arm
+    gain = 100 * (np.diag(force.sensitivity)[:3] - 1)
+    return [
+        ("force, bias", f"{_triple(force.bias[:3])} N"),
+        ("force, when warm", f"{_triple(force.warm_up[:3])} N"),
+        ("force, gain", f"{_triple(gain)} %"),
+        ("camera, offset", f"{1e3 * camera.offset_m:+.1f} mm, {1e3 * camera.warm_up_m:+.1f} mm more when warm"),
+        ("camera, largest bias over the image", f"{1e3 * camera.given.field_m:.1f} mm, {len(camera.lost)} patches lost"),
+        ("camera, true in the calibrated frame", _offset(drawn.X_CCt)),
+        ("patient, true in the registered frame", _offset(drawn.X_AAt)),
+        ("arm, largest joint offset", f"{1e3 * np.linalg.norm(arm.origin_m, axis=1).max():.2f} mm"),
+        ("arm, largest joint zero", f"{1e3 * np.abs(arm.zero_rad).max():.2f} mrad"),
+        ("arm, true over nominal friction", f"{arm.friction.min():.2f} to {arm.friction.max():.2f}"),
+        ("tool, true over nominal mass", f"{arm.tool_mass:.3f}"),
+    ]
+
+
+def _triple(values: Array) -> str:
+    return ", ".join(f"{value:+.2f}" for value in values)
+
+
+def _offset(X: Array) -> str:
+    """A small pose: translation, and rotation vector."""
+    return f"{_triple(1e3 * X[:3, 3])} mm; {_triple(np.degrees(Rotation.from_matrix(X[:3, :3]).as_rotvec()))} degrees"

@@ -1,0 +1,42 @@
+"""The page on the truth: it tells what the tissue, the robot and the camera draw."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from palpate_dashboard.truth import page
+from palpate_models.breathing import Breathing, BreathingCurve
+from palpate_models.errors import Errors, draw_errors
+from palpate_models.motion import BodyMotion, Motion
+from palpate_models.patient import Phantom
+from palpate_models.scenario import Scenario
+
+
+def numbers(scenario: Scenario, row: str) -> list[float]:
+    (line,) = [line for line in page(scenario).splitlines() if line.startswith(f"| {row} |")]
+    return [float(found) for found in re.findall(r"[-+]?\d+\.?\d*", line.removeprefix(f"| {row} |"))]
+
+
+def test_it_tells_what_was_drawn() -> None:
+    phantom = Phantom(breathing=Breathing(kind="quiet"), motion=Motion(kind="shift"))
+    scenario = Scenario(seed=7, phantom=phantom, errors=Errors(level="poor"))
+    drawn = draw_errors(scenario.errors, 7)
+    np.testing.assert_allclose(numbers(scenario, "force, bias"), drawn.force.bias[:3], atol=0.006)
+    true = numbers(scenario, "patient, true in the registered frame")
+    np.testing.assert_allclose(true[:3], 1e3 * drawn.X_AAt[:3, 3], atol=0.006)
+    np.testing.assert_allclose(numbers(scenario, "tool, true over nominal mass"), drawn.arm.tool_mass, atol=6e-4)
+    assert numbers(scenario, "breathing")[-1] == round(1e3 * BreathingCurve(phantom.breathing, 7).largest_m, 1)
+    moved = numbers(scenario, "motion")
+    motion = BodyMotion(phantom.motion, 7)
+    np.testing.assert_allclose(moved[:2], (motion.at_s, motion.until_s), atol=0.06)
+    np.testing.assert_allclose(moved[2:5], 1e3 * motion.pose(1e3)[:3, 3], atol=0.006)
+
+
+def test_another_seed_has_another_truth_and_a_clean_world_has_none() -> None:
+    errors = Errors(level="typical")
+    assert page(Scenario(seed=1, errors=errors)) != page(Scenario(seed=2, errors=errors))
+    clean = Scenario(seed=1)
+    assert numbers(clean, "patient, true in the registered frame") == [0] * 6
+    assert numbers(clean, "breathing") == numbers(clean, "motion") == []
