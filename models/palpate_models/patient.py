@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from palpate_models.anatomy import Anatomy
 from palpate_models.breathing import Breathing
+from palpate_models.draw import Build, Draw
 from palpate_models.guarding import Guarding
 from palpate_models.motion import Motion
 from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
 
 
 class Lesion(Section):
-    """A stiff area of elliptic outline in the abdomen's xy plane."""
+    """A lump: stiffer or softer than its surroundings, of elliptic outline in the abdomen's xy plane."""
 
     centre_m: Vec2
     """Centre, x to the patient's left and y to the head, from the umbilicus."""
     radii_m: tuple[Length, Length] = (0.03, 0.03)
     """Half axes of the half-contrast outline."""
-    contrast: Annotated[float, Field(gt=1, le=20)] = 4.0
-    """Stiffness at its centre over the stiffness without it. What is looked for, and scored, is stiffer than its surroundings."""
+    contrast: Annotated[float, Field(ge=0.1, le=20)] = 4.0
+    """Stiffness at its centre over the stiffness without it; below 1 it is softer than its surroundings. Not 1."""
     edge_m: Positive = 0.008
     """Width of the smooth edge."""
     depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
-    """How far below the skin it begins (services.tissue: elastic): an ellipsoid whose vertical half axis is the smaller of
-    `radii_m`. None: it reaches from the skin inward. The surface tier knows no depth: there every lesion lies in the skin."""
+    """How far below the skin it begins: an ellipsoid whose vertical half axis is the smaller of `radii_m`. The surface tier has the
+    factor that this ellipsoid gives to the skin (`palpate_models.phantom.buried`). None: it reaches from the skin inward."""
+
+    @model_validator(mode="after")
+    def _contrast(self) -> Self:
+        if self.contrast == 1:
+            raise ValueError("contrast = 1 is no lump; want 0.1 to 20 and not 1")
+        return self
 
 
 class Background(Section):
@@ -58,7 +66,7 @@ class Stiffness(Section):
     """Coulomb friction between indenter and skin."""
 
     @model_validator(mode="after")
-    def _prony(self) -> Stiffness:
+    def _prony(self) -> Self:
         if len(self.prony_g) != len(self.prony_tau_s):
             raise ValueError("prony_g and prony_tau_s need as many entries as each other")
         if sum(self.prony_g) >= 1:
@@ -69,7 +77,14 @@ class Stiffness(Section):
 class Phantom(Section):
     """The abdomen. Reaches only tissue and scoring."""
 
-    kind: Literal["parametric", "mesh"] = "parametric"
+    kind: Literal["parametric", "person", "mesh"] = "parametric"
+    """`person`: size, wall and anatomy are drawn from the scenario's seed as living people vary (`palpate_models.person`)."""
+    build: Build = Build.DRAWN
+    """How a person is built (kind: person)."""
+    draw: Draw = Draw()
+    """Lumps and guarding that are drawn, beside those of `lesions` and `guarding` (kind: person)."""
+    anatomy: Anatomy | None = None
+    """What was drawn (kind: person). With it the phantom is whole, and nothing is drawn any more."""
     mesh: str | None = None
     """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
     size_m: tuple[Length, Length, Length] = (0.36, 0.46, 0.20)
@@ -84,13 +99,28 @@ class Phantom(Section):
     motion: Motion = Motion()
 
     @model_validator(mode="after")
-    def _guarding(self) -> Phantom:
+    def _guarding(self) -> Self:
         if len({area.kind for area in self.guarding}) > 1:
             raise ValueError("guarding: all areas of a patient are of one kind, voluntary or involuntary")
         return self
 
     @model_validator(mode="after")
-    def _mesh(self) -> Phantom:
+    def _mesh(self) -> Self:
         if (self.kind == "mesh") != (self.mesh is not None):
             raise ValueError("kind: mesh needs mesh: FILE, and mesh: FILE needs kind: mesh")
+        return self
+
+    @model_validator(mode="after")
+    def _person(self) -> Self:
+        usual = {name: field.default for name, field in Phantom.model_fields.items()}
+        if self.kind != "person":
+            set_here = [name for name in ("build", "draw", "anatomy") if getattr(self, name) != usual[name]]
+            if set_here:
+                raise ValueError(f"{set_here[0]} belongs to kind: person, not to kind: {self.kind}")
+        elif self.anatomy is None:
+            if self.guarding and self.draw.guarding != "none":
+                raise ValueError("draw.guarding is for a person without guarding: leave one of them out")
+            for name in ("size_m", "stiffness", "background"):
+                if getattr(self, name) != usual[name]:
+                    raise ValueError(f"{name} of kind: person is drawn from the seed: leave it out")
         return self

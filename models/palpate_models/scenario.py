@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_v
 
 from palpate_models.errors import Errors
 from palpate_models.patient import Phantom
+from palpate_models.person import drawn
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 
 
@@ -216,6 +217,13 @@ class Scenario(Section):
     limits: Limits = Limits()
     tissue: TissueChoice = TissueChoice()
     services: Annotated[Services, Field(validate_default=True)] = Services()
+
+    @field_validator("phantom")
+    @classmethod
+    def _drawn(cls, phantom: Phantom, info: ValidationInfo) -> Phantom:
+        """A person as the seed draws it: a scenario has no phantom that is not whole."""
+        seed = info.data.get("seed")
+        return phantom if seed is None else drawn(phantom, seed)
 
     @field_validator("services")
     @classmethod

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +10,8 @@ from numpy.typing import NDArray
 from palpate_models.frames import Array
 from palpate_models.guarding import Guarding
 from palpate_models.patient import Background, Lesion
+from palpate_models.phantom.buried import at_skin
+from palpate_models.seeds import generator
 
 _FEATURES = 512
 """Random Fourier features of the background field: its covariance is within 1/sqrt(512) = 4 % of the Gaussian one."""
@@ -32,7 +33,7 @@ def gaussian_field(points: Array, correlation_m: float, seed: int) -> Array:
     Covariance exp(-r^2 / (2 correlation_m^2)), by random Fourier features (Rahimi and Recht 2007): a function of
     position, so the field does not depend on the mesh.
     """
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, zlib.crc32(b"phantom")])))
+    rng = generator(seed, "phantom")
     frequencies = rng.standard_normal((3, _FEATURES)) / correlation_m
     phases = rng.uniform(0, 2 * np.pi, _FEATURES)
     return np.asarray(np.cos(points @ frequencies + phases).sum(axis=1) * np.sqrt(2 / _FEATURES))
@@ -63,12 +64,13 @@ def edge_distance(xy: Array, area: Lesion | Guarding) -> Array:
 def lesion_field(xy: Array, lesions: Sequence[Lesion], front: NDArray[np.bool_] | None = None) -> tuple[Array, NDArray[np.int32]]:
     """Stiffness with lesions over stiffness without, and the lesion that a point belongs to (-1: none), both (n,).
 
-    The contrast rises over `edge_m`, centred on the outline, so the outline is where it is half. Where lesions overlap,
-    the stiffer one counts. Only points where `front` is true can belong to a lesion.
+    The contrast rises over `edge_m`, centred on the outline, so the outline is where it is half. Where lesions overlap, the one
+    that changes more counts. A lesion below the skin counts as the skin shows it (`palpate_models.phantom.buried`). Only points
+    where `front` is true can belong to a lesion.
     """
     factor = np.ones(len(xy))
     label = np.full(len(xy), -1, dtype=np.int32)
-    for index, lesion in enumerate(lesions):
+    for index, lesion in enumerate(map(at_skin, lesions)):
         distance = edge_distance(xy, lesion)
         share = smoothstep(0.5 - distance / lesion.edge_m)
         if front is not None:

@@ -12,7 +12,9 @@ from scipy import sparse
 
 from palpate_models.frames import Array
 from palpate_models.patient import Phantom
+from palpate_models.person import drawn
 from palpate_models.phantom.field import background_factor, lesion_field
+from palpate_models.phantom.healthy import healthy_wall
 from palpate_models.phantom.mesh import MeshError, boundary_vertices, load_mesh, vertex_normals
 from palpate_models.phantom.parametric import parametric_surface
 from palpate_models.phantom.tension import tension_field
@@ -61,10 +63,11 @@ def quadrant(x: float, y: float) -> str:
 
 
 def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
-    """The phantom of a scenario. The same seed gives the same background, whatever the mesh or its resolution.
+    """The phantom of a scenario, a person drawn if need be. The same seed gives the same wall, whatever the mesh's resolution.
 
     Raises MeshError if a user's mesh or a lesion cannot be used.
     """
+    phantom = drawn(phantom, seed)
     if phantom.mesh is not None:
         surface = load_mesh(Path(phantom.mesh), phantom.edge_m)
         vertices, triangles = surface.vertices, surface.triangles
@@ -75,13 +78,17 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         if fixed.all():
             raise MeshError(f"phantom.mesh = {phantom.mesh}: all of its vertices are on its border or its back, none can move")
     else:
-        shape = parametric_surface(phantom.size_m, phantom.edge_m)
+        shape = parametric_surface(phantom.size_m, phantom.edge_m, phantom.anatomy)
         vertices, triangles, normals, fixed = shape.vertices, shape.triangles, shape.normals, shape.fixed
     laplacian, mass = robust_laplacian.mesh_laplacian(vertices, triangles)
     laplacian = sparse.csr_array(laplacian)
     laplacian.sort_indices()
     half_length = float(np.ptp(vertices[:, 1])) / 2
     background = phantom.stiffness.k_w_n_per_m3 * background_factor(vertices, phantom.background, half_length, seed)
+    stiffening = np.full(len(vertices), phantom.stiffness.stiffening_per_m)
+    if phantom.anatomy is not None:
+        wall = healthy_wall(vertices, phantom.size_m, phantom.anatomy, phantom.stiffness.stiffening_per_m, seed)
+        background, stiffening = background * wall.stiffness, wall.stiffening
     contrast, lesion = lesion_field(vertices[:, :2], phantom.lesions, front=normals[:, 2] > 0)
     for index in sorted(set(range(len(phantom.lesions))) - set(lesion.tolist())):
         centre, radii = phantom.lesions[index].centre_m, phantom.lesions[index].radii_m
@@ -98,7 +105,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         laplacian=laplacian,
         stiffness=background * contrast,
         background=background,
-        stiffening=np.full(len(vertices), phantom.stiffness.stiffening_per_m),
+        stiffening=stiffening,
         tension=tension,
         lesion=lesion,
         fixed=fixed,

@@ -14,14 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
+from palpate_models.anatomy import Anatomy, Skeleton
 from palpate_models.frames import Array
+from palpate_models.phantom.bones import COSTAL_EDGE_M, above_costal_arch, iliac_bump
 from palpate_models.phantom.field import smoothstep
 from palpate_models.phantom.mesh import orient, vertex_normals
 
-EXPONENT = 2.4
-"""Of the superellipse: flatter in front than an ellipse, as a relaxed supine belly is."""
-DOME_M = 0.014
-"""The crown line's fall at both ends."""
 UMBILICUS_M = (0.0015, 0.009)
 """Depth and radius (standard deviation) of the umbilicus: an indenter follows it (radius of curvature 54 mm)."""
 COSTAL_RISE_M = 0.004
@@ -47,10 +45,11 @@ class Shape:
 class _Body:
     """Maps (s, y) to the surface: s is the arc length from the crown along the middle section, positive to the left."""
 
-    def __init__(self, size_m: tuple[float, float, float]) -> None:
+    def __init__(self, size_m: tuple[float, float, float], anatomy: Anatomy) -> None:
         width, length, self.height = size_m
         self.half_length = length / 2
-        a, c, power = width / 2, self.height / 2, 2 / EXPONENT
+        self._dome, self._skeleton = anatomy.dome_m, anatomy.skeleton
+        a, c, power = width / 2, self.height / 2, 2 / anatomy.exponent
         theta = np.linspace(0, np.pi / 2, 2001)
         front_x, front_z = a * np.sin(theta) ** power, c * (np.cos(theta) ** power - 1)
         # Below its widest line the section is a taller superellipse, cut by the table.
@@ -75,12 +74,9 @@ class _Body:
         x = np.sign(s) * np.interp(np.abs(s), self._s, self._x) * waist
         share = 1 + np.interp(np.abs(s), self._s, self._z) / self.height
         depth, sigma = UMBILICUS_M
-        relief = -DOME_M * eta**2 + depth * (1 - np.exp(-(x**2 + y**2) / (2 * sigma**2)))
-        scale = self.half_length / 0.23
-        above_arch = y - scale * 0.205 + 0.55 * np.abs(x)
-        relief += COSTAL_RISE_M * smoothstep(above_arch / (0.04 * scale))
-        crest = ((np.abs(x) - 0.14 * scale) ** 2 + (y + 0.175 * scale) ** 2) / (2 * (0.025 * scale) ** 2)
-        relief += ILIAC_RISE_M * np.exp(-crest)
+        relief = -self._dome * eta**2 + depth * (1 - np.exp(-(x**2 + y**2) / (2 * sigma**2)))
+        relief += COSTAL_RISE_M * smoothstep(above_costal_arch(x, y, self._skeleton) / COSTAL_EDGE_M)
+        relief += ILIAC_RISE_M * iliac_bump(x, y, self._skeleton)
         return np.column_stack((x, y, -self.height + share * (self.height + relief)))
 
 
@@ -162,13 +158,26 @@ def _close(plan: Array, inner: int, outer: tuple[float, float]) -> NDArray[np.in
     return np.concatenate(parts)
 
 
+def _ordinary(length: float) -> Anatomy:
+    """The default anatomy of a body of this length [m]."""
+    usual, scale = Skeleton(), length / 0.46
+    across, along = usual.iliac_crest_m
+    skeleton = Skeleton(
+        costal_arch_m=scale * usual.costal_arch_m,
+        iliac_crest_m=(scale * across, scale * along),
+        iliac_radius_m=scale * usual.iliac_radius_m,
+    )
+    return Anatomy(skeleton=skeleton)
+
+
 @lru_cache(maxsize=8)
-def parametric_surface(size_m: tuple[float, float, float], edge_m: float) -> Shape:
+def parametric_surface(size_m: tuple[float, float, float], edge_m: float, anatomy: Anatomy | None = None) -> Shape:
     """The parametric abdomen of width, length and height `size_m` [m], edges up to `edge_m` [m] where it is examined.
 
+    `anatomy` says where its bones are and how it is domed; without one, they are those of an ordinary body scaled to its length.
     The surface is closed: its ends and back are flat, and fixed. The umbilicus is a vertex at the origin of A.
     """
-    body = _Body(size_m)
+    body = _Body(size_m, anatomy or _ordinary(size_m[1]))
     spacing = edge_m
     for _ in range(2):  # the second lattice allows for how much the first one was stretched
         plan, inner = _plan(body, spacing)

@@ -55,16 +55,16 @@ def tension_of_ratio(ratio: float, stiffness: Stiffness) -> float:
     return float(brentq(lambda tension: pressed_force(stiffness, tension) - ratio * relaxed, 0.0, most, rtol=1e-6))
 
 
-def pressed_force(stiffness: Stiffness, tension: float) -> float:
-    """Force [N] on the sphere at the end of that press, on a flat wall of the nominal stiffness.
+def pressed_force(stiffness: Stiffness, tension: float, depth_m: float = DEPTH_M) -> float:
+    """Force [N] on the sphere at the end of that press, or of one to `depth_m` [m], on a flat wall of the nominal stiffness.
 
         left (u - l^2 lap u) + drag u + sigma(u) + tension u = p / k_w,   p >= 0,  u >= w,  p (u - w) = 0
 
     is solved on rings about the axis. `left` is what has not relaxed after a displacement that rose evenly for
-    DEPTH_M / SPEED_MPS, `drag` the dashpot's share. Contact by a primal-dual active set in which
+    depth / SPEED_MPS, `drag` the dashpot's share. Contact by a primal-dual active set in which
     sigma is linearised anew each round (Newton).
     """
-    seconds = DEPTH_M / SPEED_MPS
+    seconds = depth_m / SPEED_MPS
     g, tau = np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
     left = 1 - float(g @ (1 - tau / seconds * (1 - np.exp(-seconds / tau))))
     drag = stiffness.dashpot_s / seconds
@@ -76,9 +76,9 @@ def pressed_force(stiffness: Stiffness, tension: float) -> float:
     linear = area * (left + drag + tension)
     linear[:-1] += tie
     linear[1:] += tie
-    w = np.where(r < RADIUS_M, DEPTH_M - RADIUS_M + np.sqrt(np.maximum(RADIUS_M**2 - r**2, 0.0)), -1.0)
+    w = np.where(r < RADIUS_M, depth_m - RADIUS_M + np.sqrt(np.maximum(RADIUS_M**2 - r**2, 0.0)), -1.0)
     u = np.maximum(w, 0.0)
-    held = w > 0.5 * DEPTH_M
+    held = w > 0.5 * depth_m
     for _ in range(_MOST_ROUNDS):
         sigma, slope = wall.stress(u, stiffening), wall.slope(u, stiffening)
         bands = np.zeros((3, _RINGS))
