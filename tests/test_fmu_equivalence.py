@@ -63,12 +63,21 @@ STRAIGHT_SOON = "phantom.stiffness.stiffening_per_m=600"
 """The modulus rises no further from a depth of 6.5 mm on."""
 INVOLUNTARY = "phantom.guarding=[{centre_m: [-0.03, -0.04], kind: involuntary}]"
 VOLUNTARY = "phantom.guarding=[{centre_m: [-0.03, -0.04], kind: voluntary}]"
+PERSON = "phantom={kind: person, draw: {lumps: [2, 2]}, lesions: [{centre_m: [-0.05, -0.055], depth_m: 0.01}]}"
 
 
 @pytest.mark.parametrize(
     "settings",
-    [(), (BREATHING,), (FINE,), (STIFFENING,), (STRAIGHT_SOON, INVOLUNTARY), (STIFFENING, VOLUNTARY, BREATHING, FINE)],
-    ids=["default", "breathing", "fine mesh", "stiffening", "guarding", "all"],
+    [
+        (),
+        (BREATHING,),
+        (FINE,),
+        (STIFFENING,),
+        (STRAIGHT_SOON, INVOLUNTARY),
+        (STIFFENING, VOLUNTARY, BREATHING, FINE),
+        (PERSON, BREATHING),
+    ],
+    ids=["default", "breathing", "fine mesh", "stiffening", "guarding", "all", "person"],
 )
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:
     scenario = load_scenario("clean", settings)

@@ -15,6 +15,7 @@ from palpate_fmu.phantom_file import encode_phantom, sizes_of, start_values
 from palpate_fmu.variables import c_table
 from palpate_models.breathing import BreathingCurve
 from palpate_models.patient import Phantom
+from palpate_models.person import drawn
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Scenario
 
@@ -61,6 +62,7 @@ def build_fmu(
     if version not in (2, 3):
         raise ValueError(f"FMI version {version} is not one of 2, 3")
     wanted = platforms(version, targets)
+    phantom = drawn(phantom, seed)
     model = model or build_phantom(phantom, seed)
     starts = start_values(phantom, radius_m)
     sizes = sizes_of(model, starts)

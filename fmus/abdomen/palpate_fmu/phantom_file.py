@@ -12,6 +12,7 @@ from palpate_fmu.variables import BRANCHES, LESIONS, Sizes, parameters
 from palpate_models.frames import Array
 from palpate_models.patient import Phantom
 from palpate_models.phantom import PhantomModel
+from palpate_models.phantom.buried import at_skin
 
 SAMPLES = 64
 """Vertices whose displacement an FMI 2.0 master sees."""
@@ -26,9 +27,10 @@ class ExportError(ValueError):
 def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
     """The start value of every parameter for a phantom and an indenter radius [m]: a flat array each.
 
+    Lesions are those that the skin shows: one that lies below it is felt as a weaker and wider one.
     Raises ExportError if it has more lesions or Prony branches than the FMU has room for.
     """
-    material, lesions = phantom.stiffness, phantom.lesions
+    material, lesions = phantom.stiffness, [at_skin(lesion) for lesion in phantom.lesions]
     if len(lesions) > LESIONS:
         raise ExportError(f"phantom.lesions has {len(lesions)} entries, an FMU has room for {LESIONS}")
     if len(material.prony_g) > BRANCHES:

@@ -13,7 +13,7 @@ from palpate_models.guarding import Guarding
 from palpate_models.patient import Lesion, Phantom, Stiffness
 
 PHANTOM = Phantom(
-    stiffness=Stiffness(stiffening_per_m=80),
+    stiffness=Stiffness(k_w_n_per_m3=1.7e5, length_m=0.015, stiffening_per_m=80),
     lesions=(Lesion(centre_m=(-0.05, -0.05)),),
     guarding=(Guarding(centre_m=(-0.03, -0.02), kind="voluntary"),),
     breathing=Breathing(kind="quiet", peak_to_peak_m=0.004),

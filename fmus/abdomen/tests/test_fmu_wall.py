@@ -72,6 +72,25 @@ def test_springs_give_back_what_they_store(stiffening: Path, model: PhantomModel
             assert (after - exchange.value("elastic_energy")[0]) / (2 * h) == pytest.approx(change, rel=1e-4)
 
 
+def test_the_rates_of_bent_and_straight_springs_have_the_derivative_of_finite_differences(
+    stiffening: Path, model: PhantomModel
+) -> None:
+    """Where no vertex is within reach of a kink: neither at rest nor where a spring stiffens no further."""
+    rng = np.random.default_rng(3)
+    depth = np.where(rng.random(len(model.areas)) < 0.5, 0.004, 0.012)
+    u = depth * np.where(rng.random(len(depth)) < 0.3, -1, 1) * rng.uniform(0.9, 1.1, len(depth))
+    direction, h = rng.normal(size=len(u)), 1e-7
+    with Exchange(stiffening) as exchange:
+        rest = np.append(np.zeros(exchange.states - len(u) - 1), 0.6)
+        high, low = (exchange.rates(np.concatenate((u + s * h * direction, rest)))[: len(u)] for s in (1, -1))
+        exchange.rates(np.concatenate((u, rest)))
+        found = exchange.derivative(["displacement_rate"], {"displacement": direction})["displacement_rate"]
+        by_muscle = exchange.derivative(["displacement_rate"], {"activation": np.ones(1)})["displacement_rate"]
+    np.testing.assert_allclose(found, (high - low) / (2 * h), atol=1e-6 * np.abs(found).max())
+    expected = -model.tension * np.maximum(u, 0) / PHANTOM.stiffness.dashpot_s
+    np.testing.assert_allclose(by_muscle, np.where(model.fixed, 0, expected), atol=1e-12)
+
+
 def test_energy_falls_when_the_sphere_is_gone(stiffening: Path) -> None:
     """Where it is stiffest, and the steps are cut for that: the bound holds for the largest modulus."""
     values = {"breathing_scale": 0.0, "dashpot": 0.0064}

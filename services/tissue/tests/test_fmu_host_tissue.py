@@ -23,7 +23,13 @@ from palpate_tissue.backends.fmu.mapping import MapError, load_map
 from palpate_tissue.backends.fmu.service import create, hosted
 from palpate_tissue.backends.winkler.service import create as create_winkler
 
-SETTINGS = ("phantom.edge_m=0.008", "phantom.breathing.kind=quiet", "exam.pose.rpy_rad=[0.05, -0.1, 0.3]")
+SETTINGS = (
+    "phantom.edge_m=0.008",
+    "phantom.breathing.kind=quiet",
+    "phantom.stiffness.stiffening_per_m=80",
+    "phantom.guarding=[{centre_m: [-0.05, -0.05], kind: voluntary}]",
+    "exam.pose.rpy_rad=[0.05, -0.1, 0.3]",
+)
 
 
 @pytest.fixture(scope="module")
