@@ -209,12 +209,13 @@ class ElasticTissue(TissueBackend):
         return patch.force[patch.force > 0]
 
     @property
-    def indentation(self) -> Array:
-        """How far each vertex in contact is displaced along its inward normal [m], shape (k,)."""
+    def deepest(self) -> tuple[int, float]:
+        """See `TissueBackend`."""
         patch = self._patch
-        if patch is None or not self.touching:
-            return np.empty(0)
-        return np.asarray(patch.state[0][patch.within[patch.force > 0]])
+        assert patch is not None
+        displaced = patch.state[0].take(patch.within) * (patch.force > 0)
+        k = int(displaced.argmax())
+        return int(self.compliance.free[patch.near.vertex[k]]), float(displaced[k])
 
     @property
     def inward(self) -> Array:
