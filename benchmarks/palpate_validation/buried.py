@@ -35,9 +35,7 @@ class Buried:
     @property
     def lesion(self) -> Lesion:
         """The lump under the origin."""
-        return Lesion(
-            centre_m=(0.0, 0.0), radii_m=(self.radius_m, self.radius_m), contrast=self.contrast, depth_m=self.depth_m
-        )
+        return Lesion(centre_m=(0.0, 0.0), radii_m=(self.radius_m, self.radius_m), contrast=self.contrast, depth_m=self.depth_m)
 
 
 ELASTIC_TIER = tuple(
@@ -96,7 +94,9 @@ def section(found: Array | None = None) -> Section:
         "so this is how well it fits and no proof beyond them; large lumps that touch the skin are felt less than they should be."
     )
     data = {
-        "lumps": [{"radius_m": b.radius_m, "depth_m": b.depth_m, "contrast": b.contrast, "elastic": b.ratio} for b in ELASTIC_TIER],
+        "lumps": [
+            {"radius_m": b.radius_m, "depth_m": b.depth_m, "contrast": b.contrast, "elastic": b.ratio} for b in ELASTIC_TIER
+        ],
         "surface": found,
     }
     return Section("buried", "Lumps below the skin", text, checks, lambda f: draw(f, found), (4.2, 3.4), data)

@@ -88,7 +88,9 @@ def draw(figure: Figure, found: tuple[Person, ...]) -> None:
         x, y, z = person.model.vertices.T
         shown = person.front[person.model.triangles].all(axis=1)
         mesh = Triangulation(1e3 * x, 1e3 * y, person.model.triangles[shown])
-        image = above.tripcolor(mesh, person.force, shading="gouraud", cmap="viridis", vmin=SHOWN_N[0], vmax=SHOWN_N[1], rasterized=True)
+        image = above.tripcolor(
+            mesh, person.force, shading="gouraud", cmap="viridis", vmin=SHOWN_N[0], vmax=SHOWN_N[1], rasterized=True
+        )
         above.tricontour(mesh, person.bone, levels=[0.5], colors="white", linewidths=0.8)
         side = 1e3 * REGION_M
         above.plot([-side, side, side, -side, -side], [-side, -side, side, side, -side], "--", color="white", lw=0.7)

@@ -52,7 +52,9 @@ class Sample:
             "95 % are below [N]": float(np.quantile(self.force[:, AT_10_MM], 0.95)),
             "between people: deviation of the mean ln F at 10 mm": float(np.std([logs.mean() for logs in ten], ddof=1)),
             "between places of one person: deviation of ln F at 10 mm": float(np.sqrt(scatter / (len(self.person) - len(ten)))),
-            "largest over smallest force at 10 mm on one person, median": float(np.median([np.exp(np.ptp(logs)) for logs in ten])),
+            "largest over smallest force at 10 mm on one person, median": float(
+                np.median([np.exp(np.ptp(logs)) for logs in ten])
+            ),
             "median exponent, 5 to 10 mm": float(np.median(exponents[:, 0])),
             "median exponent, 10 to 20 mm": float(np.median(exponents[:, 1])),
             "deviation of the exponent, 10 to 20 mm": float(exponents[:, 1].std(ddof=1)),
