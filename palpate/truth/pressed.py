@@ -22,7 +22,6 @@ from palpate_models.breathing import Breathing
 from palpate_models.cache import content_key, remembered
 from palpate_models.frames import Array
 from palpate_models.patient import Lesion, Phantom
-from palpate_models.person import drawn
 from palpate_models.phantom.field import edge_distance
 from palpate_models.press import apparent_stiffness
 from palpate_models.scenario import Exam, Scenario
@@ -63,8 +62,8 @@ class Patient:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self.phantom = drawn(scenario.phantom, scenario.seed).model_copy(update={"breathing": Breathing(kind="none")})
-        """The patient at rest: a person is drawn."""
+        self.phantom = scenario.phantom.model_copy(update={"breathing": Breathing(kind="none")})
+        """The patient at rest."""
 
     def with_lesions(self, lesions: Sequence[Lesion]) -> TissueBackend | None:
         """The patient with no lesions but these; None where no copy of his tissue can be made."""
