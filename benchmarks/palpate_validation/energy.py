@@ -110,8 +110,8 @@ def section(cycles: list[Cycle] | None = None) -> Section:
     )  # fmt: skip
     text = (
         f"{len(cycles)} random closed cycles that press a stiffening wall up to {DEEPEST_M * 1e3:g} mm, slide over a sharp "
-        "lesion ten times as stiff, lift and come back, with friction of 0, 0.3 or 1. At no millisecond is more stored than was put "
-        f"in, and every cycle costs work: {100 * min(lost):.0f} to {100 * max(lost):.0f} % of what was put in."
+        "lesion ten times as stiff, lift and come back, with friction of 0, 0.3 or 1. At no millisecond is more stored than was "
+        f"put in, and every cycle costs work: {100 * min(lost):.0f} to {100 * max(lost):.0f} % of what was put in."
     )
     data = {"gained": [c.gained for c in in_contact], "surplus": [c.surplus for c in in_contact]}
     return Section("energy", "Energy", text, checks, lambda f: draw(f, in_contact), data=data)

@@ -24,7 +24,7 @@ import numpy as np
 from palpate_models.frames import Array
 
 MOST_STIFFENING = 15.0
-"""The stiffening spring's modulus is at most this many times k_w: no measured place is stiffer at 20 mm, and it bounds the step."""
+"""The stiffening spring's modulus is at most this many times k_w: none measured is stiffer at 20 mm, and it bounds the step."""
 
 
 def straight_from(stiffening: Array) -> Array:
