@@ -6,10 +6,11 @@ static const double PI = 3.14159265358979323846;
 
 /* The breath of a time, and the time since it began [s]; NULL if there is none. After the last breath comes the first again. */
 static const Breath *find(const Phantom *p, double time, double *since) {
-    const Breath *first = p->breath, *last = first + p->breaths - 1;
+    const Breath *first = p->breath, *last;
     int32_t low = 0, high = p->breaths - 1;
     double repeats;
     if (p->breaths < 1) return NULL;
+    last = first + high;
     repeats = last->start + last->inspiration + last->expiration + last->pause - first->start;
     time -= repeats * floor((time - first->start) / repeats);
     while (low < high) {

@@ -293,10 +293,14 @@ static int branches_suffice(Component *c) {
 
 /* What no single bound can say. */
 static int parameters_agree(Component *c) {
-    double relaxing = 0, needed;
+    double relaxing = 0, needed, contracted = c->tissue->state.activation;
     for (int k = 0; k < BRANCHES; k++) relaxing += c->parameters.prony_g[k];
     if (relaxing >= 1) {
         component_say(c, "prony_g must sum to less than 1, not %g", relaxing);
+        return 0;
+    }
+    if (contracted < 0 || contracted > 1) {
+        component_say(c, "activation must be 0 to 1 at the start, not %g", contracted);
         return 0;
     }
     component_assemble(c);
@@ -307,9 +311,8 @@ static int parameters_agree(Component *c) {
     if (c->exchange) return branches_suffice(c);
     needed = matrices_substeps(c->matrices, PERIOD_S);
     if (needed > MOST_SUBSTEPS) {
-        component_say(c,
-                      "%.0f sub-steps a millisecond would be needed, at most %d are allowed: use a shorter pasternak_length or "
-                      "a larger dashpot",
+        component_say(c, "%.0f sub-steps a millisecond would be needed, at most %d are allowed: use a shorter pasternak_length "
+                         "or a larger dashpot",
                       needed, MOST_SUBSTEPS);
         return 0;
     }
@@ -327,8 +330,7 @@ int component_exit_initialization(Component *c) {
 }
 
 int component_step(Component *c, double time, double dt) {
-    const double now = c->tissue->state.time;
-    double substeps, periods;
+    const double now = c->tissue->state.time, periods = ceil(dt / PERIOD_S * (1 - 1e-9));
     if (!component_expects(c, c->phase == PHASE_STEP, "a step")) return 0;
     if (!(dt > 0) || dt > LONGEST_STEP_S) {
         component_say(c, "a step of %g s is not possible: want more than 0 and at most %g s", dt, LONGEST_STEP_S);
@@ -343,10 +345,8 @@ int component_step(Component *c, double time, double dt) {
         component_say(c, "a step to %.9g s is not possible: the stop time is %.9g s", time + dt, c->stop);
         return 0;
     }
-    periods = ceil(dt / PERIOD_S * (1 - 1e-9));
-    substeps = matrices_substeps(c->matrices, dt / periods);
     c->tissue->state.time = time;
-    tissue_step(c->tissue, &c->inputs, dt, (long)periods, (long)substeps);
+    tissue_step(c->tissue, &c->inputs, dt, (long)periods, (long)matrices_substeps(c->matrices, dt / periods));
     c->fresh &= 1u << GROUP_MATRICES;
     return 1;
 }

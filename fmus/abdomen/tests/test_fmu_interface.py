@@ -168,6 +168,8 @@ def test_an_impossible_step_is_refused_with_a_message_and_nothing_changes(fmu: P
 def test_parameters_that_disagree_are_refused(fmu: Path) -> None:
     with pytest.raises(FmuError, match="prony_g must sum to less than 1"):
         FmuInstance(fmu, values={"prony_g": [0.5, 0.5, 0.2, 0.0]})
+    with pytest.raises(FmuError, match="activation must be 0 to 1"):
+        FmuInstance(fmu, values={"activation": 1.5})
     with pytest.raises(FmuError, match="sub-steps"):
         FmuInstance(fmu, values={"dashpot": 1e-4})
 
