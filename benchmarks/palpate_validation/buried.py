@@ -1,4 +1,4 @@
-"""Lumps below the skin: the surface tier's formula (`palpate_models.phantom.buried`) against the elastic tier, which has depth."""
+"""Lumps below the skin: the formula of `palpate_models.phantom.buried` against the elastic tier, which has depth."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def section(found: Array | None = None) -> Section:
     )  # fmt: skip
     text = (
         "The force over the middle of a lump below the skin over the force without it, sphere of 15 mm pressed 10 mm: the surface "
-        "tier, which has a formula for it, against the elastic tier, whose lumps are ellipsoids in a slab of 0.12 m (its own "
+        "tier, which has a formula for it, against the elastic tier, whose lumps are ellipsoids in a slab of 0.12 m (its "
         "figures depend on its elements by some percent of the effect). The formula's constants were fitted to these very lumps, "
         "so this is how well it fits and no proof beyond them; large lumps that touch the skin are felt less than they should be."
     )

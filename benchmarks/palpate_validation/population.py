@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,8 +74,9 @@ def measured() -> Sample:
 def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> Sample:
     """Persons of the seeds 0, 1, 2 .., each pressed at `PLACES` random places of the belly away from bone.
 
-    The force is that of a flat wall with the stiffness and stiffening of the place (quasi-static and axisymmetric,
-    `palpate_models.phantom.tension.pressed_force`: within 3 % of the file at its fitted places), the zero offset the fits' median.
+    The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
+    (`palpate_models.phantom.tension.pressed_force`, which is within 3 % of the file at nearly all of its fitted places); the zero
+    offset is the fits' median.
     """
     offset = float(np.median([fit.zero_offset_m for fit in remus2024.fitted().values()]))
     force = []
@@ -111,11 +111,11 @@ def section(found: Sample | None = None) -> Section:
         for (name, ours), theirs, within in zip(found.figures().items(), people.figures().values(), WITHIN, strict=True)
     )
     text = (
-        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {PLACES} random places of the belly "
-        "away from bone by a sphere of 10 mm at 5 mm/s, beside the 48 places of ten relaxed people (Remus et al. 2024, CC BY 4.0). "
-        "Level, stiffening and length of a person and their variation from place to place are drawn with the moments of "
-        "`fitted.csv`. Both sides are treated alike: neither deviation is freed of what the other leaves in it. Ten people tell a "
-        "deviation between people to a quarter, so the bounds are as wide. The people were young, male and slim: other builds "
+        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {PLACES} random places of the "
+        "belly away from bone by a sphere of 10 mm at 5 mm/s, beside the 48 places of ten relaxed people (Remus et al. 2024, CC BY "
+        "4.0). Level, stiffening and length of a person and their variation from place to place are drawn with the moments of "
+        "`fitted.csv`. Both sides are treated alike: neither deviation is freed of what the other leaves in it. Ten people "
+        "tell a deviation between people to a quarter, so the bounds are as wide. The people were young, male and slim: other builds "
         "are models."
     )
     data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
@@ -125,10 +125,14 @@ def section(found: Sample | None = None) -> Section:
 def draw(figure: Figure, found: Sample, people: Sample) -> None:
     """Distributions of force, of its ratio within a person and of its exponent, sampled and measured."""
     axes = figure.subplots(1, 3)
-    shown: Sequence[tuple[str, Array, Array]] = (
+    shown = (
         ("force at 10 mm [N]", found.force[:, AT_10_MM], people.force[:, AT_10_MM]),
         ("largest over smallest on one person", _ratios(found), _ratios(people)),
-        ("exponent, 10 to 20 mm", *(np.log2(s.force[:, 2] / s.force[:, 1]) for s in (found, people))),
+        (
+            "exponent, 10 to 20 mm",
+            np.log2(found.force[:, 2] / found.force[:, 1]),
+            np.log2(people.force[:, 2] / people.force[:, 1]),
+        ),
     )
     for ax, (name, ours, theirs) in zip(axes, shown, strict=True):
         for values, colour, label, style in ((ours, COLOURS[0], "sampled", "-"), (theirs, INK, "measured", ".")):
