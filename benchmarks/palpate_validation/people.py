@@ -119,12 +119,12 @@ def section(found: People | None = None) -> Section:
     text = (
         f"{len(found.places)} curves of force over depth of ten relaxed people, places 1 to 5 (Remus et al. 2024, DOI "
         "10.3389/fbioe.2024.1384062, CC BY 4.0), each beside a simulation of the same test on the surface tier: a sphere of "
-        "10 mm pressed at 5 mm/s into a wall with the parameters of `models/palpate_models/data/remus2024/fitted.csv`. Fitted "
-        "are k_w, wall length, stiffening and a zero offset of at most 2 mm a place, as their zero lies on slightly pressed skin; relaxation is "
-        "the default's, as they did not measure it. The force alone hardly tells the wall length. The loops are of the median "
-        f"person's wall (k_w {MEDIAN.k_w_n_per_m3:.3g} N/m³, {1e3 * MEDIAN.length_m:g} mm, {MEDIAN.stiffening_per_m:g} per m); "
-        "no loss was found measured on a living abdomen, so only its order is asked for. Tensed muscles are a spring beside the "
-        "wall that makes its force at 10 mm as many times larger as they measured."
+        "10 mm pressed at 5 mm/s into a wall with the parameters of `models/palpate_models/data/remus2024/fitted.csv`. "
+        "Fitted are k_w, wall length, stiffening and, as their zero lies on slightly pressed skin, a zero offset of at most "
+        "2 mm a place; relaxation is the default's, as they did not measure it. The force alone hardly tells the wall length. "
+        f"The loops are of the median person's wall (k_w {MEDIAN.k_w_n_per_m3:.3g} N/m³, {1e3 * MEDIAN.length_m:g} mm, "
+        f"{MEDIAN.stiffening_per_m:g} per m); no loss was found measured on a living abdomen, so only its order is asked for. "
+        "Tensed muscles are a spring beside the wall that makes its force at 10 mm as many times larger as they measured."
     )
     checks = (*_errors(found), *_exponents(found.places), _tensed(found.places), *_losses(found.loops))
     data = {

@@ -133,6 +133,7 @@ class ElasticTissue(TissueBackend):
         self._behind, self._excursion, self._patch = 0, 0.0, None
         self.friction.release()
         self.disturbed = self.touching = False
+        self.activation = 1.0
 
     def press(self, places: Array, normals: Array, radius: float) -> Array:
         """See `TissueBackend`. In steps of PRESS_STEP_S: the step is implicit, and what is read is the end of the hold."""

@@ -111,6 +111,7 @@ class WinklerTissue(TissueBackend):
         self._excursion, self._last = 0.0, None
         self._near, self._patch = None, self._nothing
         self.disturbed = self.touching = False
+        self.activation = 1.0
 
     def press(self, places: Array, normals: Array, radius: float) -> Array:
         """See `TissueBackend`. Each goes into the part of the wall that it reaches, cut out and held at its rim."""
