@@ -45,6 +45,11 @@ class Breaths:
         """From one rise to the next [s], shape (n,)."""
         return self.inspiration + self.expiration + self.pause
 
+    @property
+    def share(self) -> Array:
+        """Inspiration over duration [1], shape (n,)."""
+        return self.inspiration / self.duration
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -132,7 +137,7 @@ def section(found: Measured | None = None) -> Section:
     quiet, deep = found.quiet, found.deep
     depth_mm = 1e3 * float(_pooled(quiet, "depth").mean())
     rate, slow = (60 / float(_pooled(breaths, "duration").mean()) for breaths in (quiet, deep))
-    ratio = float((_pooled(quiet, "expiration") / _pooled(quiet, "inspiration")).mean())
+    ratio = float(_pooled(quiet, "expiration").mean() / _pooled(quiet, "inspiration").mean())
     share = depth_mm / (1e3 * float(_pooled(deep, "depth").mean()))
     pause = 100 * float((_pooled(quiet, "pause") / _pooled(quiet, "duration")).mean())
     checks = (
@@ -144,6 +149,7 @@ def section(found: Measured | None = None) -> Section:
         Check("quiet over deep", share, "", None, 1 / 3, "less than a third, n = 100 (Kaneko 2012)"),
         Check("variation of duration from breath to breath", _cv(quiet, "duration"), "%", 18, 24, "20.8 % (Tobin 1988)"),
         Check("variation of depth from breath to breath", _cv(quiet, "depth"), "%", 28, 38, "33 % (Tobin 1988)"),
+        Check("variation of inspiration's share of a breath", _cv(quiet, "share"), "%", 15, 21, "17.9 % (Tobin 1988)"),
         Check("correlation of depth with the breath before", _memory(quiet, "depth"), "", 0.15, 0.45, "0.30 (Tobin 1995)"),
         Check("change of speed in 10 ms, of the greatest", 100 * found.jump, "%", None, 5, "a curve without corners"),
         Check("share of the excursion at the body's border", found.border, "", None, 0, "none"),
@@ -152,8 +158,7 @@ def section(found: Measured | None = None) -> Section:
     text = (
         f"{len(quiet)} patients breathe for {TABLE_S:g} s each; their breaths are read from the curve, sampled at "
         f"{1 / STEP_S:g} Hz, without knowledge of the table behind it. Duration and depth are log-normal from breath to breath, "
-        "and a breath remembers the one before; pause, depth in millimetres and coughs are assumed. What is left out: the ratio "
-        "of inspiration to a whole breath varies by 17.9 % in people (Tobin 1988) and not at all here, nor are there sighs."
+        "and a breath remembers the one before; pause, depth in millimetres and coughs are assumed. Sighs are left out."
     )
     data = {"time_s": found.time, **{f"{name}_m": curve for name, curve in found.curves.items()}}
     data |= {"quiet_duration_s": _pooled(quiet, "duration"), "quiet_depth_m": _pooled(quiet, "depth")}

@@ -103,7 +103,7 @@ def scenario(contrast: float) -> Scenario:
     """A uniform abdomen `contrast` times as stiff as the default, on the default robot without sensor noise."""
     wall = Stiffness(k_w_n_per_m3=1.7e5 * contrast)
     plain = Scenario()
-    still = Errors(arm=ArmErrors(position_noise_rad=0.0, velocity_noise_radps=0.0))
+    still = Errors(level="none", arm=ArmErrors(position_noise_rad=0.0, velocity_noise_radps=0.0))
     phantom = Phantom(stiffness=wall, background=Background(cv=0.0, margins=1.0), edge_m=0.006)
     return plain.model_copy(update={"phantom": phantom, "errors": still})
 

@@ -23,6 +23,8 @@ MOST_M = 0.04
 _DEEP = {"peak_to_peak_m": 0.025, "rate_per_min": 7.4, "depth_cv": 0.1}
 """What a deep breather has unless the scenario says otherwise. Rate: Ragnarsdottir 2006 [V]; depth: more than three
 times the quiet one (Kaneko and Horie 2012) [V]; its variation [A]."""
+_MOST_SHARE = 0.8
+"""Inspiration takes at most this part of a breath's motion."""
 _COUGH_S = (0.15, 0.25, 0.10)
 """A cough's rise, fall, and rest until the next one of its burst [s] [A]."""
 
@@ -40,17 +42,19 @@ class Breathing(Section):
     rate_per_min: Annotated[float, Field(ge=4, le=40)] = 14.0
     """Breaths a minute, where the breath is not held: 14 at rest, n = 100 (Ragnarsdottir and Kristinsdottir 2006) [V]."""
     expiration_ratio: Annotated[float, Field(ge=0.5, le=4)] = 1.2
-    """Duration of expiration, its pause apart, over that of inspiration: 1.21 for men, 1.14 for women (the same) [V]. Whether
-    they counted the pause is not known."""
+    """Mean duration of expiration, its pause apart, over that of inspiration: 1.21 for men, 1.14 for women (the same) [V].
+    Whether they counted the pause is not known."""
     pause: Annotated[float, Field(ge=0, le=0.5)] = 0.1
     """Share of a breath in which the wall rests after expiration [A]."""
     duration_cv: Share = 0.208
     """Variation of duration from breath to breath, log-normal (Tobin 1988, n = 65: 20.8 +- 11.5 % of the frequency) [V]."""
     depth_cv: Share = 0.33
     """Variation of depth from breath to breath, log-normal (Tobin 1988: 33 +- 14.9 % of the tidal volume) [V]."""
+    timing_cv: Share = 0.179
+    """Variation of inspiration's share of a breath, log-normal (Tobin 1988: 17.9 +- 6.5 %) [V]."""
     memory: Share = 0.28
-    """Correlation of a breath's duration, and of its depth, with those of the breath before (Tobin 1995: 0.26 of the
-    expiratory time, 0.30 of the tidal volume) [V]."""
+    """Correlation of a breath's duration, depth and share of inspiration with those of the breath before (Tobin 1995: 0.26 of
+    the expiratory time, 0.30 of the tidal volume, 0.20 of the inspiratory time) [V]."""
     breathes_s: Positive = 40.0
     """How long somebody who holds the breath breathes before each time (kind: held) [A]."""
     held_s: Annotated[float, Field(gt=0, le=120)] = 20.0
@@ -121,20 +125,22 @@ def _breaths(breathing: Breathing, seed: int) -> Array:
     streams = np.random.SeedSequence([seed, crc32(b"breathing")]).spawn(2)
     breaths, coughs = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
     rows: list[tuple[float, float, float, float, float]] = []
-    z = breaths.standard_normal(2)
+    z = breaths.standard_normal(3)
+    share = (1 - breathing.pause) / (1 + breathing.expiration_ratio)
     clock = -breaths.uniform(0, 60 / breathing.rate_per_min)
     next_hold, next_cough = clock + breathing.breathes_s, _until_next(breathing, coughs)
     while clock < TABLE_S:
         duration = 60 / breathing.rate_per_min * _log_normal(breathing.duration_cv, z[0])
         depth = breathing.peak_to_peak_m * _log_normal(breathing.depth_cv, z[1])
-        z = breathing.memory * z + math.sqrt(1 - breathing.memory**2) * breaths.standard_normal(2)
         pause = breathing.pause * duration
-        inspiration = (duration - pause) / (1 + breathing.expiration_ratio)
+        inspiration = duration * min(share * _log_normal(breathing.timing_cv, z[2]), _MOST_SHARE * (1 - breathing.pause))
+        expiration = duration - pause - inspiration
+        z = breathing.memory * z + math.sqrt(1 - breathing.memory**2) * breaths.standard_normal(3)
         if breathing.kind == "held" and clock + duration >= next_hold:
             pause += breathing.held_s
             next_hold = clock + duration + breathing.held_s + breathing.breathes_s
-        rows.append((clock, inspiration, breathing.expiration_ratio * inspiration, pause, min(depth, MOST_M)))
-        clock += (1 + breathing.expiration_ratio) * inspiration + pause
+        rows.append((clock, inspiration, expiration, pause, min(depth, MOST_M)))
+        clock += inspiration + expiration + pause
         while next_cough <= clock:
             next_cough += _until_next(breathing, coughs)
             for _ in range(int(coughs.integers(2, 4))):

@@ -48,11 +48,14 @@ def test_breaths_vary_as_much_as_is_set_and_remember_the_one_before():
     assert cv(breaths[:, 4]) == pytest.approx(0.3, abs=0.03)
     for values in (durations(breaths), breaths[:, 4]):
         assert np.corrcoef(np.log(values[:-1]), np.log(values[1:]))[0, 1] == pytest.approx(0.28, abs=0.06)
-    assert cv(durations(table(duration_cv=0, depth_cv=0))) < 1e-9
+    assert cv(breaths[:, 1] / durations(breaths)) == pytest.approx(0.179, abs=0.02)
+    assert breaths[:, 2].mean() / breaths[:, 1].mean() == pytest.approx(1.2, abs=0.03)
+    regular = table(duration_cv=0, depth_cv=0, timing_cv=0)
+    assert np.ptp(regular[:, 1:], axis=0).max() < 1e-9
 
 
 def test_expiration_is_longer_and_ends_with_a_pause():
-    breaths = table(expiration_ratio=1.2, pause=0.1)
+    breaths = table(expiration_ratio=1.2, pause=0.1, timing_cv=0)
     np.testing.assert_allclose(breaths[:, 2] / breaths[:, 1], 1.2)
     np.testing.assert_allclose(breaths[:, 3] / durations(breaths), 0.1)
 

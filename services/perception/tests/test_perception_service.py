@@ -31,7 +31,7 @@ def phantom() -> PhantomModel:
 
 
 def scenario(*settings: str, seed: int = 0) -> Scenario:
-    return load_scenario("rlq_guarding", settings, seed)
+    return load_scenario("rlq_guarding", ("errors=none", *settings), seed)
 
 
 def skin(case: Scenario, rise: float = 0.0) -> Any:

@@ -11,7 +11,7 @@ from palpate_bus.messages.codec import decode, encode, message_type
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models import lbr
-from palpate_models.errors import ForceErrors
+from palpate_models.errors import Errors, ForceErrors
 from palpate_models.gravity import GRAVITY
 from palpate_models.scenario import Robot, Scenario
 from palpate_robot.backends.dart.service import create
@@ -75,7 +75,7 @@ class Rig:
 
 @pytest.fixture
 def rig() -> Rig:
-    return Rig(Scenario())
+    return Rig(Scenario(errors=Errors(level="none")))
 
 
 def test_every_topic_comes_at_its_tick_and_keeps_its_ranges(rig: Rig) -> None:

@@ -158,6 +158,18 @@ def test_without_a_tool_the_abdomen_breathes_and_exerts_nothing():
     assert 0.0115 < max(tops) - min(tops) <= 0.0121
 
 
+def test_true_depth_is_counted_from_the_skin_as_the_breath_has_lifted_it():
+    breathing = Breathing(kind="quiet", depth_cv=0)
+    service, curve, inbox = create(scenario(breathing=breathing)), BreathingCurve(breathing, 0), OneTopic()
+    X_WA = matrix(true_pose(scenario()))
+    inbox.message = tool_state(0, (X_WA @ (0.0, 0.0, 0.045, 1.0))[:3].tolist())  # 30 mm above the skin at rest
+    sent = {k: service.step(k * MS, inbox) for k in range(3000)}
+    depths = {k: out["truth/indentation"].depth for k, out in sent.items() if "truth/indentation" in out}
+    lifts = np.array([curve.excursion(k / 1000) for k in depths])
+    assert np.ptp(lifts) > 0.007
+    np.testing.assert_allclose(np.array(list(depths.values())), -0.030 + lifts, atol=0.0002)
+
+
 def test_report_counts_contact():
     case = scenario()
     service = create(case)
