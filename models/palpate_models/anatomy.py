@@ -72,7 +72,7 @@ class Anatomy(Section):
     skeleton: Skeleton = Skeleton()
     muscles: Muscles = Muscles()
     variation: Variation = Variation()
-    bone: Positive = 1.5
+    bone: Positive = 2.0
     """Stiffness of the wall over bone, over that beside it [A] ..."""
-    bone_stiffening_per_m: Positive = 350.0
-    """... and its stiffening: the modulus is 13 times greater at 10 mm [A]."""
+    bone_stiffening_per_m: Positive = 600.0
+    """... and its stiffening: 16 times the modulus from 6.5 mm on [A]."""

@@ -26,8 +26,8 @@ class Lesion(Section):
     edge_m: Positive = 0.008
     """Width of the smooth edge."""
     depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
-    """How far below the skin it begins: an ellipsoid whose vertical half axis is the smaller of `radii_m`. The surface tier has the
-    factor that this ellipsoid gives to the skin (`palpate_models.phantom.buried`). None: it reaches from the skin inward."""
+    """How far below the skin it begins: an ellipsoid whose vertical half axis is the smaller of `radii_m`. The surface tier has
+    the factor that this ellipsoid gives to the skin (`palpate_models.phantom.buried`). None: it reaches from the skin inward."""
 
     @model_validator(mode="after")
     def _contrast(self) -> Self:

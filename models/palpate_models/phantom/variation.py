@@ -1,6 +1,6 @@
 """The natural variation of a person's wall: fields of families that no prior of the assessment has.
 
-A field is a weighted sum of a few components. Each has a family, a length, an anisotropy and a direction of its own, and none is
+A field is a weighted sum of two components. Each has a family, a length, an anisotropy and a direction of its own, and none is
 Gaussian: ridges have crests, patches have borders, hills are log-normal, and waves have heavy-tailed frequencies and weights.
 Fields are functions of position, made from random Fourier features (Rahimi and Recht 2007), and do not depend on the mesh.
 """
@@ -9,17 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from palpate_models.frames import Array
 
 _FEATURES = 96
-_COMPONENTS = 3
+_COMPONENTS = 2
 _MOST_ANISOTROPIC = 3.0
 """Largest ratio of the lengths along and across a component's direction [A]."""
 _MOST = 3.0
-"""A field comes no further from its mean than this many standard deviations: one healthy place is not another tissue."""
+"""A field comes hardly further from its mean than this many standard deviations: one healthy place is not another tissue."""
+
+
+Family = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,36 @@ def _hills(g: Array) -> Array:
     return np.exp(0.8 * g)
 
 
-_FAMILIES: tuple[Callable[[Array], Array] | None, ...] = (_ridges, _patches, _hills, None)
-"""What is made of waves; None: heavy-tailed waves as they are."""
+def _as_they_are(g: Array) -> Array:
+    return g
+
+
+_FAMILIES: tuple[Family, ...] = (_ridges, _patches, _hills, _as_they_are)
+"""What is made of waves; the last ones are heavy-tailed."""
+
+
+class _Component(NamedTuple):
+    """Waves that are made into what the family has; its mean and deviation over the reference points, and its weight."""
+
+    waves: _Waves
+    family: Family
+    weight: float
+    mean: float = 0.0
+    sd: float = 1.0
+
+    def __call__(self, points: Array) -> Array:
+        return self.family(self.waves(points))
+
+
+def _component(rng: np.random.Generator, length_m: tuple[float, float], share: float, reference: Array) -> _Component:
+    """A component whose family, lengths and direction are drawn, and which has this share of the field's variance."""
+    family = _FAMILIES[int(rng.integers(len(_FAMILIES)))]
+    length = np.exp(rng.uniform(*np.log(length_m)))
+    longer = np.exp(rng.uniform(0, np.log(_MOST_ANISOTROPIC)))
+    lengths = np.array((min(length * longer, length_m[1]), length, length))
+    part = _Component(_waves(rng, lengths, heavy=family is _as_they_are), family, float(np.sqrt(share)))
+    values = part(reference)
+    return part._replace(mean=float(values.mean()), sd=float(values.std()))
 
 
 class NaturalField:
@@ -71,26 +103,22 @@ class NaturalField:
 
     def __init__(self, rng: np.random.Generator, length_m: tuple[float, float], reference: Array) -> None:
         """`length_m`: the shortest and the longest length of a component [m]; `reference` (m, 3) in A [m]."""
-        self._parts: list[tuple[float, _Waves, Callable[[Array], Array] | None, float, float]] = []
-        shares = rng.dirichlet(np.full(_COMPONENTS, 2.0))
-        for share in shares:
-            family = _FAMILIES[rng.integers(len(_FAMILIES))]
-            length = np.exp(rng.uniform(*np.log(length_m)))
-            longer = np.exp(rng.uniform(0, np.log(_MOST_ANISOTROPIC)))
-            lengths = np.array((min(length * longer, length_m[1]), length, length))
-            waves = _waves(rng, lengths, heavy=family is None)
-            values = family(waves(reference)) if family else waves(reference)
-            self._parts.append((float(np.sqrt(share)), waves, family, float(values.mean()), float(values.std())))
+        shares = rng.dirichlet(np.ones(_COMPONENTS))
+        self._parts = [_component(rng, length_m, float(share), reference) for share in shares]
         total = self._sum(reference)
-        self._mean, self._sd = float(total.mean()), float(total.std())
+        self._middle, self._reach = float(total.mean()), _MOST * float(total.std())
+        bounded = self._bounded(reference)
+        self._mean, self._sd = float(bounded.mean()), float(bounded.std())
 
     def _sum(self, points: Array) -> Array:
         total = np.zeros(len(points))
-        for weight, waves, family, mean, sd in self._parts:
-            values = waves(points)
-            total += weight * ((family(values) if family else values) - mean) / sd
+        for part in self._parts:
+            total += part.weight * (part(points) - part.mean) / part.sd
         return total
+
+    def _bounded(self, points: Array) -> Array:
+        return np.tanh((self._sum(points) - self._middle) / self._reach)
 
     def __call__(self, points: Array) -> Array:
         """At points (n, 3) of A [m], shape (n,)."""
-        return _MOST * np.tanh((self._sum(points) - self._mean) / (_MOST * self._sd))
+        return np.asarray((self._bounded(points) - self._mean) / self._sd)

@@ -1,0 +1,114 @@
+"""Three persons as they were drawn: the force that a press meets over the belly, and the shape of the body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from palpate_models.draw import Build
+from palpate_models.frames import Array
+from palpate_models.patient import Phantom, Stiffness
+from palpate_models.person import drawn
+from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.phantom.bones import bone_share
+from palpate_models.phantom.tension import pressed_force
+from palpate_validation.check import Check, Section
+from palpate_validation.plots import COLOURS, INK, QUIET
+
+SEEDS = ((Build.SLIM, 4), (Build.MEDIAN, 2), (Build.OBESE, 3))
+SHOWN_N = (0.7, 15.0)
+TICKS_N = (1, 2, 5, 10)
+REGION_M = 0.1
+STRIP_M = 0.012
+_TABLE = np.linspace(0.0, 600.0, 25)
+
+
+@dataclass(frozen=True)
+class Person:
+    """A person, and the force on a sphere of 10 mm pressed 10 mm deep at every vertex of the mesh [N], shape (n,)."""
+
+    build: Build
+    phantom: Phantom
+    model: PhantomModel
+    force: Array
+
+    @property
+    def bone(self) -> Array:
+        """How far each vertex lies on bone, shape (n,)."""
+        assert self.phantom.anatomy is not None
+        return bone_share(self.model.vertices[:, 0], self.model.vertices[:, 1], self.phantom.anatomy.skeleton)
+
+    @property
+    def front(self) -> NDArray[np.bool_]:
+        """Whether each vertex faces forward, shape (n,)."""
+        return np.asarray(self.model.normals[:, 2] > 0.3)
+
+
+def measure() -> tuple[Person, ...]:
+    """The persons of `SEEDS`."""
+    return tuple(_person(build, seed) for build, seed in SEEDS)
+
+
+def _person(build: Build, seed: int) -> Person:
+    phantom = drawn(Phantom(kind="person", build=build), seed)
+    model = build_phantom(phantom, seed)
+    return Person(build, phantom, model, force_at_10_mm(model, phantom.stiffness))
+
+
+def force_at_10_mm(model: PhantomModel, wall: Stiffness) -> Array:
+    """Force [N] of a press of 10 mm on a flat wall with the stiffness and stiffening of each vertex, shape (n,)."""
+    unit = [pressed_force(wall.model_copy(update={"stiffening_per_m": beta}), 0.0) for beta in _TABLE.tolist()]
+    return model.stiffness / wall.k_w_n_per_m3 * np.interp(model.stiffening, _TABLE, unit)
+
+
+def section(found: tuple[Person, ...] | None = None) -> Section:
+    """The persons, and what must be so in each."""
+    found = found or measure()
+    checks = []
+    for person in found:
+        belly = person.front & (person.bone < 0.01) & (np.abs(person.model.vertices[:, :2]) < REGION_M).all(axis=1)
+        over_bone = float(np.median(person.force[person.front & (person.bone > 0.9)]) / np.median(person.force[belly]))
+        checks.append(Check(f"{person.build}: force over bone, of that over the belly", over_bone, "times", low=3.0))
+        checks.append(Check(f"{person.build}: median force over the belly", float(np.median(person.force[belly])), "N"))
+    text = (
+        "Three persons of `phantom.kind: person`, one of each build. Above, the force on a sphere of 10 mm pressed 10 mm deep, "
+        "as the stiffness and stiffening of each place give it; white lines are where the wall begins to lie on ribs and iliac "
+        "crests, the dashed square is the default examined region. Below, the crown line from pelvis to ribs, and the middle section."
+    )
+    return Section("persons", "Three persons", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6))
+
+
+def draw(figure: Figure, found: tuple[Person, ...]) -> None:
+    """A map of the force for each person, and outlines of the bodies."""
+    axes = figure.subplots(2, 3, height_ratios=(2.4, 1))
+    image = None
+    for k, (person, (above, below)) in enumerate(zip(found, axes.T, strict=True)):
+        x, y, z = person.model.vertices.T
+        shown = person.front[person.model.triangles].all(axis=1)
+        mesh = Triangulation(1e3 * x, 1e3 * y, person.model.triangles[shown])
+        image = above.tripcolor(mesh, person.force, shading="gouraud", cmap="viridis", norm=LogNorm(*SHOWN_N))
+        above.tricontour(mesh, person.bone, levels=[0.5], colors="white", linewidths=0.8)
+        side = 1e3 * REGION_M
+        above.plot([-side, side, side, -side, -side], [-side, -side, side, side, -side], "--", color="white", lw=0.7)
+        fat = 0.0 if person.phantom.anatomy is None else person.phantom.anatomy.fat_m
+        above.set(title=f"{person.build}: {1e3 * fat:.0f} mm of fat", aspect="equal", xlim=(-215, 215), ylim=(-235, 235))
+        above.grid(visible=False)
+        for at, along, label, line in ((np.abs(x), y, "crown line", "-"), (np.abs(y), x, "middle section", "--")):
+            near = np.flatnonzero(person.front & (at < STRIP_M))
+            order = near[np.argsort(along[near])]
+            below.plot(1e3 * along[order], 1e3 * z[order], line, color=COLOURS[0] if line == "-" else INK, lw=1, label=label)
+        below.set(xlabel="along, across [mm]", xlim=(-250, 250), ylim=(-150, 25))
+        below.axhline(0, color=QUIET, lw=0.4)
+        if k == 0:
+            above.set(ylabel="to the head [mm]")
+            below.set(ylabel="height [mm]")
+            below.legend(loc="lower center")
+    assert image is not None
+    figure.colorbar(
+        image, ax=axes[0], label="force at 10 mm [N]", extend="max", shrink=0.9, ticks=TICKS_N, format="%g"
+    ).minorticks_off()

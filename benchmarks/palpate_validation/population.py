@@ -1,0 +1,147 @@
+"""Sampled persons pressed as Remus et al. pressed living people: their statistics beside the measured ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from palpate_models import remus2024
+from palpate_models.draw import Build
+from palpate_models.frames import Array
+from palpate_models.patient import Phantom
+from palpate_models.person import drawn
+from palpate_models.phantom.healthy import belly, healthy_wall
+from palpate_models.phantom.tension import pressed_force
+from palpate_models.seeds import generator
+from palpate_validation.check import Check, Section
+from palpate_validation.plots import COLOURS, INK
+
+PERSONS = 200
+PLACES = 5
+DEPTHS_M = np.array((0.005, 0.010, 0.020))
+APART_M = 0.04
+"""Least distance of a person's places."""
+AT_10_MM = 1
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Places of a number of people."""
+
+    person: NDArray[np.int_]
+    """Whose place it is, shape (n,)."""
+    force: Array
+    """At `DEPTHS_M` [N], shape (n, 3)."""
+
+    def of_people(self, depth: int) -> list[Array]:
+        """The logarithms of each one's forces at a depth."""
+        return [np.log(self.force[self.person == one, depth]) for one in np.unique(self.person)]
+
+    def figures(self) -> dict[str, float]:
+        """The statistics that are compared."""
+        ten = self.of_people(AT_10_MM)
+        scatter = sum(float(((logs - logs.mean()) ** 2).sum()) for logs in ten)
+        exponents = np.log2(self.force[:, 1:] / self.force[:, :-1])
+        return {
+            **{f"median force at {1e3 * d:g} mm [N]": float(np.median(f)) for d, f in zip(DEPTHS_M, self.force.T, strict=True)},
+            "5 % of forces at 10 mm are below [N]": float(np.quantile(self.force[:, AT_10_MM], 0.05)),
+            "95 % are below [N]": float(np.quantile(self.force[:, AT_10_MM], 0.95)),
+            "between people: deviation of the mean ln F at 10 mm": float(np.std([logs.mean() for logs in ten], ddof=1)),
+            "between places of one person: deviation of ln F at 10 mm": float(np.sqrt(scatter / (len(self.person) - len(ten)))),
+            "largest over smallest force at 10 mm on one person, median": float(
+                np.median([np.exp(np.ptp(logs)) for logs in ten])
+            ),
+            "median exponent, 5 to 10 mm": float(np.median(exponents[:, 0])),
+            "median exponent, 10 to 20 mm": float(np.median(exponents[:, 1])),
+            "deviation of the exponent, 10 to 20 mm": float(exponents[:, 1].std(ddof=1)),
+        }
+
+
+WITHIN = (0.08, 0.08, 0.10, 0.15, 0.15, 0.40, 0.20, 0.12, 0.07, 0.07, 0.40)
+"""How far each of the figures may be from the measured one, of the measured one: of ten people they are no nearer than that."""
+
+
+def measured() -> Sample:
+    """The 48 relaxed places of the file."""
+    places = remus2024.relaxed_people()
+    force = np.array([remus2024.curve(*place).force(DEPTHS_M) for place in places])
+    return Sample(np.array([remus2024.PEOPLE.index(person) for _, person in places]), force)
+
+
+def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> Sample:
+    """Persons of the seeds 0, 1, 2 .., each pressed at `PLACES` random places of the belly away from bone.
+
+    The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
+    (`palpate_models.phantom.tension.pressed_force`, which is within 3 % of the file at nearly all of its fitted places); the zero
+    offset is the fits' median.
+    """
+    offset = float(np.median([fit.zero_offset_m for fit in remus2024.fitted().values()]))
+    force = []
+    for seed in range(persons):
+        phantom = drawn(Phantom(kind="person", build=build), seed)
+        assert phantom.anatomy is not None
+        usual = phantom.stiffness
+        at = _places(belly(phantom.size_m, phantom.anatomy), generator(seed, "places"))
+        wall = healthy_wall(at, phantom.size_m, phantom.anatomy, usual.stiffening_per_m, seed)
+        for factor, stiffening in zip(wall.stiffness.tolist(), wall.stiffening.tolist(), strict=True):
+            here = usual.model_copy(update={"k_w_n_per_m3": usual.k_w_n_per_m3 * factor, "stiffening_per_m": stiffening})
+            force.append([pressed_force(here, 0.0, depth + offset) for depth in DEPTHS_M.tolist()])
+    return Sample(np.repeat(np.arange(persons), PLACES), np.array(force))
+
+
+def _places(points: Array, rng: np.random.Generator) -> Array:
+    """Places chosen of points (m, 3), at least `APART_M` from each other, shape (PLACES, 3)."""
+    chosen: list[Array] = []
+    for point in rng.permutation(points):
+        if all(np.linalg.norm(point - other) >= APART_M for other in chosen):
+            chosen.append(point)
+        if len(chosen) == PLACES:
+            return np.array(chosen)
+    raise RuntimeError(f"population: fewer than {PLACES} places {APART_M} m apart among {len(points)}")
+
+
+def section(found: Sample | None = None) -> Section:
+    """The comparison with its bounds."""
+    found, people = found or sampled(), measured()
+    checks = tuple(
+        Check(name, ours, "", theirs * (1 - within), theirs * (1 + within), f"measured: {theirs:.3g}")
+        for (name, ours), theirs, within in zip(found.figures().items(), people.figures().values(), WITHIN, strict=True)
+    )
+    text = (
+        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {PLACES} random places of the "
+        "belly away from bone by a sphere of 10 mm at 5 mm/s, beside the 48 places of ten relaxed people (Remus et al. 2024, CC BY "
+        "4.0). Level, stiffening and length of a person and their variation from place to place are drawn with the moments of "
+        "`fitted.csv`. Both sides are treated alike: neither deviation is freed of what the other leaves in it. Ten people "
+        "tell a deviation between people to a quarter, so the bounds are as wide. The people were young, male and slim: other builds "
+        "are models."
+    )
+    data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
+    return Section("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)
+
+
+def draw(figure: Figure, found: Sample, people: Sample) -> None:
+    """Distributions of force, of its ratio within a person and of its exponent, sampled and measured."""
+    axes = figure.subplots(1, 3)
+    shown = (
+        ("force at 10 mm [N]", found.force[:, AT_10_MM], people.force[:, AT_10_MM]),
+        ("largest over smallest on one person", _ratios(found), _ratios(people)),
+        (
+            "exponent, 10 to 20 mm",
+            np.log2(found.force[:, 2] / found.force[:, 1]),
+            np.log2(people.force[:, 2] / people.force[:, 1]),
+        ),
+    )
+    for ax, (name, ours, theirs) in zip(axes, shown, strict=True):
+        for values, colour, label, style in ((ours, COLOURS[0], "sampled", "-"), (theirs, INK, "measured", ".")):
+            at = np.sort(values)
+            ax.plot(at, (np.arange(len(at)) + 0.5) / len(at), style, ms=3, lw=1.2, color=colour, label=label)
+        ax.set(xlabel=name, ylim=(0, 1))
+    axes[0].set(ylabel="share below")
+    axes[0].legend()
+
+
+def _ratios(sample: Sample) -> Array:
+    return np.array([np.exp(np.ptp(logs)) for logs in sample.of_people(AT_10_MM)])

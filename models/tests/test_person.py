@@ -1,0 +1,255 @@
+"""Persons: drawn from the seed alone, whole, of the bodies and walls that their builds have."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy.stats import kurtosis
+
+from palpate_models.anatomy import Anatomy, Muscles, Skeleton, Variation
+from palpate_models.draw import Build, Draw
+from palpate_models.load import ScenarioError, dump_scenario, load_scenario
+from palpate_models.patient import Phantom, Stiffness
+from palpate_models.person import FAT_YOUNG_PA, MEASURED_FAT_M, drawn, under_fat
+from palpate_models.phantom import build_phantom
+from palpate_models.phantom.bones import bone_share
+from palpate_models.phantom.healthy import belly, healthy_wall
+from palpate_models.phantom.variation import NaturalField
+from palpate_models.remus2024 import fitted
+from palpate_models.scenario import Scenario
+from palpate_models.seeds import generator
+from palpate_models.wall_statistics import moments, wall_statistics
+
+PERSON = Phantom(kind="person")
+SIZE = (0.36, 0.46, 0.20)
+LUMPY = Draw(lumps=(2, 4), pairs=0.5, guarding="voluntary")
+
+
+def person(**fields: Any) -> Phantom:
+    return Phantom(kind="person", **fields)
+
+
+def test_a_person_is_the_seeds() -> None:
+    assert drawn(PERSON, 3) == drawn(PERSON, 3) != drawn(PERSON, 4)
+    assert drawn(Phantom(), 3) == Phantom()
+
+
+def test_a_drawn_person_is_whole_and_stays() -> None:
+    whole = drawn(person(draw=LUMPY), 5)
+    assert drawn(whole, 5) == whole == drawn(whole, 6)
+    assert Phantom.model_validate(whole.model_dump()) == whole
+    first, second = build_phantom(person(draw=LUMPY), 5), build_phantom(whole, 5)
+    for name in ("vertices", "stiffness", "background", "stiffening", "tension", "breathing"):
+        assert np.array_equal(getattr(first, name), getattr(second, name)), name
+
+
+def test_lumps_and_guarding_leave_the_body_as_it_is() -> None:
+    plain, lumpy = drawn(PERSON, 7), drawn(person(draw=LUMPY), 7)
+    assert lumpy.lesions
+    assert lumpy.guarding
+    assert plain.model_copy(update={"draw": LUMPY, "lesions": lumpy.lesions, "guarding": lumpy.guarding}) == lumpy
+
+
+def test_a_scenario_has_the_person_of_its_seed() -> None:
+    scenario = load_scenario("person", seed=11)
+    assert scenario.phantom == drawn(PERSON, 11) == Scenario(seed=11, phantom=PERSON).phantom
+    assert Scenario.model_validate(scenario.model_dump()) == scenario
+    assert "anatomy" in dump_scenario(scenario)
+
+
+@pytest.mark.parametrize("build", [Build.SLIM, Build.MEDIAN, Build.OBESE])
+def test_builds_can_be_examined(build: Build) -> None:
+    for seed in range(3):
+        model = build_phantom(person(build=build), seed)
+        assert (model.areas > 0).all()
+        assert model.stiffness.min() > 0
+        assert model.stiffening.min() >= 0
+        assert not model.fixed[np.hypot(*model.vertices[:, :2].T).argmin()]
+
+
+def test_builds_differ_as_they_are_called() -> None:
+    slim, median, obese = ([drawn(person(build=build), seed) for seed in range(20)] for build in ("slim", "median", "obese"))
+
+    def mean(people: list[Phantom], of: Any) -> float:
+        return float(np.mean([of(one) for one in people]))
+
+    for of in (lambda p: p.anatomy.fat_m, lambda p: p.anatomy.dome_m, lambda p: p.size_m[0], lambda p: p.size_m[2]):
+        assert mean(slim, of) < mean(median, of) < mean(obese, of)
+    assert mean(obese, lambda p: p.stiffness.k_w_n_per_m3) < 0.8 * mean(median, lambda p: p.stiffness.k_w_n_per_m3)
+    assert mean(obese, lambda p: p.stiffness.length_m) > 1.1 * mean(median, lambda p: p.stiffness.length_m)
+
+
+def test_breathing_is_largest_near_the_navel_and_fades_to_the_border() -> None:
+    for seed in range(3):
+        model = build_phantom(PERSON, seed)
+        at = np.hypot(*model.vertices[:, :2].T)
+        assert at[model.breathing.argmax()] < 0.03
+        assert (model.breathing[model.fixed] == 0).all()
+
+
+def test_the_wall_does_not_depend_on_the_mesh() -> None:
+    coarse, fine = (build_phantom(person(edge_m=edge), 3) for edge in (0.008, 0.005))
+    at = [np.argmin(np.linalg.norm(model.vertices, axis=1)) for model in (coarse, fine)]
+    assert coarse.stiffness[at[0]] == pytest.approx(fine.stiffness[at[1]], rel=1e-9)
+    assert coarse.stiffening[at[0]] == pytest.approx(fine.stiffening[at[1]], rel=1e-9)
+
+
+def test_over_the_belly_the_wall_varies_as_asked() -> None:
+    anatomy = Anatomy(
+        muscles=Muscles(linea_alba=1.1, rectus=1.2),
+        variation=Variation(stiffness=0.2, stiffening_per_m=20.0, correlation=-0.5),
+    )
+    points = belly(SIZE, anatomy)
+    deviations, correlations = [], []
+    for seed in range(100):
+        wall = healthy_wall(points, SIZE, anatomy, 200.0, seed)
+        logs = np.log(wall.stiffness)
+        assert abs(logs.mean()) < 0.02
+        deviations.append((logs.std(), wall.stiffening.std()))
+        correlations.append(np.corrcoef(logs, wall.stiffening)[0, 1])
+    np.testing.assert_allclose(np.mean(deviations, axis=0), (0.2, 20.0), rtol=0.08)
+    assert np.mean(correlations) == pytest.approx(-0.5, abs=0.1)
+
+
+def fields(length_m: tuple[float, float]) -> list[Any]:
+    """Forty random fields on a grid of 5 mm."""
+    x, y = np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.1, 0.1, 41))
+    points = np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size)))
+    return [NaturalField(generator(seed, "test"), length_m, points)(points).reshape(x.shape) for seed in range(40)]
+
+
+def test_fields_are_not_gaussian() -> None:
+    excess = [abs(kurtosis(field.ravel())) for field in fields((0.010, 0.012))]
+    assert max(abs(field).max() for field in fields((0.010, 0.150))) < 5
+    assert np.median(excess) > 0.5  # a Gaussian field of this length has less than 0.5 in nine of ten
+
+
+def test_fields_have_lengths_and_directions_of_their_own() -> None:
+    slopes = np.array([[part.std() for part in np.gradient(field, 0.005)] for field in fields((0.010, 0.150))])
+    steep, turned = np.hypot(*slopes.T), slopes[:, 0] / slopes[:, 1]
+    assert steep.max() > 4 * steep.min()
+    assert turned.max() > 1.5 > 1 / 1.5 > turned.min()
+
+
+def test_bone_is_stiff_and_part_of_the_healthy_wall() -> None:
+    model = build_phantom(person(build="median"), 2)
+    whole = drawn(person(build="median"), 2)
+    assert whole.anatomy is not None
+    x, y, _ = model.vertices.T
+    share = bone_share(x, y, whole.anatomy.skeleton)
+    bone = share == 1
+    assert model.stiffening[bone].min() == pytest.approx(whole.anatomy.bone_stiffening_per_m)
+    assert np.median(model.background[bone]) > 1.5 * np.median(model.background[share == 0])
+
+
+def test_bones_are_where_the_skeleton_says() -> None:
+    skeleton = Skeleton()
+    across, along = skeleton.iliac_crest_m
+    x = np.array([0.0, 0.0, 0.0, across, -across])
+    y = np.array([0.0, skeleton.costal_arch_m - 0.001, skeleton.costal_arch_m + 0.05, along, along])
+    np.testing.assert_allclose(bone_share(x, y, skeleton), (0, 0, 1, 1, 1), atol=1e-9)
+
+
+def test_under_fat_the_wall_is_two_springs_in_series() -> None:
+    wall, fat = Stiffness(k_w_n_per_m3=2e5, length_m=0.015, stiffening_per_m=80.0), 0.045
+    extra = fat - MEASURED_FAT_M
+    both = under_fat(wall, fat)
+    pressure = 200.0  # small: the springs are expanded to third order
+
+    def yields(k: float, beta: float) -> float:
+        linear = pressure / k
+        roots = np.roots((beta**2 / 3, 0, 1, -linear))
+        return float(roots[np.argmin(abs(roots.imag))].real)
+
+    apart = yields(wall.k_w_n_per_m3, wall.stiffening_per_m) + yields(FAT_YOUNG_PA / extra, 1 / extra)
+    assert yields(both.k_w_n_per_m3, both.stiffening_per_m) == pytest.approx(apart, rel=1e-5)
+    shear = [one.k_w_n_per_m3 * one.length_m**2 for one in (wall, both)]
+    assert shear[0] == pytest.approx(shear[1])
+    assert under_fat(wall, MEASURED_FAT_M) == wall
+
+
+def test_moments_are_told_apart() -> None:
+    rng = np.random.default_rng(0)
+    count, places = 4000, 5
+    mix = np.array([[0.2, 0.0, 0.0], [0.05, 0.1, 0.0], [-0.1, 0.1, 0.3]])
+    level = np.array((12.0, -4.0, 70.0)) + rng.standard_normal((count, 3)) @ np.diag((0.15, 0.05, 10.0))
+    values = np.repeat(level, places, axis=0) + rng.standard_normal((count * places, 3)) @ mix.T
+    found = moments(values, np.repeat(np.arange(count).astype(str), places))
+    np.testing.assert_allclose(found.mean, (12, -4, 70), atol=0.5)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.between)), (0.15, 0.05, 10.0), rtol=0.05)
+    inner = mix @ mix.T
+    given = inner[np.ix_([0, 2], [0, 2])] - np.outer(inner[[0, 2], 1], inner[[0, 2], 1]) / inner[1, 1]
+    np.testing.assert_allclose(found.places, given, atol=0.02 * inner.max())
+
+
+def test_between_people_the_statistics_are_sound() -> None:
+    statistics = wall_statistics()
+    assert (np.linalg.eigvalsh(statistics.between) >= -1e-12).all()
+    assert 0.15 < np.sqrt(statistics.places[0, 0]) < 0.27  # about 0.2 between places
+
+
+def test_lumps_are_within_their_ranges() -> None:
+    draw = Draw(lumps=(1, 5), radius_m=(0.01, 0.02), elongation=(3, 4), depth_m=(0.005, 0.01), contrast=(0.2, 0.5), pairs=0.5)
+    counts = set()
+    for seed in range(60):
+        lumps = drawn(person(draw=draw), seed).lesions
+        counts.add(len(lumps))
+        for lump in lumps:
+            assert 0.01 <= min(lump.radii_m) <= 0.02
+            assert 3 <= max(lump.radii_m) / min(lump.radii_m) <= 4
+            assert lump.depth_m is not None
+            assert 0.005 <= lump.depth_m <= 0.01
+            assert 0.2 <= lump.contrast <= 0.5
+    assert counts == {1, 2, 3, 4, 5}
+
+
+def test_pairs_are_beside_each_other() -> None:
+    first, second = drawn(person(draw=Draw(lumps=(2, 2), elongation=(1, 1), pairs=1.0)), 1).lesions
+    gap = np.linalg.norm(np.subtract(first.centre_m, second.centre_m)) - first.radii_m[0] - second.radii_m[0]
+    assert 0.002 <= gap <= 0.020
+
+
+def test_lumps_on_the_edge_of_the_region() -> None:
+    draw = Draw(lumps=(1, 1), place="edge", region_m=(0.2, 0.16))
+    for seed in range(20):
+        (lump,) = drawn(person(draw=draw), seed).lesions
+        assert np.max(np.abs(lump.centre_m) / np.array((0.1, 0.08))) == pytest.approx(1)
+
+
+def test_guarding_has_a_measured_ratio() -> None:
+    ratios = [fit.activated_ratio for fit in fitted().values()]
+    found = [drawn(person(draw=Draw(guarding="involuntary")), seed).guarding[0] for seed in range(200)]
+    assert {area.kind for area in found} == {"involuntary"}
+    assert min(ratios) <= min(area.ratio for area in found) <= max(area.ratio for area in found) <= max(ratios)
+    assert np.median([area.ratio for area in found]) == pytest.approx(np.median(ratios), abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"kind": "person", "stiffness": {"k_w_n_per_m3": 1e5}}, "stiffness of kind: person is drawn"),
+        ({"kind": "person", "size_m": (0.3, 0.4, 0.2)}, "size_m of kind: person is drawn"),
+        ({"kind": "person", "mesh": "a.stl"}, "mesh: FILE needs kind: mesh"),
+        ({"kind": "person", "build": "tall"}, "slim"),
+        ({"build": "slim"}, "build belongs to kind: person"),
+        ({"draw": {"lumps": (1, 2)}}, "draw belongs to kind: person"),
+        ({"anatomy": {}}, "anatomy belongs to kind: person"),
+        ({"kind": "person", "draw": {"lumps": (3, 2)}}, "lumps = 3 to 2"),
+        ({"kind": "person", "draw": {"radius_m": (5, 40)}}, "radius_m = 5 to 40: want 0.005"),
+        ({"kind": "person", "draw": {"contrast": (0.5, 2)}}, "both above 1, or both below"),
+        ({"kind": "person", "draw": {"guarding": "voluntary"}, "guarding": [{"centre_m": (0, 0)}]}, "draw.guarding"),
+        ({"lesions": [{"centre_m": (0, 0), "contrast": 1}]}, "contrast = 1 is no lump"),
+        ({"lesions": [{"centre_m": (0, 0), "contrast": 0.05}]}, "greater than or equal to 0.1"),
+    ],
+)
+def test_bad_input_is_refused(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        Phantom.model_validate(fields)
+
+
+def test_bad_input_of_a_scenario_names_the_field() -> None:
+    with pytest.raises(ScenarioError, match=r"person\.yaml: phantom\.draw.*depth_m = 0 to 0\.2"):
+        load_scenario("person", ["phantom.draw.depth_m=[0, 0.2]"])
