@@ -12,7 +12,7 @@ from palpate_models.scenario import Scenario
 from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
 from palpate_tissue.backends.elastic.equivalent import with_equivalent_stiffness
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
-from palpate_tissue.moving import carried
+from palpate_tissue.moving.service import carried
 from palpate_tissue.service import TissueService
 
 
