@@ -11,7 +11,7 @@ from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
-from palpate_tissue.moving import carried
+from palpate_tissue.moving.service import carried
 from palpate_tissue.service import TissueService
 
 

@@ -25,7 +25,7 @@ from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.wiring import Wiring
-from palpate_tissue.moving import carried
+from palpate_tissue.moving.service import carried
 
 _log = logging.getLogger("palpate.tissue")
 

@@ -10,7 +10,7 @@ from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_tissue.moving import carried
+from palpate_tissue.moving.service import carried
 from palpate_tissue.service import TissueService
 
 

@@ -1,0 +1,1 @@
+"""A patient who moves: a service that carries any tissue service along."""
