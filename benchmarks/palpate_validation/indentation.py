@@ -36,7 +36,8 @@ def wall_tissue(wall: WallParameters, tension: float = 0.0) -> WinklerTissue:
 
 def press(wall: WallParameters, tension: float = 0.0, depth_m: float = REACH_M) -> Array:
     """Force [N] of their sphere as it is pressed to `depth_m` [m], at each `SPACING_M` from the surface down, the first 0."""
-    return force_along(wall_tissue(wall, tension), np.arange(1, round(depth_m / SPACING_M) + 1) * SPACING_M, SPEED_MPS)
+    depths = SPACING_M * np.arange(1.0, round(depth_m / SPACING_M) + 1)
+    return force_along(wall_tissue(wall, tension), depths, SPEED_MPS)
 
 
 def force_along(tissue: WinklerTissue, depths: Array, speed: float) -> Array:

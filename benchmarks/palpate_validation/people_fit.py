@@ -31,6 +31,17 @@ USUAL_LENGTH_M = 0.015
 LENGTH_WEIGHT = 0.05
 """A force over depth says little of the wall length, so it is drawn to the usual one: by ln 2 costs as much as 3.5 % RMS."""
 RATIO_AT_M = 0.010
+"""Depth at which tensed muscles are compared with relaxed ones."""
+COLUMNS = (
+    "region",
+    "id",
+    *WallParameters._fields,
+    "zero_offset_m",
+    "rms_percent",
+    "activated_ratio",
+    "tension",
+)
+"""Of `fitted.csv`."""
 
 Simulated = Callable[[float, float], Array]
 """Force over k_w [m^3] at each `SPACING_M`, by wall length [m] and stiffening [1/m]."""
@@ -94,14 +105,12 @@ def write(found: dict[tuple[str, str], Fit], path: Path) -> None:
     """Writes `fitted.csv`."""
     with path.open("w", encoding="ascii", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow((*"region id k_w_n_per_m3 length_m stiffening_per_m zero_offset_m rms_percent activated_ratio tension".split(),))
-        for (region, person), f in found.items():
+        out.writerow(COLUMNS)
+        for place, f in found.items():
             k_w, length, beta = f.wall
-            out.writerow(
-                (region, person, f"{k_w:.0f}", f"{length:.5f}", f"{beta:.2f}", f"{f.zero_offset_m:.6f}", f"{f.rms_percent:.2f}")
-                + (f"{f.activated_ratio:.3f}", f"{f.tension:.3f}")
-            )
+            wall = (f"{k_w:.0f}", f"{length:.5f}", f"{beta:.2f}", f"{f.zero_offset_m:.6f}", f"{f.rms_percent:.2f}")
+            out.writerow((*place, *wall, f"{f.activated_ratio:.3f}", f"{f.tension:.3f}"))
 
 
 if __name__ == "__main__":
-    write(fits(), Path(str(remus2024.FOLDER / "fitted.csv")))
+    write(fits(), remus2024.FOLDER / "fitted.csv")

@@ -54,7 +54,7 @@ class Stiffness(Section):
     length_m: Annotated[float, Field(ge=0.002, le=0.1)] = 0.015
     """Pasternak length l = sqrt(G / k_w)."""
     stiffening_per_m: NonNegative = 0.0
-    """How fast the modulus rises with depth: at displacement u it is k_w (1 + stiffening_per_m u), see `palpate_models.wall`."""
+    """How fast the modulus rises with depth: at a displacement u it is k_w (1 + (stiffening_per_m u)^2), see `wall.py`."""
     prony_g: tuple[NonNegative, ...] = (0.3, 0.2)
     """Relaxing fractions of the instantaneous modulus."""
     prony_tau_s: tuple[Positive, ...] = (1.86, 51.3)

@@ -9,7 +9,7 @@ import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from palpate_models.frames import Array
 from palpate_models.wall import WallParameters
 
-FOLDER = files("palpate_models") / "data" / "remus2024"
+FOLDER = Path(__file__).parent / "data" / "remus2024"
 RADIUS_M = 0.010
 """The hemisphere they pressed with."""
 SPEED_MPS = 0.005
@@ -42,10 +42,9 @@ class Curve:
         """Force [N] at depths [m], shape as theirs. Raises ValueError for a depth that was not measured."""
         depth = np.asarray(depth_m, dtype=np.float64)
         if not ((depth >= 0) & (depth <= self.deepest_m)).all():
-            raise ValueError(
-                f"{self.name}: depths from {depth.min():g} to {depth.max():g} m are asked for, measured are 0 to {self.deepest_m:g} m"
-            )
-        return np.maximum(np.polyval(self.coefficients, 1e3 * depth), 0.0)
+            asked = f"{depth.min():g} to {depth.max():g} m"
+            raise ValueError(f"remus2024: {self.name}: depths of {asked} are asked for, measured are 0 to {self.deepest_m:g} m")
+        return np.asarray(np.maximum(np.polyval(self.coefficients, 1e3 * depth), 0.0))
 
 
 @cache

@@ -24,11 +24,11 @@ import numpy as np
 from palpate_models.frames import Array
 
 MOST_STIFFENING = 15.0
-"""The stiffening spring's modulus is at most this many times k_w: no measured place is stiffer to 20 mm, and steps stay stable."""
+"""The stiffening spring's modulus is at most this many times k_w: none measured is stiffer at 20 mm, and it bounds the step."""
 
 
 def straight_from(stiffening: Array) -> Array:
-    """Displacement u_c [m] from which the stiffening spring is straight, of `stiffening` beta [1/m]; infinite where beta is 0."""
+    """Displacement [m] from which a stiffening spring of beta = `stiffening` [1/m] is straight; infinite where beta is 0."""
     with np.errstate(divide="ignore"):
         return np.asarray(math.sqrt(MOST_STIFFENING) / np.asarray(stiffening, dtype=np.float64))
 

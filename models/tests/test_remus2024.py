@@ -24,7 +24,7 @@ def test_forces_are_in_newton_at_depths_in_metres() -> None:
 
 @pytest.mark.parametrize("depth", [-1e-6, 0.0357, np.nan])
 def test_depths_that_were_not_measured_are_refused(depth: float) -> None:
-    with pytest.raises(ValueError, match="R1 P01.*0 to 0.0356 m"):
+    with pytest.raises(ValueError, match=r"R1 P01.*0 to 0\.0356 m"):
         curve("R1", "P01").force(np.array((0.01, depth)))
 
 
@@ -36,7 +36,7 @@ def test_no_force_is_below_zero() -> None:
 
 
 def test_a_row_that_is_not_there_is_named() -> None:
-    with pytest.raises(KeyError, match="'R1'.*'P03'"):
+    with pytest.raises(KeyError, match=r"'R1'.*'P03'"):
         curve("R1", "P03")
 
 

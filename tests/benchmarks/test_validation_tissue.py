@@ -9,9 +9,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from palpate_models.patient import Stiffness
-from palpate_validation import drop, energy, hertz, lumps, meshes, relaxation
+from palpate_models.remus2024 import relaxed_people
+from palpate_validation import drop, energy, hertz, lumps, meshes, people, relaxation
 from palpate_validation.check import Check, Section
 from palpate_validation.foundation import lump, static_force, uniform
+from palpate_validation.indentation import SPACING_M
+from palpate_validation.people_fit import at_depths, fit
 
 
 def assert_bounds(section: Section) -> None:
@@ -56,6 +59,34 @@ def test_mesh_halving_and_superposition() -> None:
 
 def test_relaxation_is_read_back_from_the_force() -> None:
     assert_bounds(relaxation.section())
+
+
+def test_a_sixth_of_the_living_people() -> None:
+    assert_bounds(people.section(people.measure(relaxed_people()[::6])))
+
+
+@pytest.mark.slow
+def test_all_living_people() -> None:
+    assert_bounds(people.section())
+
+
+def test_people_are_fitted_by_the_wall_that_made_the_force() -> None:
+    """The fit finds a wall, its offset and its k_w again from a force that such a wall gave."""
+
+    def simulated(length: float, beta: float) -> np.ndarray:
+        depth = np.arange(221) * SPACING_M
+        return length * depth + depth**1.5 * length**2 + beta**2 * depth**4
+
+    force = 2e5 * at_depths(simulated(0.015, 90.0), 0.0005)
+    wall, offset, rms = fit(force, simulated)
+    np.testing.assert_allclose(wall, (2e5, 0.015, 90.0), rtol=1e-3)
+    assert offset == pytest.approx(0.0005, rel=1e-3)
+    assert rms < 1e-3
+
+
+def test_a_loop_loses_what_does_not_come_back() -> None:
+    depth = np.array((0.0, 1.0, 2.0, 1.0, 0.0)) * 1e-3
+    assert people.Loop(0.01, depth, np.array((0.0, 1.0, 2.0, 0.5, 0.0))).lost_percent == pytest.approx(25.0)
 
 
 def test_random_cycles() -> None:

@@ -67,7 +67,7 @@ class Patch(NamedTuple):
 _N, _X, _BETA, _GAIN = 0, 3, 6, 7
 """Columns of a patch: outward normal (three), position (three) [m], share of the breathing excursion, and C / h [N/m]."""
 _BETA2, _BENT, _TENSION = 0, 1, 2
-"""Rows of the springs: beta^2 [1/m^2], the displacement from which they are straight [m], and what a contracted muscle adds [1]."""
+"""Rows of the springs: beta^2 [1/m^2], the displacement from which they are straight [m], a contracted muscle's tension [1]."""
 
 
 @compiled

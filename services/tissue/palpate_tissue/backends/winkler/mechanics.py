@@ -77,9 +77,9 @@ def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
         shape=(n, n),
     )
     matrix.sort_indices()
-    foundation = model.stiffness * model.areas
-    damping = stiffness.dashpot_s * foundation
-    hardest = matrix + sparse.diags_array(np.where(free, foundation * wall.largest_slope(model.stiffening, model.tension), 0.0))
+    damping = stiffness.dashpot_s * model.stiffness * model.areas
+    beside = wall.largest_slope(model.stiffening, model.tension)
+    hardest = matrix + sparse.diags_array(np.where(free, model.stiffness * model.areas * beside, 0.0))
     return Mechanics(matrix, damping, _largest_rate(hardest, damping), _gershgorin(hardest, damping))
 
 

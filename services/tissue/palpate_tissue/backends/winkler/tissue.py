@@ -5,7 +5,8 @@ State: displacement u of every vertex along its inward rest normal [m], and one 
     C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f,     y_k' = (g_k u - y_k) / tau_k
     f >= 0,  u >= w,  f (u - w) = 0
 
-sigma is the stiffening of `palpate_models.wall`. w(p) is where the sphere holds a vertex on its inward normal. See the README for the derivation, and `kernel.py` for the step.
+sigma is the stiffening of `palpate_models.wall`, a how far muscles are contracted, w(p) where the sphere holds a vertex on its
+inward normal. See the README for the derivation, and `kernel.py` for the step.
 """
 
 from __future__ import annotations
@@ -135,7 +136,16 @@ class WinklerTissue(TissueBackend):
         feed: Array = np.array(stiffness.prony_g) * (1 - decay)
         prony, share = np.column_stack((decay, feed)), h / stiffness.dashpot_s
         return Wall(
-            self.displacement, self.branches, indptr, columns, A.data, prony, h, self._springs(), share, np.array([self.activation])
+            self.displacement,
+            self.branches,
+            indptr,
+            columns,
+            A.data,
+            prony,
+            h,
+            self._springs(),
+            share,
+            np.array([self.activation]),
         )
 
     def _springs(self) -> Array:
@@ -170,7 +180,7 @@ class WinklerTissue(TissueBackend):
         return self.displacement
 
     def energy(self) -> float:
-        """Elastic energy [J] stored in the springs, the Maxwell branches' and the stiffening included, and in the sheared skin."""
+        """Elastic energy [J] stored in all springs, those of the Maxwell branches too, and in the sheared skin."""
         u, K = self.displacement, self.mechanics.stiffness
         stored = 0.5 * (1 - sum(self._prony_g)) * (u @ (K @ u))
         for g, y in zip(self._prony_g, self.branches, strict=True):
@@ -178,6 +188,6 @@ class WinklerTissue(TissueBackend):
                 stretch = u - y / g
                 stored += 0.5 * g * (stretch @ (K @ stretch))
         model = self.model
-        beside = wall.stored(u, model.stiffening) + 0.5 * self.activation * model.tension * np.maximum(u, 0.0) ** 2
-        stored += (model.stiffness * model.areas) @ beside
+        muscle = self.activation * model.tension * np.maximum(u, 0.0) ** 2 / 2
+        stored += (model.stiffness * model.areas) @ (wall.stored(u, model.stiffening) + muscle)
         return float(stored + self.friction.energy())
