@@ -50,8 +50,8 @@ class TissueBackend(ABC):
 
     @property
     @abstractmethod
-    def indentation(self) -> Array:
-        """How far each vertex in contact is displaced along its inward normal [m], shape (k,)."""
+    def deepest(self) -> tuple[int, float]:
+        """The vertex in contact that is displaced most, and how far along its inward normal [m]. There has to be contact."""
 
     @property
     @abstractmethod
@@ -66,10 +66,8 @@ class TissueBackend(ABC):
     def guard(self, v_A: Array) -> None:
         """Advances `activation` by a period, from how the sphere of velocity `v_A` [m/s] holds the skin: how each step ends."""
         if self._guarding.voluntary and self.touching:
-            indentation = self.indentation
-            deepest = int(indentation.argmax())
-            normal = self.model.normals[self.contacts[deepest]]
-            self.activation = self._guarding.after(self.activation, float(indentation[deepest]), -float(v_A @ normal))
+            vertex, depth = self.deepest
+            self.activation = self._guarding.after(self.activation, depth, -float(v_A @ self.model.normals[vertex]))
 
     def excursion(self, t_s: float) -> float:
         """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""

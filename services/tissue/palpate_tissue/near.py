@@ -41,24 +41,23 @@ class Near(NamedTuple):
 class Search:
     """Finds the vertices near a sphere among some at rest. Everything is in A."""
 
-    def __init__(self, vertices: Array, normals: Array, excursion: float, margin: float, beside: float = 0.0) -> None:
+    def __init__(self, vertices: Array, normals: Array, excursion: float, margin: float) -> None:
         """`vertices` [m] and outward `normals`, shape (n, 3); the largest breathing `excursion` [m].
 
-        The centre may move by `margin` [m] before they have to be searched again. Vertices up to `beside` [m] beside the sphere
-        are found with those that it might touch.
+        The centre may move by `margin` [m] before they have to be searched again.
         """
         self._vertices, self._normals = vertices, normals
         self._tree = cKDTree(vertices)
-        self._excursion, self._margin, self._beside = excursion, margin, beside
+        self._excursion, self._margin = excursion, margin
 
     def around(self, p: list[float], radius: float, deepest: float) -> Near:
         """What a sphere of `radius` [m] near `p` [m] might touch, where the skin is displaced by at most `deepest` [m]."""
-        ball = math.hypot(radius + self._beside, max(_REACH_M, deepest + 0.01)) + self._excursion + self._margin
+        ball = math.hypot(radius, max(_REACH_M, deepest + 0.01)) + self._excursion + self._margin
         distance, nearest = self._tree.query(p)
         index = np.sort(np.asarray(self._tree.query_ball_point(p, ball), dtype=np.intp))
         n, X = self._normals[index], self._vertices[index] - p
         height = (n * X).sum(axis=1)
         lateral = np.linalg.norm(X - height[:, None] * n, axis=1)
         facing = n @ self._normals[nearest] > 0  # not the far side of something thin
-        keep = (lateral < radius + self._beside + self._margin) & facing
+        keep = (lateral < radius + self._margin) & facing
         return Near(p, max(self._margin, float(distance) - ball), radius, index[keep], n[keep], X[keep])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate_models.frames import Array
 from palpate_tissue.backends.elastic.contact import ContactSolver
@@ -17,7 +18,7 @@ _NOWHERE_M = -1.0
 
 
 class ElasticPatch:
-    """Vertices that the sphere might hold, or press aside, while its centre stays near a place; m of them."""
+    """Vertices that the sphere might hold while its centre stays near a place; m of them."""
 
     def __init__(self, near: Near, breathing: Array, state: Array, compliance: Array) -> None:
         """`breathing` (m,) is their share of the excursion, `compliance` (m, m) displacement by force in a step [m/N]."""
@@ -28,24 +29,17 @@ class ElasticPatch:
         """What the forces since the beginning left behind, shape (branches + 1, m) [N]: S times it is displacement."""
         self.force = np.zeros(len(near.vertex))
         """Contact forces f after the step, along the inward normals [N], shape (m,)."""
+        self.vertex = near.vertex
+        """Which vertices these are, shape (m,)."""
+        self.within: NDArray[np.intp] = np.arange(len(near.vertex))
+        """Where among them are those that the sphere might hold."""
         self.deepest = math.inf
         """Displacement [m] up to which the step is passive."""
         self.solver = ContactSolver(compliance)
-        self._springs: Springs | None = None
-        self._lag: Array = np.empty(0)
         self._breathing = breathing
         self._height = (near.n * near.X).sum(axis=1)
         self._square = (near.X * near.X).sum(axis=1)
         self._q = self._s = self._c = np.empty(0)
-
-    def resist(self, springs: Springs, deepest: float) -> None:
-        """Puts `springs` on the vertices for displacements up to `deepest` [m]."""
-        self.deepest = deepest
-        self._springs = springs
-        self._lag = lag = springs.steepest(deepest)
-        compliance = self.solver.matrix
-        softened = np.linalg.solve(np.eye(len(lag)) + compliance * lag, compliance)
-        self.solver = ContactSolver(0.5 * (softened + softened.T))
 
     def hold(self, p: Array, excursion: float) -> Array:
         """Displacement w [m] at which the sphere with its centre at `p` holds each vertex, shape (m,).
@@ -64,28 +58,20 @@ class ElasticPatch:
         return w
 
     def step(self, w: Array, advance: Array, feed: Array, activation: float) -> bool:
-        """One step of the vertices, held out of the sphere. Whether the sphere touches any.
-
-        (u, y)+ = M (u, y) + b S (f - q),    q = q(u) + d (u+ - u),  d = max q': at the end of the step, as the solid is.
-        """
+        """One step of the vertices, held out of the sphere: (u, y)+ = M (u, y) + b (S f). Whether the sphere touches any."""
         free = advance @ self.state
-        if self._springs is None:
-            self.force, moved = self.solver.solve(w - free[0])
-            load = self.force
-        else:
-            u, d = self.state[0], self._lag
-            opposing = self._springs.force(u, activation) + d * (free[0] - u)  # q if nothing but M moved the vertices
-            yielded = self.solver.matrix @ opposing
-            self.force, pushed = self.solver.solve(w - free[0] + yielded)
-            moved = pushed - yielded
-            load = self.force - opposing - d * moved
-        self.state = free + (feed / feed[0])[:, None] * moved
-        self.impulse = advance @ self.impulse + feed[:, None] * load
+        self.force, moved = self.solver.solve(w - free[0])
+        self._finish(advance, feed, free, moved, self.force)
         return bool(self.force.any())
 
+    def _finish(self, advance: Array, feed: Array, free: Array, moved: Array, load: Array) -> None:
+        """The state after `free` [m] (branches + 1, m), by what a `load` [N] has `moved` the vertices [m], each (m,)."""
+        self.state = free + (feed / feed[0])[:, None] * moved
+        self.impulse = advance @ self.impulse + feed[:, None] * load
+
     def spring_energy(self, activation: float) -> float:
-        """What the springs store [J]."""
-        return 0.0 if self._springs is None else self._springs.energy(self.state[0], activation)
+        """What springs beside the solid store [J]: there are none."""
+        return 0.0
 
     def push(self) -> Push:
         """What holding the vertices takes.
@@ -100,3 +86,47 @@ class ElasticPatch:
         force = normal + (g.sum() * q - g @ X) + (g * s) @ n
         arm = (f @ X - (f * (s + c)) @ n) / load - q  # a vertex is at X - (s + c) n
         return Push(tuple(force.tolist()), tuple(normal.tolist()), tuple(arm.tolist()))
+
+
+class SprungPatch(ElasticPatch):
+    """The same with springs, on these k vertices and on those beside them; m in all.
+
+    (u, y)+ = M (u, y) + b S (f - q),    q = q(u) + d (u+ - u),  d = max q': at the end of the step, as the solid is.
+    """
+
+    def __init__(
+        self,
+        near: Near,
+        vertex: NDArray[np.intp],
+        breathing: Array,
+        state: Array,
+        compliance: Array,
+        springs: Springs,
+        deepest: float,
+    ) -> None:
+        """`breathing` is of the k, the others of all `vertex` (m,). `deepest` [m] is how far they may be displaced."""
+        self._lag = lag = springs.steepest(deepest)
+        softened = np.linalg.solve(np.eye(len(lag)) + compliance * lag, compliance)
+        self._softened: Array = 0.5 * (softened + softened.T)
+        within = np.searchsorted(vertex, near.vertex)
+        self._columns = np.ascontiguousarray(self._softened[:, within])
+        super().__init__(near, breathing, state, np.ascontiguousarray(self._columns[within]))
+        self.vertex, self.within, self.deepest = vertex, within, deepest
+        self._springs = springs
+
+    def step(self, w: Array, advance: Array, feed: Array, activation: float) -> bool:
+        """See `ElasticPatch`."""
+        free = advance @ self.state
+        u, d = self.state[0], self._lag
+        opposing = self._springs.force(u, activation) + d * (free[0] - u)  # q if nothing but M moved the vertices
+        yielded = self._softened @ opposing
+        self.force, _ = self.solver.solve(w - (free[0] - yielded)[self.within])
+        moved = self._columns @ self.force - yielded
+        load = -opposing - d * moved
+        load[self.within] += self.force
+        self._finish(advance, feed, free, moved, load)
+        return bool(self.force.any())
+
+    def spring_energy(self, activation: float) -> float:
+        """See `ElasticPatch`."""
+        return self._springs.energy(self.state[0], activation)

@@ -28,7 +28,7 @@ from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
-from palpate_tissue.backends.elastic.patch import ElasticPatch
+from palpate_tissue.backends.elastic.patch import ElasticPatch, SprungPatch
 from palpate_tissue.backends.elastic.springs import Springs
 from palpate_tissue.friction import Sphere, rub
 from palpate_tissue.near import Search
@@ -87,8 +87,7 @@ class ElasticTissue(TissueBackend):
             compliance.young / YOUNG_OVER_K_W * model.areas[free], model.stiffening[free], model.tension[free]
         )
         self._resists = bool(model.stiffening.any() or model.tension.any())
-        beside = _BESIDE_M if self._resists else 0.0
-        self._search = Search(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M, beside)
+        self._search = Search(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M)
         self._state = np.zeros((len(self._feed), len(free)))
         """u and y_k of the free vertices as they were `_behind` steps ago."""
         self._behind = 0
@@ -109,7 +108,7 @@ class ElasticTissue(TissueBackend):
             w = patch.hold(p_A, self._excursion)
         self._behind += 1
         wrench = np.zeros(6)
-        if len(patch.near.vertex) and patch.step(w, self._advance, self._feed, self.activation):
+        if len(patch.vertex) and patch.step(w, self._advance, self._feed, self.activation):
             self.touching = self.disturbed = True
             sphere = Sphere(tuple(p), tuple(v_A.tolist()), (0.0, 0.0, 0.0) if w_A is None else tuple(w_A.tolist()), radius)
             rub(self.friction, sphere, patch.push(), self.dt, wrench)
@@ -143,9 +142,9 @@ class ElasticTissue(TissueBackend):
             return
         pushed = patch.impulse[0] != 0
         if pushed.any():
-            rows = self.compliance.matrix[patch.near.vertex[pushed]]
+            rows = self.compliance.matrix[patch.vertex[pushed]]
             self._state += patch.impulse[:, pushed].astype(np.float32) @ rows
-        self._state[:, patch.near.vertex] = patch.state  # the same but for rounding
+        self._state[:, patch.vertex] = patch.state  # the same but for rounding
         patch.impulse[:] = 0.0
 
     def _gather(self, p: list[float], radius: float) -> ElasticPatch:
@@ -154,14 +153,19 @@ class ElasticTissue(TissueBackend):
         old = self._patch
         deepest = float(old.state[0].max(initial=0.0)) if old is not None else 0.0
         near = self._search.around(p, radius, deepest)
-        index = near.vertex
+        index = self._search.around(p, radius + _BESIDE_M, deepest).vertex if self._resists else near.vertex
+        state = self._state[:, index].copy()
         local = self._feed[0] * self.compliance.matrix[np.ix_(index, index)].astype(np.float64)
-        self._patch = patch = ElasticPatch(near, self._breathing[index], self._state[:, index].copy(), local)
-        if self._resists and len(index):
-            w = patch.hold(np.array(p), self._excursion)
-            patch.resist(self._springs.at(index), max(deepest, float(w.max())) + _DEEPER_M)
+        breathing = self._breathing[near.vertex]
+        if self._resists:
+            lowest = radius + float((near.n * near.X).sum(axis=1).max(initial=-radius)) + max(self._excursion, 0.0)
+            deepest = max(deepest, lowest) + _DEEPER_M
+            patch: ElasticPatch = SprungPatch(near, index, breathing, state, local, self._springs.at(index), deepest)
+        else:
+            patch = ElasticPatch(near, breathing, state, local)
+        self._patch = patch
         if old is not None and self.touching:
-            patch.solver.begin_with(np.isin(index, old.near.vertex[old.solver.active]))
+            patch.solver.begin_with(np.isin(near.vertex, old.near.vertex[old.solver.active]))
         return patch
 
     @property
@@ -189,12 +193,13 @@ class ElasticTissue(TissueBackend):
         return patch.force[patch.force > 0]
 
     @property
-    def indentation(self) -> Array:
-        """How far each vertex in contact is displaced along its inward normal [m], shape (k,)."""
+    def deepest(self) -> tuple[int, float]:
+        """See `TissueBackend`."""
         patch = self._patch
-        if patch is None or not self.touching:
-            return np.empty(0)
-        return np.asarray(patch.state[0][patch.force > 0])
+        assert patch is not None
+        displaced = patch.state[0].take(patch.within) * (patch.force > 0)
+        k = int(displaced.argmax())
+        return int(self.compliance.free[patch.near.vertex[k]]), float(displaced[k])
 
     @property
     def inward(self) -> Array:

@@ -168,9 +168,12 @@ class WinklerTissue(TissueBackend):
         return self._patch.f[self._patch.f > 0] if self.touching else np.empty(0)
 
     @property
-    def indentation(self) -> Array:
-        """How far each vertex in contact is displaced along its inward normal [m], shape (k,)."""
-        return self.displacement[self.contacts]
+    def deepest(self) -> tuple[int, float]:
+        """See `TissueBackend`."""
+        vertex, held = self._patch.vertex, self._patch.f > 0
+        displaced = self.displacement.take(vertex) * held
+        k = int(displaced.argmax())
+        return int(vertex[k]), float(displaced[k])
 
     @property
     def inward(self) -> Array:
