@@ -88,10 +88,11 @@ def section(found: Array | None = None) -> Section:
               "of all", low=1.0, against="elastic tier"),
     )  # fmt: skip
     text = (
-        "The force over the middle of a lump below the skin over the force without it, sphere of 15 mm pressed 10 mm: the surface "
-        "tier, which has a formula for it, against the elastic tier, whose lumps are ellipsoids in a slab of 0.12 m (its "
-        "figures depend on its elements by some percent of the effect). The formula's constants were fitted to these very lumps, "
-        "so this is how well it fits and no proof beyond them; large lumps that touch the skin are felt less than they should be."
+        "The force over the middle of a lump below the skin over the force without it, sphere of 15 mm pressed 10 mm: the "
+        "surface tier, which has a formula for it, against the elastic tier, whose lumps are ellipsoids in a slab of 0.12 "
+        "m (its figures depend on its elements by some percent of the effect). The formula's constants were fitted to "
+        "these very lumps, so this is how well it fits and no proof beyond them; large lumps that touch the skin are felt "
+        "less than they should be."
     )
     data = {
         "lumps": [

@@ -76,9 +76,10 @@ def section(found: tuple[Person, ...] | None = None) -> Section:
         checks.append(Check(f"{person.build}: force over bone, of that over the belly", over_bone, "times", low=3.0))
         checks.append(Check(f"{person.build}: median force over the belly", float(np.median(person.force[belly])), "N"))
     text = (
-        "Three persons of `phantom.kind: person`, one of each build. Above, the force on a sphere of 10 mm pressed 10 mm deep, "
-        "as the stiffness and stiffening of each place give it; white lines are where the wall begins to lie on ribs and iliac "
-        "crests, the dashed square is the default examined region. Below, the crown line from pelvis to ribs, and the middle section."
+        "Three persons of `phantom.kind: person`, one of each build. Above, the force on a sphere of 10 mm pressed 10 mm "
+        "deep, as the stiffness and stiffening of each place give it; white lines are where the wall begins to lie on "
+        "ribs and iliac crests, the dashed square is the default examined region. Below, the crown line from pelvis to "
+        "ribs, and the middle section."
     )
     return Section("persons", "Three persons", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6))
 
@@ -96,7 +97,7 @@ def draw(figure: Figure, found: tuple[Person, ...]) -> None:
         side = 1e3 * REGION_M
         above.plot([-side, side, side, -side, -side], [-side, -side, side, side, -side], "--", color="white", lw=0.7)
         fat = 0.0 if person.phantom.anatomy is None else person.phantom.anatomy.fat_m
-        above.set(title=f"{person.build}: {1e3 * fat:.0f} mm of fat", aspect="equal", xlim=(-215, 215), ylim=(-235, 235))
+        above.set(title=f"{person.build}: {1e3 * fat:.0f} mm of fat", aspect="equal", xlim=(-250, 250), ylim=(-250, 250))
         above.grid(visible=False)
         for at, along, label, line in ((np.abs(x), y, "crown line", "-"), (np.abs(y), x, "middle section", "--")):
             near = np.flatnonzero(person.front & (at < STRIP_M))

@@ -111,12 +111,12 @@ def section(found: Sample | None = None) -> Section:
         for (name, ours), theirs, within in zip(found.figures().items(), people.figures().values(), WITHIN, strict=True)
     )
     text = (
-        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {PLACES} random places of the "
-        "belly away from bone by a sphere of 10 mm at 5 mm/s, beside the 48 places of ten relaxed people (Remus et al. 2024, CC BY "
-        "4.0). Level, stiffening and length of a person and their variation from place to place are drawn with the moments of "
-        "`fitted.csv`. Both sides are treated alike: neither deviation is freed of what the other leaves in it. Ten people "
-        "tell a deviation between people to a quarter, so the bounds are as wide. The people were young, male and slim: other builds "
-        "are models."
+        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {PLACES} random places "
+        "of the belly away from bone by a sphere of 10 mm at 5 mm/s, beside the 48 places of ten relaxed people (Remus et "
+        "al. 2024, CC BY 4.0). Level, stiffening and length of a person and their variation from place to place are drawn "
+        "with the moments of `fitted.csv`. Both sides are treated alike: neither deviation is freed of what the other "
+        "leaves in it. Ten people tell a deviation between people to a quarter, so the bounds are as wide. The people "
+        "were young, male and slim: other builds are models."
     )
     data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
     return Section("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)

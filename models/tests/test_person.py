@@ -212,6 +212,19 @@ def test_pairs_are_beside_each_other() -> None:
     assert 0.002 <= gap <= 0.020
 
 
+def test_lumps_of_one_size_and_contrast() -> None:
+    for seed in range(20):
+        (lump,) = drawn(person(draw=Draw(lumps=(1, 1), radius_m=(0.04, 0.04), contrast=(20, 20))), seed).lesions
+        assert min(lump.radii_m) == pytest.approx(0.04)
+        assert lump.contrast == pytest.approx(20)
+
+
+def test_a_lumpy_person_can_be_built() -> None:
+    for seed in range(10):
+        phantom = drawn(person(draw=Draw(lumps=(2, 3), pairs=0.3)), seed)
+        assert set(range(len(phantom.lesions))) <= set(build_phantom(phantom, seed).lesion.tolist())
+
+
 def test_lumps_on_the_edge_of_the_region() -> None:
     draw = Draw(lumps=(1, 1), place="edge", region_m=(0.2, 0.16))
     for seed in range(20):
