@@ -272,7 +272,7 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
             for name, message in new.items():
                 writer.add_message(ids[name], t, codec.encode(message, contract().topics[name].type), t)
         writer.finish()
-    with pytest.raises(FileNotFoundError, match=r"exam\.yaml"):
+    with pytest.raises(FileNotFoundError, match=r"scenario\.yaml"):
         replay.main(tmp_path)
     (tmp_path / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
     again = Recording(replay.main(tmp_path))

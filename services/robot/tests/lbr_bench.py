@@ -80,7 +80,7 @@ def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any
     return LbrService(exam.model_copy(update={"robot": robot}), port, inner), port
 
 
-SCENARIO = load_scenario("rlq_guarding")
+SCENARIO = load_scenario("rlq_guarding", ("errors=none",))
 GAIN = np.array([400.0, 400.0, 300.0, 300.0, 100.0, 60.0, 30.0])
 
 

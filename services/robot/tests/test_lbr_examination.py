@@ -20,7 +20,7 @@ SHORT = ("exam.region_m=[0.03,0.03]", "exam.centre_m=[-0.055,-0.055]", "camera.f
 @pytest.mark.parametrize("level", ["torque", "setpoint"])
 @pytest.mark.parametrize("gravity_error_nm", [0.0, 0.5])
 def test_an_examination_completes(level: str, gravity_error_nm: float) -> None:
-    scenario = load_scenario("rlq_guarding", SHORT)
+    scenario = load_scenario("rlq_guarding", (*SHORT, "errors=none"))
     robot, port = driver_on_emulator(seen(scenario, "plant"), level, gravity_error_nm=gravity_error_nm)
     collector = Collector()
     run = Composed([robot, *load_services(scenario, OTHERS), collector])
