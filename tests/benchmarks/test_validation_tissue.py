@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from palpate_models.patient import Stiffness
 from palpate_models.remus2024 import relaxed_people
-from palpate_validation import breathing, drop, energy, hertz, lumps, meshes, people, relaxation
+from palpate_validation import drop, energy, hertz, lumps, meshes, people, relaxation
 from palpate_validation.check import Check, Section
 from palpate_validation.foundation import lump, static_force, uniform
 from palpate_validation.indentation import SPACING_M

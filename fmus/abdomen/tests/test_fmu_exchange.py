@@ -80,7 +80,7 @@ def test_cvode_agrees_with_the_co_simulation(coarse: Path) -> None:
 
 @pytest.mark.parametrize("sliding", [False, True], ids=["sticking", "sliding"])
 def test_directional_derivatives_are_those_of_finite_differences(fmu: Path, sliding: bool) -> None:
-    """All outputs and rates are differentiated by all inputs, states and time, in contact, breathing, under muscle that contracts.
+    """All outputs and rates by all inputs, states and time, in contact, while the body breathes and its muscle contracts.
 
     Tension acts on inward displacement alone, so no vertex is left where its force has a kink.
     """
