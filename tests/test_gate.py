@@ -1,7 +1,7 @@
 """What decides whether a change is good: whole examinations, through the command that users run.
 
-The region is a part of the abdomen that holds the lesion and tissue around it, so that this takes minutes. Bounds are the worst
-that README.md's table of figures shows for the whole region, but for the band: a small region has more edge, where it holds less.
+It is the clean world: a patient who lies still, and equipment that errs by white noise alone (docs/reality.md says what comes of
+any other). The region is a part of the abdomen that holds the lesion and tissue around it, so that this takes minutes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from killing import assert_held_and_no_harder, kill_in_contact
 
 pytestmark = pytest.mark.timeout(900)
 LOCALISED_M = 1.7e-3
-DICE = 0.93
+DICE = 0.80
+"""With the area in which the lump is felt, which is wider than the lump."""
 COVERAGE = 0.89
 HIGHEST_FORCE_N = 11.3
 DEPTH_RMS_M = 0.1e-3
@@ -39,7 +40,7 @@ def test_the_lesion_is_found(distributed: Finished) -> None:
 
 
 def test_healthy_has_no_finding(tmp_path: Path) -> None:
-    finished = palpate_run("healthy", tmp_path, "--composed", "--no-record", settings=SHORT)
+    finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=(*SHORT, "phantom.lesions=[]"))
     assert finished.status == 0, finished.output
     assert finished.report["samples"] > 50
     assert finished.report["findings"] == []

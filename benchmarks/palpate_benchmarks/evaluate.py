@@ -29,18 +29,21 @@ class Evaluation:
 
     name: str
     seed: int
+    settings: tuple[str, ...] = ()
+    """Overrides `a.b=c` of the scenario."""
 
     @property
     def words(self) -> list[str]:
         """The words of its `palpate run`."""
+        settings = [word for setting in self.settings for word in ("--set", setting)]
         if self.name != ELSEWHERE:
-            return [self.name]
+            return [self.name, *settings]
         rng = np.random.default_rng([self.seed, 20])
         x, y = rng.uniform(-0.06, 0.06, 2)
         a, b = rng.uniform(0.020, 0.035, 2)
         contrast = rng.uniform(2.5, 6.0)
         lesion = f"{{centre_m: [{x:.4f}, {y:.4f}], radii_m: [{a:.4f}, {b:.4f}], contrast: {contrast:.2f}}}"
-        return ["healthy", "--set", f"phantom.lesions=[{lesion}]", "--set", f"name={ELSEWHERE}"]
+        return ["healthy", "--set", f"phantom.lesions=[{lesion}]", "--set", f"name={ELSEWHERE}", *settings]
 
 
 def run_case(case: Evaluation) -> dict[str, Any]:
@@ -58,13 +61,12 @@ def run_case(case: Evaluation) -> dict[str, Any]:
 
 
 def evaluate(
-    names: Sequence[str], seeds: Sequence[int], workers: int, tell: Callable[[int, int, str], None] = lambda *_: None
+    cases: Sequence[Evaluation], workers: int, tell: Callable[[int, int, str], None] = lambda *_: None
 ) -> list[dict[str, Any]]:
     """The reports of all cases, `workers` at a time. `tell` hears how many of how many are done, and which was the last.
 
     A case that did not complete has a report with `failure`, `scenario` and `seed` alone: none is left out of the count.
     """
-    cases = [Evaluation(name, seed) for name in names for seed in seeds]
     tell(0, len(cases), "")
     with ThreadPoolExecutor(workers) as pool:
         running = {pool.submit(run_case, case): case for case in cases}

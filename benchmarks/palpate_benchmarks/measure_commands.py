@@ -11,11 +11,11 @@ from rich.console import Console
 
 from palpate.command_line import EXIT_FAILED, output_file
 from palpate.report.files import write_text
-from palpate.run.inputs import usable
+from palpate.run.inputs import Settings, usable
 from palpate_benchmarks.bench import GROUPS
 from palpate_benchmarks.bench import bench as run_bench
 from palpate_benchmarks.case_display import CaseDisplay
-from palpate_benchmarks.evaluate import DEFAULT_CASES, ELSEWHERE
+from palpate_benchmarks.evaluate import DEFAULT_CASES, ELSEWHERE, Evaluation
 from palpate_benchmarks.evaluate import evaluate as run_evaluation
 from palpate_benchmarks.evaluate import table as evaluation_table
 
@@ -39,7 +39,9 @@ def bench(
 
 def evaluate(
     names: Annotated[list[str] | None, typer.Argument(help="Scenarios; `elsewhere` draws a lesion from each seed.")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Seeds 0 to N-1.")] = 5,
+    seeds: Annotated[int, typer.Option(min=1, help="How many seeds.")] = 5,
+    first_seed: Annotated[int, typer.Option(min=0, help="The first of them: 0 to 999 are for tuning, report others.")] = 0,
+    settings: Settings = None,
     workers: Annotated[int, typer.Option(min=1, help="Examinations at a time.")] = 2,
     out: Annotated[Path, output_file("File for the reports.")] = Path("evaluation.json"),
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the table only.")] = False,
@@ -49,10 +51,11 @@ def evaluate(
     chosen = names or DEFAULT_CASES
     for name in chosen:
         if name != ELSEWHERE:
-            usable(name)
+            usable(name, settings)
+    cases = [Evaluation(name, first_seed + i, tuple(settings or ())) for name in chosen for i in range(seeds)]
     console = Console(stderr=True)
     with CaseDisplay(console, quiet or as_json) as display:
-        reports = run_evaluation(chosen, range(seeds), workers, display.tell)
+        reports = run_evaluation(cases, workers, display.tell)
     write_text(out, json.dumps(reports))
     if as_json:
         print(json.dumps(reports))
