@@ -71,8 +71,10 @@ class Drawing:
         return LogNorm(float(np.quantile(values, 0.002)), float(np.quantile(values, 0.998)))
 
     def plane(self, axes: Axes, values: Array, cmap: str, norm: Normalize) -> ScalarMappable:
-        """The map seen from the front, with quadrants and outlines."""
-        image = axes.tripcolor(self.tri, np.nan_to_num(values), cmap=cmap, norm=norm, shading="gouraud", rasterized=True)
+        """The map seen from the front, with quadrants, where `values` are known."""
+        known = np.isfinite(values)[self.triangles].all(axis=1)
+        tri = Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles[known])
+        image = axes.tripcolor(tri, np.nan_to_num(values), cmap=cmap, norm=norm, shading="gouraud", rasterized=True)
         low, high = self.xyz[self.triangles].reshape(-1, 3).min(axis=0), self.xyz[self.triangles].reshape(-1, 3).max(axis=0)
         axes.axhline(0, color="white", lw=0.8, alpha=0.55)
         axes.axvline(0, color="white", lw=0.8, alpha=0.55)

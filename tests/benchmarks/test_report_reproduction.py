@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from palpate.report.archive import Evidence, completed
+from palpate.truth.touched import Touched
 from palpate_reproduction import figures
 from palpate_reproduction.render import BACKGROUND, Body, Viewpoint, picture
 from palpate_reproduction.reproduction import chosen_moments
@@ -60,6 +61,7 @@ def evidence(phase: list[int], force: list[float]) -> Evidence:
         time=np.arange(n, dtype=float), phase=np.array(phase, dtype=np.uint8), depth=flat, setpoint=flat, force=np.array(force),
         in_contact=none, steady=none, force_limited=none, visited=np.zeros(n, np.uint32), skipped=np.zeros(n, np.uint32),
         target_count=1, true_time=flat, true_depth=flat, true_force=flat, events=(), stiffness_map=None, findings=None,
+        touched=Touched(np.empty((0, 3)), np.empty((0, 3))), pressed=None,
         phantom=None, targets=None,
     )  # fmt: skip
 
