@@ -107,7 +107,7 @@ def section(found: Sample | None = None) -> Section:
     """The comparison with its bounds."""
     found, people = found or sampled(), measured()
     checks = tuple(
-        Check(name, ours, "", theirs * (1 - within), theirs * (1 + within), f"measured: {theirs:.3g}")
+        Check(name, ours, "", round(theirs * (1 - within), 3), round(theirs * (1 + within), 3), f"measured: {theirs:.3g}")
         for (name, ours), theirs, within in zip(found.figures().items(), people.figures().values(), WITHIN, strict=True)
     )
     text = (
