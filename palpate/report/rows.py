@@ -33,7 +33,7 @@ class LumpRow(_Row):
     """What can truly be felt of a lump."""
 
     centroid_m: Point
-    """Of its area, xy of the abdomen frame [m]; where it is felt most when it is not palpable."""
+    """Centre of its area, xy of the abdomen frame [m]; where it is felt most when it is not palpable."""
     quadrant: str
     area_m2: float
     """Where its effect is at least half of its greatest; 0 when it is not palpable."""
@@ -80,9 +80,9 @@ class ScoresRow(_Row):
     """In world."""
     dice: float | None
     size_error: float | None
-    """Of the area, relative."""
+    """Relative error of the area."""
     ratio_error: float | None
-    """Relative."""
+    """Relative error of the ratio."""
     ratio_coverage_90: float | None
     """Part of the matched findings whose own band holds their true ratio."""
     coverage_90: float | None

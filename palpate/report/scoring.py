@@ -239,7 +239,7 @@ def _coverage(found: Map, truth: Truth) -> tuple[float | None, float | None]:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """Of the magnitudes; None where there is none."""
+    """The mean of the magnitudes; None where there is none."""
     known = [abs(value) for value in values if value is not None]
     return float(np.mean(known)) if known else None
 

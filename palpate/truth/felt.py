@@ -37,7 +37,7 @@ class Lump:
     contrast: float
     """Felt contrast where |e| is greatest [1]; below 1 where the lump is softer than what is around it."""
     centroid: Array
-    """Of its area [m], shape (2,); where |e| is greatest if it is not palpable."""
+    """Centre of its area [m], shape (2,); where |e| is greatest if it is not palpable."""
     area: float
     """[m^2]; 0 if it is not palpable."""
     inside: Mask

@@ -110,7 +110,7 @@ class FeltRatios:
         self._posterior, self._observations, self._healthy, self._grid, self._mean = posterior, observations, healthy, grid, mean
 
     def __call__(self, areas: Sequence[Mask], footprints: Footprints) -> list[tuple[float, float]]:
-        """Of each area the log of its ratio of apparent stiffness, mean over the area, and its standard deviation.
+        """For each area the log of its ratio of apparent stiffness, mean over the area, and its standard deviation.
 
         The surroundings are continued into the areas from the samples whose footprint is clear of all of them. Both sides'
         variances add.
