@@ -19,7 +19,7 @@ def test_it_conforms_to_the_role_robot() -> None:
 
 
 def test_it_starts_at_home_and_says_what_it_is() -> None:
-    service = create(load_scenario("rlq_guarding"))
+    service = create(load_scenario("rlq_guarding", ("errors=none",)))
     assert service.start()["robot_description"].data == lbr.urdf(load_scenario("rlq_guarding").robot)
     rig = ServiceRig(service, RigSettings(load_scenario("rlq_guarding"), 0.0, True))
     rig.run(0.01, {})
