@@ -86,6 +86,9 @@ def table(reports: Sequence[dict[str, Any]]) -> Table:
             rows.add_row(report["scenario"], str(report["seed"]), f"[red]{escape(report['failure'])}[/]")
             continue
         scores = report["scores"]
+        if scores is None:
+            rows.add_row(report["scenario"], str(report["seed"]), "[yellow]nothing is known of what could be felt[/]")
+            continue
 
         def figure(value: float | None, scale: float = 1.0, form: str = ".2f") -> str:
             return "" if value is None else format(scale * value, form)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot
 from typing import Any
@@ -122,20 +123,28 @@ def peak_force(message: Any) -> float:
     return max(float(message.peak_force), hypot(message.normal_force, message.tangential_force))
 
 
-def steady_contact(exam_states: list[Any], indentation: list[Any], X_WA: Array, registered_X_WA: Array) -> ContactRecord:
-    """Exam states that count, with the true contact at the same stamp. Poses of A in world: the true and the registered."""
+def steady_contact(
+    exam_states: list[Any], indentation: list[Any], X_WA: Callable[[float], Array], registered_X_WA: Array
+) -> ContactRecord:
+    """Exam states that count, with the true contact at the same stamp.
+
+    Poses of A in world: the true one as a function of time [s], since a patient may move, and the registered one.
+    """
     true = {nanoseconds(m.header.stamp): m for m in indentation}
     pairs = [(s, true[t]) for s in exam_states if s.steady and (t := nanoseconds(s.header.stamp)) in true]
 
-    def places(messages: list[Any], pose: Array) -> Array:
-        xyz = [(m.surface_point.x, m.surface_point.y, m.surface_point.z) for m in messages]
-        return apply(inverse(pose), np.array(xyz, dtype=np.float64).reshape(-1, 3))
+    def place(message: Any, pose: Array) -> Array:
+        p = message.surface_point
+        return apply(inverse(pose), np.array(((p.x, p.y, p.z),)))
+
+    believed = [place(s, registered_X_WA) for s, _ in pairs]
+    truly = [place(m, X_WA(nanoseconds(m.header.stamp) / NS)) for _, m in pairs]
 
     return ContactRecord(
         measured=np.array([s.depth for s, _ in pairs]),
         true=np.array([m.depth for _, m in pairs]),
         wanted=np.array([s.depth_setpoint for s, _ in pairs]),
         force=np.array([s.normal_force for s, _ in pairs]),
-        touched=Touched(places([s for s, _ in pairs], registered_X_WA), places([m for _, m in pairs], X_WA)),
+        touched=Touched(np.array(believed).reshape(-1, 3), np.array(truly).reshape(-1, 3)),
         limited=np.array([s.force_limited for s, _ in pairs], dtype=bool),
     )

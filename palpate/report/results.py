@@ -34,6 +34,7 @@ from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunResult
 from palpate_models.frames import apply, inverse
 from palpate_models.load import exam_input
+from palpate_models.motion import BodyMotion
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import Scenario
 
@@ -52,7 +53,9 @@ def truth_of_run(scenario: Scenario, c: Collected) -> Known:
     if c.phantom is None:
         return Known(None, None, None)
     body = body_of(c.phantom)
-    contact = steady_contact(c.exam_states, c.indentation, body.X_WA, np.array(exam_input(scenario).X_WA))
+    motion = BodyMotion(scenario.phantom.motion, scenario.seed)
+    registered = np.array(exam_input(scenario).X_WA)
+    contact = steady_contact(c.exam_states, c.indentation, lambda t_s: body.X_WA @ motion.pose(t_s), registered)
     pressed = press_patient(scenario)
     return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
 
