@@ -14,6 +14,6 @@ if __name__ == "__main__":
     if find_spec("matplotlib"):
         import_module("matplotlib.font_manager")
     if extra in COMPILED:
-        scenario = import_module("palpate_models.load").load_scenario("lump")
+        scenario = import_module("palpate_models.load").load_scenario("clean")
         role, _, name = extra.partition("-")
         create(role, name or getattr(scenario.services, role), scenario)

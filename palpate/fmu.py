@@ -45,7 +45,7 @@ def _scenario(name: str, settings: list[str]) -> Scenario:
 
 @app.command()
 def build(
-    phantom: Annotated[str, typer.Argument(help="Name or file of a scenario, or a mesh (OBJ, STL, PLY).")] = "lump",
+    phantom: Annotated[str, typer.Argument(help="Name or file of a scenario, or a mesh (OBJ, STL, PLY).")] = "clean",
     out: Annotated[Path, typer.Option("--out", "-o", help="The FMU to write.")] = Path("abdomen.fmu"),
     fmi: Annotated[int, typer.Option(min=2, max=3, help="FMI version; 2 shows a sample of the surface only.")] = 3,
     only: Annotated[

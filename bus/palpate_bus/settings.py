@@ -27,7 +27,7 @@ DOMAIN_MAX = 232
 """The highest ROS domain with DDS's default port range; zenoh itself knows no limit."""
 
 COMPOSE_VARIABLES = {
-    "PALPATE_SCENARIO_NAME": ("lump", "Scenario that the containers examine: a name or a file."),
+    "PALPATE_SCENARIO_NAME": ("clean", "Scenario that the containers examine: a name or a file."),
     "PALPATE_SETTINGS": ("", "Changes to the scenario, `a.b=c`, separated by spaces."),
     "PALPATE_RESULTS": ("./out", "Folder of this machine into which the containers write."),
     "PALPATE_UID": ("1000", "User id under which the containers write."),

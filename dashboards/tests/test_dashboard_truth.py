@@ -37,6 +37,7 @@ def test_it_tells_what_was_drawn() -> None:
 def test_another_seed_has_another_truth_and_a_clean_world_has_none() -> None:
     errors = Errors(level="typical")
     assert page(Scenario(seed=1, errors=errors)) != page(Scenario(seed=2, errors=errors))
-    clean = Scenario(seed=1)
+    still = Phantom(breathing=Breathing(kind="none"))
+    clean = Scenario(seed=1, phantom=still, errors=Errors(level="none"))
     assert numbers(clean, "patient, true in the registered frame") == [0] * 6
     assert numbers(clean, "breathing") == numbers(clean, "motion") == []

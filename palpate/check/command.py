@@ -35,7 +35,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
         str | None,
         typer.Option(metavar="NAME_OR_FILE", help="Check an installed one or a Python file in this process, in simulated time."),
     ] = None,
-    scenario: Annotated[str, typer.Option(help="What it was configured with; its patient holds the breath.")] = "lump",
+    scenario: Annotated[str, typer.Option(help="What it was configured with; its patient holds the breath.")] = "clean",
     motion: Annotated[bool, typer.Option("--motion", help="It may move: needed for most of the robot's checks.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
     slack: Annotated[float, typer.Option(help="Milliseconds that transport and scheduler may add to a reaction.")] = 150.0,

@@ -39,7 +39,7 @@ NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait
 
 
 def run(  # noqa: PLR0913 - the options of a command
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "lump",
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "clean",
     out: Annotated[Path | None, typer.Option(help="Folder for the results; by default out/<scenario>-<time>.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     composed: Annotated[bool, typer.Option("--composed", help="All services in this process.")] = False,
@@ -142,7 +142,7 @@ def _conclude(
 
 
 def prepare(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a YAML file.")] = "lump",
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a YAML file.")] = "clean",
     out: Annotated[Path, typer.Option(help="Folder for the scenario files.")] = Path("out"),
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     settings: Settings = None,

@@ -14,13 +14,14 @@ from fmpy import fmi2, fmi3
 from numpy.typing import ArrayLike
 
 from palpate_fmu.instance import read_variables
+from palpate_models.breathing import Breathing
 from palpate_models.patient import Lesion, Phantom
 
 Array = np.ndarray
 
 
 def coarse_phantom() -> Phantom:
-    return Phantom(lesions=(Lesion(centre_m=(-0.05, -0.05)),), edge_m=0.02)
+    return Phantom(lesions=(Lesion(centre_m=(-0.05, -0.05)),), breathing=Breathing(kind="none"), edge_m=0.02)
 
 
 class Exchange:

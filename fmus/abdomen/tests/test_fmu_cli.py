@@ -13,7 +13,7 @@ from palpate_fmu.compiling import native
 from palpate_fmu.running import run_and_plot
 
 runner = CliRunner()
-BUILD = ("build", "healthy", "--platform", native(), "--set", "phantom.edge_m=0.01")
+BUILD = ("build", "healthy", "--platform", native(), "--set", "phantom.edge_m=0.01", "--set", "phantom.breathing.kind=none")
 
 
 def test_build_info_and_simulate(tmp_path: Path) -> None:

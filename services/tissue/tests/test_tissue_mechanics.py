@@ -14,13 +14,14 @@ from palpate_models import phantom as phantoms
 from palpate_models.breathing import Breathing, BreathingCurve
 from palpate_models.patient import Lesion, Phantom, Stiffness
 from palpate_models.phantom import build_phantom
+from palpate_models.wall import stress
 from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, StabilityError, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.friction import Push, Sphere, rub, skin
 from palpate_tissue.near import RIM
 
-ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
+ELASTIC = Stiffness(length_m=0.015, prony_g=(), prony_tau_s=(), friction=0.0)
 STILL = np.zeros(3)
 flat_phantom = cache(phantoms.flat_phantom)
 OFFSETS = ((0.0, 0.0), (0.0025, 0.0), (0.0, 0.0029), (0.0013, 0.0008), (0.0031, 0.0017))
@@ -337,7 +338,9 @@ def test_fields_of_small_and_large_meshes_move_alike():
 def reference_step(wall, patch, motion, radius, excursion):
     """The step in numpy and scipy, from the equations of the README: u, y, contact forces f and the force on the sphere."""
     A = csr_array((wall.rate, wall.indices.astype(np.int32), wall.indptr.astype(np.int32)), shape=(len(wall.u),) * 2)
-    u = wall.u + A @ (wall.u - wall.y.sum(axis=0))
+    beta2, _, tension = wall.spring
+    beside = stress(wall.u, np.sqrt(beta2)) + tension * wall.activation * np.maximum(wall.u, 0.0)
+    u = wall.u + A @ (wall.u - wall.y.sum(axis=0)) - wall.share * beside
     n, X, (beta, gain) = patch.table[:, :3], patch.table[:, 3:6], patch.table[:, 6:].T
     d = motion[0] - X
     s = -(d * n).sum(axis=1)

@@ -12,6 +12,8 @@ from test_tissue_service import OneTopic, tool_state, vector
 from palpate_bus.contract import MS
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Service
+from palpate_models.breathing import Breathing
+from palpate_models.errors import Errors
 from palpate_models.frames import apply, matrix
 from palpate_models.load import true_pose
 from palpate_models.motion import BodyMotion, Motion
@@ -29,7 +31,9 @@ AFTER = 150
 
 
 def scenario(motion: Motion) -> Scenario:
-    return Scenario(seed=5, exam=LYING, phantom=Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), motion=motion, edge_m=0.008))
+    still = Breathing(kind="none")
+    phantom = Phantom(lesions=(Lesion(centre_m=(-0.02, 0.0)),), breathing=still, motion=motion, edge_m=0.008)
+    return Scenario(seed=5, exam=LYING, errors=Errors(level="none"), phantom=phantom)
 
 
 def body_poses(case: Scenario) -> tuple[np.ndarray, np.ndarray]:

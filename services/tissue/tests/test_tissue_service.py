@@ -50,7 +50,8 @@ class OneTopic:
 
 
 def scenario(**phantom):
-    return Scenario(phantom=Phantom(lesions=(LESION,), **phantom))
+    still = {"breathing": Breathing(kind="none"), **phantom}
+    return Scenario(errors=Errors(level="none"), phantom=Phantom(lesions=(LESION,), **still))
 
 
 def press(service, X_WA, depth=0.008, ticks=60, at=(0.0, 0.0)):

@@ -230,7 +230,7 @@ def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool
 def main(arguments: list[str] | None = None) -> int:
     """Runs the emulator until a signal; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m palpate_robot.backends.lbr.emulator", description=__doc__.partition("\n")[0])
-    parser.add_argument("scenario", nargs="?", default="lump", help="where the arm stands and what tool it has")
+    parser.add_argument("scenario", nargs="?", default="clean", help="where the arm stands and what tool it has")
     parser.add_argument("--listen", default="tcp/127.0.0.1:7447", help="zenoh endpoint, where rmw_zenohd would be")
     parser.add_argument("--domain", type=int, default=0, help="ROS domain")
     parser.add_argument("--period-ms", type=int, default=2, help="FRI send period")
