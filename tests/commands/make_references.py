@@ -16,7 +16,7 @@ from palpate_bus.messages.stamps import NS
 
 FOLDER = Path(__file__).parent / "references"
 SETTINGS = (
-    "exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "phantom.edge_m=0.02",
+    "exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "phantom.edge_m=0.02", "phantom.lesions.0.contrast=2",
     "camera.frames=2", "camera.width_px=160", "camera.height_px=120", "camera.focal_px=146",
 )  # fmt: skip
 """A small examination with small messages: a coarse abdomen and a camera of few pixels."""

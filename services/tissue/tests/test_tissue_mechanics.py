@@ -74,7 +74,7 @@ def test_a_small_lump_shows_less_than_its_contrast():
 
 
 def test_force_relaxes_by_the_prony_series():
-    stiffness = Stiffness(friction=0.0)
+    stiffness = ELASTIC.model_copy(update={"prony_g": (0.3, 0.2), "prony_tau_s": (1.86, 51.3)})
     tissue = WinklerTissue(flat_phantom(), stiffness)
     p = np.array((0.0, 0.0, 0.005))
     forces = [tissue.step(0, p, STILL, 0.015)[0][2] for _ in range(5000)]
