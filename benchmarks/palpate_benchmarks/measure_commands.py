@@ -61,5 +61,8 @@ def evaluate(
         print(json.dumps(reports))
     else:
         Console(width=max(WIDE, Console().width)).print(evaluation_table(reports))
+        for report in reports:
+            if report["failure"]:
+                console.print(f"{report['scenario']}, seed {report['seed']}: {report['failure']}", markup=False, highlight=False)
     if any(report["failure"] for report in reports):
         raise typer.Exit(EXIT_FAILED)
