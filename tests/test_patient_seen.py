@@ -23,12 +23,13 @@ from palpate_models.scenario import Scenario
 from palpate_tissue.backends.winkler.service import create
 
 BREATHING = Breathing(kind="quiet", peak_to_peak_m=0.008, depth_cv=0)
+STILL = Phantom(breathing=Breathing(kind="none"))
 IDEAL = Errors.model_validate({"level": "none", "camera": {"noise_scale": 0.0}})
 
 
 def surface(phantom: Phantom, t: int) -> Any:
     """The surface that the tissue sends at `t` [ns]."""
-    service = create(Scenario(phantom=phantom))
+    service = create(Scenario(phantom=phantom, errors=Errors(level="none")))
     service.start()
     return service.step(t, HandInbox())["sim/surface"]
 
@@ -60,7 +61,7 @@ def above(p_W: np.ndarray, message: Any) -> np.ndarray:
 def test_the_camera_sees_the_wall_where_the_breath_has_lifted_it() -> None:
     start, inspiration = BreathingCurve(BREATHING, 0).table[1, :2]
     t = round(20 * (start + inspiration)) * 50 * MS  # the surface is sent each 50 ms
-    still, lifted = surface(Phantom(), t), surface(Phantom(breathing=BREATHING), t)
+    still, lifted = surface(STILL, t), surface(Phantom(breathing=BREATHING), t)
     points = seen(lifted)
     assert len(points) > 2000
     assert np.sqrt(np.mean(above(points, lifted) ** 2)) < 0.3e-3
@@ -70,7 +71,7 @@ def test_the_camera_sees_the_wall_where_the_breath_has_lifted_it() -> None:
 
 def test_the_camera_sees_the_body_where_it_has_moved_to() -> None:
     motion = Motion(kind="turn", turn_rad=np.radians(6), at_s=0.0, over_s=0.1)
-    before, after = surface(Phantom(), 500 * MS), surface(Phantom(motion=motion), 500 * MS)
+    before, after = surface(STILL, 500 * MS), surface(STILL.model_copy(update={"motion": motion}), 500 * MS)
     points = seen(after)
     assert np.sqrt(np.mean(above(points, after) ** 2)) < 0.3e-3
     assert np.sqrt(np.mean(above(points, before) ** 2)) > 3e-3

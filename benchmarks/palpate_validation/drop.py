@@ -1,7 +1,7 @@
 """The contact test of the paper's figure 3: an indenter dropped on a soft and on a rigid surface, force and position over time.
 
 The paper plunges by about 3 mm, oscillates and comes to rest at about 1 mm; on the rigid surface it stops where it touches.
-Our default wall is softer than the paper's surface: this tool would sink 14 mm into it and dip twice more. The figure's surface
+Our default wall is softer than the paper's surface: this tool would sink 11 mm into it and dip twice more. The figure's surface
 is stiffer and less damped, as DART's was, with the stiffness chosen for the 1 mm, drop and damping for the 3 mm.
 
     from palpate_validation.drop import measure, draw
@@ -134,7 +134,7 @@ def section(drops: tuple[Drop, ...] | None = None) -> Section:
         "as in the paper's figure 3. "
         "Soft surfaces oscillate and settle about 1 mm in; the rigid one stops it at once. The paper gives no masses and "
         "no stiffness: stiffness is chosen for its 1 mm, drop and damping for its 3 mm. Into the default wall this tool would "
-        "sink 14 mm."
+        "sink 11 mm."
     )
     data = {drop.name: {"time_s": drop.time, "depth_m": drop.depth, "force_n": drop.force} for drop in drops}
     return Section("drop", "The contact test of the paper (figure 3)", text, checks, lambda f: draw(f, drops), (7.0, 3.6), data)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from palpate_models.frames import Array
-from palpate_models.patient import Lesion, Stiffness
+from palpate_models.patient import Lesion
 from palpate_models.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, Section
@@ -57,7 +57,7 @@ def measure() -> LumpRatios:
 
 
 def _continuum(radius: float, contrast: float, edge: float) -> float:
-    wall = Stiffness()
+    wall = ELASTIC
     k_w = lump(wall.k_w_n_per_m3, radius, contrast, edge) if radius else uniform(wall.k_w_n_per_m3)
     return static_force(DEPTH_M, RADIUS_M, k_w, lambda r: k_w(r) * wall.length_m**2)
 

@@ -47,7 +47,7 @@ class MeshForces:
 
 def measure_meshes() -> MeshForces:
     """Presses both meshes at the same places."""
-    wall = Stiffness()
+    wall = ELASTIC
     force = np.empty((len(EDGES_M), len(RADII_M), len(OFFSETS), len(DEPTHS_M)))
     for e, edge in enumerate(EDGES_M):
         model = flat_phantom(HALF_M, edge)

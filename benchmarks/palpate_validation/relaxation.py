@@ -62,7 +62,7 @@ def measure(hold_s: float = HOLD_S) -> Relaxation:
 def section(found: Relaxation | None = None) -> Section:
     """The series read back, with its bounds."""
     found = found or measure()
-    wall = Stiffness()
+    wall = Stiffness(k_w_n_per_m3=ELASTIC.k_w_n_per_m3, length_m=ELASTIC.length_m, stiffening_per_m=0.0)
     checks = []
     for k, (g, tau) in enumerate(zip(wall.prony_g, wall.prony_tau_s, strict=True)):
         checks.append(Check(f"relaxing fraction g{k + 1} read from the force", found.g[k], "", 0.98 * g, 1.02 * g, f"{g:g}"))
@@ -82,7 +82,7 @@ def section(found: Relaxation | None = None) -> Section:
 def draw(figure: Figure, found: Relaxation) -> None:
     """The force ratio over the logarithm of time, with the scenario's series."""
     axes = figure.subplots()
-    wall = Stiffness()
+    wall = Stiffness(k_w_n_per_m3=ELASTIC.k_w_n_per_m3, length_m=ELASTIC.length_m, stiffening_per_m=0.0)
     axes.plot(found.time, found.ratio, ".", color=COLOURS[0], ms=3, label="tissue")
     expected = series(found.time, wall.prony_g[0], wall.prony_tau_s[0], wall.prony_g[1], wall.prony_tau_s[1])
     axes.plot(found.time, expected, color=INK, lw=0.8, label="Prony series of the scenario")

@@ -133,7 +133,7 @@ def test_dropped_on_a_rigid_surface_it_stops() -> None:
 
 def test_the_tool_would_sink_deep_into_the_default_wall() -> None:
     wall = Stiffness(prony_g=(), prony_tau_s=())
-    assert 0.012 < drop.drop_on_tissue(wall, seconds=1.5).settled < 0.016
+    assert 0.009 < drop.drop_on_tissue(wall, seconds=1.5).settled < 0.013
 
 
 @pytest.mark.slow

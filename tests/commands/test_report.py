@@ -149,7 +149,12 @@ def test_where_no_copy_can_be_made_nothing_is_scored(scenario: Scenario, felt: K
 
 @pytest.mark.parametrize(
     ("setting", "clean"),
-    [("seed=1", True), ("phantom.breathing.amplitude_m=0.005", False), ("phantom.pose.error.xyz_m=[0.001, 0, 0]", False)],
+    [
+        ("seed=1", True),
+        ("phantom.breathing.kind=quiet", False),
+        ("phantom.motion.kind=shift", False),
+        ("errors.arm.zero_rad=0.001", False),
+    ],
 )
 def test_a_clean_world_is_called_one(setting: str, clean: bool) -> None:
     assert clean_world(load_scenario("clean", [setting])) == clean
