@@ -23,6 +23,8 @@ HOLD_S = 160.0
 """Three of the longest time constants."""
 FROM_S = 0.5
 """Before it the dashpot's 0.05 s is still in the force."""
+WALL = Stiffness(length_m=ELASTIC.length_m, stiffening_per_m=0.0, friction=0.0)
+"""The linear wall of `ELASTIC` with the default's relaxation."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def measure(hold_s: float = HOLD_S) -> Relaxation:
     """Holds the sphere for `hold_s` [s] and fits the series to the force by least squares, from a guess of 1 s and 20 s."""
     model = flat_phantom(HALF_M)
     instantaneous = hold(WinklerTissue(model, ELASTIC), DEPTH_M, RADIUS_M)
-    tissue = WinklerTissue(model, Stiffness(friction=0.0))
+    tissue = WinklerTissue(model, WALL)
     p = np.array((0.0, 0.0, RADIUS_M - DEPTH_M))
     force = np.array([tissue.step(0.0, p, STILL, RADIUS_M)[0][2] for _ in range(round(hold_s / tissue.dt))])
     time = tissue.dt * np.arange(1, len(force) + 1)
@@ -62,14 +64,13 @@ def measure(hold_s: float = HOLD_S) -> Relaxation:
 def section(found: Relaxation | None = None) -> Section:
     """The series read back, with its bounds."""
     found = found or measure()
-    wall = Stiffness(k_w_n_per_m3=ELASTIC.k_w_n_per_m3, length_m=ELASTIC.length_m, stiffening_per_m=0.0)
     checks = []
-    for k, (g, tau) in enumerate(zip(wall.prony_g, wall.prony_tau_s, strict=True)):
+    for k, (g, tau) in enumerate(zip(WALL.prony_g, WALL.prony_tau_s, strict=True)):
         checks.append(Check(f"relaxing fraction g{k + 1} read from the force", found.g[k], "", 0.98 * g, 1.02 * g, f"{g:g}"))
         checks.append(
             Check(f"time constant tau{k + 1} read from the force", found.tau[k], "s", 0.98 * tau, 1.02 * tau, f"{tau:g} s")
         )
-    left = 1 - sum(wall.prony_g)
+    left = 1 - sum(WALL.prony_g)
     checks.append(Check("ratio left for ever", float(1 - found.g.sum()), "", 0.98 * left, 1.02 * left, f"{left:g}"))
     text = (
         f"A sphere of {RADIUS_M * 1e3:g} mm held {DEPTH_M * 1e3:g} mm deep for {HOLD_S:g} s; two exponentials fitted to its "
@@ -82,9 +83,8 @@ def section(found: Relaxation | None = None) -> Section:
 def draw(figure: Figure, found: Relaxation) -> None:
     """The force ratio over the logarithm of time, with the scenario's series."""
     axes = figure.subplots()
-    wall = Stiffness(k_w_n_per_m3=ELASTIC.k_w_n_per_m3, length_m=ELASTIC.length_m, stiffening_per_m=0.0)
     axes.plot(found.time, found.ratio, ".", color=COLOURS[0], ms=3, label="tissue")
-    expected = series(found.time, wall.prony_g[0], wall.prony_tau_s[0], wall.prony_g[1], wall.prony_tau_s[1])
+    expected = series(found.time, WALL.prony_g[0], WALL.prony_tau_s[0], WALL.prony_g[1], WALL.prony_tau_s[1])
     axes.plot(found.time, expected, color=INK, lw=0.8, label="Prony series of the scenario")
     axes.set(xlabel="time [s]", ylabel="force over the instantaneous", xscale="log")
     axes.legend()
