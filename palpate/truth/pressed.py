@@ -21,6 +21,7 @@ from palpate_bus.implementations import create
 from palpate_models.breathing import Breathing
 from palpate_models.cache import content_key, remembered
 from palpate_models.frames import Array
+from palpate_models.motion import Motion
 from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom.field import edge_distance
 from palpate_models.press import apparent_stiffness
@@ -62,7 +63,8 @@ class Patient:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self.phantom = scenario.phantom.model_copy(update={"breathing": Breathing(kind="none")})
+        still = {"breathing": Breathing(kind="none"), "motion": Motion()}
+        self.phantom = scenario.phantom.model_copy(update=still)
         """The patient at rest."""
 
     def with_lesions(self, lesions: Sequence[Lesion]) -> TissueBackend | None:

@@ -175,3 +175,11 @@ def test_where_the_tool_truly_touched() -> None:
     assert turned.places(np.array(((0.1, 0.0),)))[0] == pytest.approx((0.11, 0.0), abs=1e-4)
     nowhere = Touched(np.empty((0, 3)), np.empty((0, 3)))
     assert nowhere.places(np.array(((0.02, 0.03),))).tolist() == [[0.02, 0.03]]
+
+
+def test_a_patient_who_moves_is_pressed_where_he_lay() -> None:
+    settings = [REGION, "phantom.edge_m=0.01"]
+    moving, still = (press_patient(load_scenario(name, settings)) for name in ("restless", "healthy"))
+    assert moving is not None
+    assert still is not None
+    np.testing.assert_array_equal(moving.force, still.force)
