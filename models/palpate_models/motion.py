@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from typing import Annotated, Literal
-from zlib import crc32
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate_models.frames import Array
 from palpate_models.section import NonNegative, Section
+from palpate_models.seeds import generator
 
 _MIDDLE_S = (40.0, 90.0)
 """Between these times [s] the patient moves, where the scenario names none: within the scan of the default examination."""
@@ -44,7 +44,7 @@ class BodyMotion:
 
     def __init__(self, motion: Motion, seed: int) -> None:
         """Equal settings and seed give an equal motion."""
-        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, crc32(b"motion")])))
+        rng = generator(seed, "motion")
         middle, direction, side = rng.uniform(*_MIDDLE_S), rng.uniform(0, 2 * math.pi), rng.choice((-1.0, 1.0))
         self.at_s = float(middle) if motion.at_s is None else motion.at_s
         """When it begins [s]."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from palpate.report.evidence import (
 from palpate.report.figures import draw_map
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
-from palpate.report.rows import DepthRow, FindingRow, LumpRow, Report, ScoresRow, TruthRow
+from palpate.report.rows import DepthRow, FindingRow, LumpRow, Report, TruthRow
 from palpate.truth.pressed import press_patient
 from palpate.truth.surface import TrueBody
 from palpate_conductor.collector import Collected
@@ -75,7 +75,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     depth = _depth(known)
     scores = None
     if known.felt is not None and final is not None:
-        scores = ScoresRow.model_validate(asdict(scoring.score(found_of(final), found, known.felt)))
+        scores = scoring.score(found_of(final), found, known.felt)
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
     forces = [peak_force(m) for m in c.indentation] or [s.normal_force for s in c.exam_states if s.in_contact]
     return Report(
@@ -171,7 +171,7 @@ def clean_words(report: Report) -> str:
     return " of a clean world" if report.clean_world else ""
 
 
-def in_words(s: ScoresRow) -> str:
+def in_words(s: scoring.Scores) -> str:
     """Scores in a line."""
     parts = [f"{s.matched} matched, {s.missed} missed"]
     parts += [f"{s.not_palpable} not palpable"] if s.not_palpable else []

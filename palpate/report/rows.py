@@ -6,6 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
+from palpate.report.scoring import Scores
+
 Point = tuple[float, ...]
 
 
@@ -48,48 +50,6 @@ class TruthRow(_Row):
     felt: bool
     """Whether a copy could be made: not of somebody else's FMU, nor of what is real. Without it nothing is scored."""
     lumps: list[LumpRow]
-
-
-class FindingScoreRow(_Row):
-    """A finding against the truth (scoring.py says how)."""
-
-    lump: int | None
-    dice: float | None
-    place_error_m: float | None
-    absolute_error_m: float | None
-    size_error: float | None
-    true_ratio: float | None
-    ratio_error: float | None
-    ratio_held: bool | None
-    on_guarding: bool
-
-
-class ScoresRow(_Row):
-    """Findings and map against the truth (scoring.py says how). Errors are mean magnitudes over matched findings."""
-
-    matched: int
-    missed: int
-    not_palpable: int
-    """Lumps that nobody could feel: neither matched nor missed."""
-    false_findings: int
-    on_guarding: int
-    """False findings over guarded muscle."""
-    place_error_m: float | None
-    """Compared at the places that the tool truly touched."""
-    absolute_error_m: float | None
-    """In world."""
-    dice: float | None
-    size_error: float | None
-    """Relative error of the area."""
-    ratio_error: float | None
-    """Relative error of the ratio."""
-    ratio_coverage_90: float | None
-    """Part of the matched findings whose own band holds their true ratio."""
-    coverage_90: float | None
-    """Part of the scanned area on which the map's 90 % band holds the true apparent stiffness."""
-    coverage_90_in_lumps: float | None
-    findings: list[FindingScoreRow]
-    """One a finding, in their order."""
 
 
 class DepthRow(_Row):
@@ -148,7 +108,7 @@ class Report(_Row):
     """Whether there are findings that are final, though it be none."""
     findings: list[FindingRow]
     truth: TruthRow | None
-    scores: ScoresRow | None
+    scores: Scores | None
     """Null when the run ended before there was anything to score, or nothing is known of what could be felt."""
     blame: dict[str, Any]
     """Where each service's time goes."""
