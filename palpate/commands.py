@@ -1,60 +1,70 @@
 """The table of commands. Only the module of the command that was asked for is imported: `palpate stop` must not wait for a
-plotting library.
+plotting library, and `palpate --help` imports none of them: it reads what each says of itself in its source.
 """
 
 from __future__ import annotations
 
+import ast
 import sys
 from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from palpate.command_line import EXIT_BAD_INPUT
-from palpate_bus.contract import contract
 
 HELP = "Autonomous robotic palpation as a co-simulation of independent processes on an Eclipse zenoh bus."
-COMMANDS = {
-    "run": "palpate.run.command:run",
-    "prepare": "palpate.run.command:prepare",
-    "conduct": "palpate.run.command:conduct",
-    "join": "palpate.run.places:join",
-    "takeover": "palpate.run.places:takeover",
-    "scenarios": "palpate.listings:scenarios",
-    "topics": "palpate.listings:topics",
-    "stop": "palpate.live.operator:stop",
-    "release": "palpate.live.operator:release",
-    "pause": "palpate.live.operator:pause",
-    "resume": "palpate.live.operator:resume",
-    "step": "palpate.live.operator:step",
-    "dashboard": "palpate.live.dashboard:dashboard",
-    "topic": "palpate.live.topic:app",
-    "node": "palpate.live.node:app",
-    "doctor": "palpate.live.doctor_command:doctor",
-    "report": "palpate.report.command:report",
-    "replay": "palpate.replay.command:replay",
-    "check": "palpate.check.command:check_command",
-    "keys": "palpate.security.keys:app",
-    "router": "palpate.security.router:router",
-    "fmu": "palpate.fmu:app",
-    "bench": "palpate_benchmarks.measure_commands:bench",
-    "evaluate": "palpate_benchmarks.measure_commands:evaluate",
-    "swaps": "palpate_benchmarks.swaps_command:swaps",
-    "wallclock": "palpate_benchmarks.wallclock_command:wallclock",
-    "faults": "palpate_benchmarks.campaign_command:faults",
-    "fuzz": "palpate.fuzz.command:fuzz",
-    "validate": "palpate_validation.cli:app",
-    "reproduce": "palpate_reproduction.command:reproduce",
+GROUPS = {
+    "Examine": {
+        "run": "palpate.run.command:run",
+        "scenarios": "palpate.listings:scenarios",
+        "stop": "palpate.live.operator:stop",
+        "release": "palpate.live.operator:release",
+        "pause": "palpate.live.operator:pause",
+        "resume": "palpate.live.operator:resume",
+        "step": "palpate.live.operator:step",
+    },
+    "Look": {
+        "dashboard": "palpate.live.dashboard:dashboard",
+        "report": "palpate.report.command:report",
+        "replay": "palpate.replay.command:replay",
+        "doctor": "palpate.live.doctor_command:doctor",
+        "topics": "palpate.listings:topics",
+        "topic": "palpate.live.topic:app",
+        "node": "palpate.live.node:app",
+    },
+    "Replace a part, or run in several places": {
+        "check": "palpate.check.command:check_command",
+        "join": "palpate.run.places:join",
+        "takeover": "palpate.run.places:takeover",
+        "fmu": "palpate.fmu:app",
+        "keys": "palpate.security.keys:app",
+        "router": "palpate.security.router:router",
+        "prepare": "palpate.run.command:prepare",
+        "conduct": "palpate.run.command:conduct",
+    },
+    "Measure": {
+        "evaluate": "palpate_benchmarks.measure_commands:evaluate",
+        "validate": "palpate_validation.cli:app",
+        "reproduce": "palpate_reproduction.command:reproduce",
+        "swaps": "palpate_benchmarks.swaps_command:swaps",
+        "wallclock": "palpate_benchmarks.wallclock_command:wallclock",
+    },
+    "Maintain": {
+        "bench": "palpate_benchmarks.measure_commands:bench",
+        "faults": "palpate_benchmarks.campaign_command:faults",
+        "fuzz": "palpate.fuzz.command:fuzz",
+    },
 }
-"""The word of each command, and where it is: a function, or a Typer app of several commands."""
+"""The words of the commands by what they are for, and where each is: a function, or a Typer app of several commands."""
+COMMANDS = {word: where for group in GROUPS.values() for word, where in group.items()}
 
 
 def main() -> None:
     """Runs the command of `sys.argv`."""
-    try:
-        contract()
-    except ValueError as error:
-        print(f"palpate: {error}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
     try:
         app_for(sys.argv[1] if len(sys.argv) > 1 else "")(prog_name="palpate")
     except BrokenPipeError:
@@ -62,22 +72,41 @@ def main() -> None:
 
 
 def app_for(word: str) -> typer.Typer:
-    """The app that has the command `word` alone, or all commands for a word that is not in the table."""
+    """The app that has the command `word` alone; for a word that is not in the table, one that can only list them all."""
     app = typer.Typer(
         name="palpate",
         help=HELP,
-        callback=_nothing,
+        callback=_options,
         no_args_is_help=True,
         rich_markup_mode="rich",
         pretty_exceptions_show_locals=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
     )
-    for name in [word] if word in COMMANDS else COMMANDS:
-        _add(app, name)
+    if word in COMMANDS:
+        _add(app, word)
+        return app
+    for group, commands in GROUPS.items():
+        for name, where in commands.items():
+            app.command(name, help=_summary(where), rich_help_panel=group)(_listed)
     return app
 
 
-def _nothing() -> None:
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"palpate {version('palpate')}")
+        raise typer.Exit
+
+
+def _options(
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version, and nothing else.")
+    ] = False,
+) -> None:
     """With a callback, an app of one command still wants that command's name."""
+
+
+def _listed() -> None:
+    """Stands for a command in the list of all."""
 
 
 def _add(app: typer.Typer, word: str) -> None:
@@ -86,8 +115,27 @@ def _add(app: typer.Typer, word: str) -> None:
         command = getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
         print(f"palpate: the command {word} needs the module {error.name}; pip install 'palpate[all]'", file=sys.stderr)
-        return
+        sys.exit(EXIT_BAD_INPUT)
+    except ValueError as error:  # a contract of one's own that cannot be used
+        print(f"palpate: {error}", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
     if isinstance(command, typer.Typer):
         app.add_typer(command, name=word)
     else:
         app.command(word)(command)
+
+
+def _summary(where: str) -> str:
+    """The first paragraph of a command's docstring, or the `help` of an app, read in the source of its module."""
+    name, _, attribute = where.partition(":")
+    package, _, rest = name.partition(".")
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        return "Not installed."
+    source = Path(spec.origin).parent.joinpath(*rest.split(".")).with_suffix(".py")
+    for node in ast.parse(source.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef) and node.name == attribute:
+            return (ast.get_docstring(node) or "").partition("\n\n")[0]
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == attribute and isinstance(node.value, ast.Call):
+            return next(str(ast.literal_eval(word.value)) for word in node.value.keywords if word.arg == "help")
+    raise LookupError(f"{source}: no {attribute}")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import version
+
+from typer.testing import CliRunner
 
 from palpate.commands import COMMANDS, app_for
 
@@ -18,6 +21,22 @@ def names(word: str) -> set[str]:
 def test_a_command_of_another_package_comes_alone() -> None:
     assert names("doctor") == {"doctor"}
     assert names("topic") == {"topic"}
+
+
+def test_the_list_of_commands_imports_none_and_says_what_each_is_for() -> None:
+    program = (
+        "import sys; from palpate.commands import app_for; app = app_for('-h');"
+        "print(sorted({'numpy', 'pydantic', 'rosbags', 'zenoh'} & sys.modules.keys()));"
+        "print(all(command.help for command in app.registered_commands))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["[]", "True"]
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    called = CliRunner().invoke(app_for(""), ["--version"])
+    assert called.exit_code == 0
+    assert called.stdout.strip() == f"palpate {version('palpate')}"
 
 
 def test_an_operator_does_not_wait_for_plots_and_meshes() -> None:
