@@ -17,6 +17,7 @@ from palpate.report.page import write_page
 from palpate.report.results import print_findings, write_results
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
+from palpate.run.folder import FolderError, results_folder
 from palpate.run.inputs import Settings, usable
 from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
@@ -40,7 +41,10 @@ NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait
 
 def run(  # noqa: PLR0913 - the options of a command
     scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "clean",
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; by default out/<scenario>-<time>.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the results; by default out/<scenario>-<time>.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Remove the results of an earlier run from the folder.")] = False,
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     composed: Annotated[bool, typer.Option("--composed", help="All services in this process.")] = False,
     realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
@@ -109,19 +113,21 @@ def run(  # noqa: PLR0913 - the options of a command
         if not composed:
             console.print("[dim]look at it from another terminal: palpate doctor, palpate topic list[/]", highlight=False)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with RunDisplay(console, quiet) as display:
-            if composed:
-                result = run_composed(chosen, folder.resolve(), display.tell, observers)
-            else:
-                timing = Timing(wallclock, 1.0 if realtime else None, handover_s=handover)
-                with SecureBus(keys) if secure else nullcontext() as bus:
-                    result = run_distributed(chosen, folder.resolve(), display.tell, observers, timing, secure=bus, absent=absent)
-    except (ProcessListError, ChoiceError, PlaceError, BusConfigError, KeysError, OSError) as error:
+        with results_folder(folder, overwrite=overwrite):
+            with RunDisplay(console, quiet) as display:
+                if composed:
+                    result = run_composed(chosen, folder.resolve(), display.tell, observers)
+                else:
+                    timing = Timing(wallclock, 1.0 if realtime else None, handover_s=handover)
+                    with SecureBus(keys) if secure else nullcontext() as bus:
+                        result = run_distributed(
+                            chosen, folder.resolve(), display.tell, observers, timing, secure=bus, absent=absent
+                        )
+            _conclude(console, folder, chosen, result, quiet, as_json)
+    except (ProcessListError, ChoiceError, PlaceError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
     except RunFailed as error:
         fail(error)
-    _conclude(console, folder, chosen, result, quiet, as_json)
 
 
 def _conclude(
