@@ -17,8 +17,11 @@ def _whole_past() -> Any:
     return rrb.VisibleTimeRange(TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative())
 
 
+_HIDDEN = rrb.EntityBehavior(visible=False)
+"""Shown when somebody asks for it, by the eye beside its name in the viewer. Nothing of the truth is in the picture before."""
+
+
 def _scene() -> Any:
-    hidden = rrb.EntityBehavior(visible=False)
     return rrb.Spatial3DView(
         name="Examination (world frame, m)",
         origin="/world",
@@ -28,9 +31,10 @@ def _scene() -> Any:
         eye_controls=_eye((0.92, -1.04, 1.80), (0.41, 0.03, 1.09), (0.0, 0.0, 1.0)),
         overrides={
             "/world/tool/travelled": rrb.VisibleTimeRanges([_whole_past()]),
-            "/world/perception/normals": hidden,
-            "/world/perception/surface": hidden,
-            "/world/truth/axes": hidden,
+            "/world/perception/normals": _HIDDEN,
+            "/world/perception/surface": _HIDDEN,
+            "/world/truth/lesions": _HIDDEN,
+            "/world/truth/axes": _HIDDEN,
         },
     )
 
@@ -44,6 +48,7 @@ def _map(layer: str, name: str, region_m: tuple[float, float], centre_m: tuple[f
         background=(24, 27, 33),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=_eye((x, y - 1e-3, distance), (x, y, 0.0), (0.0, 1.0, 0.0)),
+        overrides={f"/map/{layer}/truth": _HIDDEN},
     )
 
 

@@ -22,7 +22,7 @@ LEGEND = """
 | blue line | planned path of the indenter |
 | green, brown line | travelled path, free and in contact |
 | red arrow beside the tool | true normal force, 5 N are 15 cm |
-| violet outline | true lesion at half contrast, on the patient's true pose (its axes are hidden at first): see `world/truth` |
+| violet outline | true lesion at half contrast, on the patient's true pose: hidden until the eye of `world/truth` is clicked |
 | white points | palpation targets; light blue: perceived points |
 | pyramid | view of the depth camera, on its tripod |
 | head, pillow, drape | for the eye alone: neither arm nor camera meets them; switch them off under `world/patient` |

@@ -236,7 +236,10 @@ def test_the_truth_about_the_patient_is_not_shown_at_first() -> None:
         (holder,) = [tab for tab in tabs if view in tab.contents]
         assert holder.contents[0] is not view  # the first tab is in front
     (scene,) = [part for part in parts if getattr(part, "origin", "") == "/world"]
-    assert "/world/truth/axes" in scene.visualizer_overrides
+    (mean,) = [part for part in parts if getattr(part, "origin", "") == "/map/mean"]
+    drawn = {"/world/truth/lesions": scene, "/world/truth/axes": scene, "/map/mean/truth": mean}
+    for path, view in drawn.items():
+        assert view.visualizer_overrides[path].visible.as_arrow_array().to_pylist() == [False]
 
 
 OBSERVED = sorted(topic.name for topic, _ in contract().inputs("dashboard"))
