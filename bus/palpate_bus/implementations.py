@@ -10,9 +10,11 @@ import ast
 import re
 import sys
 from collections.abc import Callable
+from difflib import get_close_matches
 from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, distribution, entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 from palpate_bus.service import Service
@@ -40,7 +42,9 @@ def check(role: str, choice: str) -> None:
     if is_file(choice):
         _check_file(role, Path(choice))
     elif choice not in names(role):
-        raise ChoiceError(f"services.{role} = {choice!r}: want {_allowed(role)}")
+        near = get_close_matches(choice, names(role), n=1)
+        meant = f". Did you mean {near[0]}?" if near else ""
+        raise ChoiceError(f"services.{role} = {choice!r}: want {_allowed(role)}{meant}")
 
 
 def check_libraries(role: str, choice: str) -> None:
@@ -60,12 +64,16 @@ def create_for(role: str, choice: str) -> Create:
 
 
 def create(role: str, choice: str, scenario: Any) -> Service:
-    """The service of a role for a scenario. Raises ChoiceError; other errors are those of the implementation."""
+    """The service of a role for a scenario. Raises ChoiceError; other errors are those of an installed implementation."""
     make = create_for(role, choice)
     try:
         service = make(scenario)
     except ModuleNotFoundError as error:
         raise ChoiceError(_lacking(role, choice, error)) from error
+    except Exception as error:
+        if not is_file(choice):
+            raise
+        raise ChoiceError(_broken(role, Path(choice).resolve(), error)) from error
     if service.role != role:
         raise ChoiceError(f"services.{role} = {choice!r}: makes a service of the role {service.role!r}")
     return service
@@ -152,6 +160,13 @@ def _defined(tree: ast.Module) -> set[str]:
     return found
 
 
+def _broken(role: str, path: Path, error: Exception) -> str:
+    """What went wrong in a user's own file, with the last of its lines that took part."""
+    lines = [frame.lineno for frame in extract_tb(error.__traceback__) if Path(frame.filename) == path]
+    where = f"line {lines[-1]}: " if lines else ""
+    return f"services.{role} = {str(path)!r}: {where}{type(error).__name__}: {error}"
+
+
 def _own(role: str, path: Path) -> Create:
     """`create` of a user's own file, which may import what is beside it."""
     if str(path.parent) not in sys.path:
@@ -165,5 +180,7 @@ def _own(role: str, path: Path) -> Create:
         spec.loader.exec_module(own)
     except ModuleNotFoundError as error:
         raise ChoiceError(_lacking(role, str(path), error)) from error
+    except Exception as error:
+        raise ChoiceError(_broken(role, path, error)) from error
     made: Create = own.create
     return made

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +11,7 @@ import yaml
 from pydantic import ValidationError
 
 from palpate_models.errors import draw_errors
+from palpate_models.explain import did_you_mean, explain
 from palpate_models.frames import matrix, pose_of
 from palpate_models.scenario import ExamInput, PlantInput, Scenario
 from palpate_models.section import Pose
@@ -71,6 +72,7 @@ def _read(source: str) -> tuple[str, str]:
     if not path.is_file():
         raise ScenarioError(
             f"{source}: no such scenario; known are {', '.join(scenario_names())}, or give the path of a YAML file"
+            f"{did_you_mean(source, scenario_names())}"
         )
     try:
         return path.read_text(encoding="utf-8"), source
@@ -109,15 +111,7 @@ def _parse(text: str, name: str) -> Any:
         raise ScenarioError(f"{name}: not YAML: {error}") from error
 
 
-def _explain(name: str, error: ValidationError) -> str:
-    lines = []
-    for item in error.errors():
-        field = ".".join(str(part) for part in item["loc"]) or "scenario"
-        lines.append(f"{name}: {field} = {item['input']!r}: {item['msg']}")
-    return "\n".join(lines)
-
-
-def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = None) -> Scenario:
+def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = None) -> Scenario:
     """A scenario by name or YAML file, with overrides `a.b=c` applied in order.
 
     Raises ScenarioError naming file, field, value and what is allowed.
@@ -136,7 +130,7 @@ def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = 
     try:
         return Scenario.model_validate(raw)
     except ValidationError as error:
-        raise ScenarioError(_explain(name, error)) from error
+        raise ScenarioError(explain(name, text, settings, Scenario, error)) from error
 
 
 def view_of(role: str) -> View:

@@ -40,7 +40,7 @@ def test_a_level_and_a_field_are_set_in_any_way() -> None:
         ("errors=5", r"errors = 5: .*none, typical or poor"),
         ("errors.level=[poor]", r"errors\.level = \['poor'\]"),
         ("errors.force.tare_n=-1", r"errors\.force\.tare_n = -1: .*greater than or equal to 0"),
-        ("errors.force.tara_n=1", r"errors\.force\.tara_n = 1: Extra inputs"),
+        ("errors.force.tara_n=1", r"errors\.force\.tara_n = 1: there is no such field\. Did you mean tare_n\?"),
         ("errors.hand_eye.translation_m=5", r"errors\.hand_eye\.translation_m = 5: .*less than or equal to 0\.1"),
         ("errors.camera=blind", r"errors\.camera = 'blind'"),
     ],

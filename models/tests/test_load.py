@@ -25,8 +25,11 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("exam: {depth_m: deep}", r"mine\.yaml: exam\.depth_m = 'deep': .*number"),
-        ("exam: {depht_m: 0.01}", r"mine\.yaml: exam\.depht_m = 0\.01: Extra inputs"),
+        ("exam: {depth_m: deep}", r"mine\.yaml, line 1: exam\.depth_m = 'deep': .*number"),
+        (
+            "seed: 1\nexam:\n  depht_m: 0.01\n",
+            r"mine\.yaml, line 3: exam\.depht_m = 0\.01: there is no .*mean depth_m\?",
+        ),
         ("exam: {pattern: zigzag}", r"exam\.pattern = 'zigzag': .*'snake' or 'raster'"),
         ("phantom: {lesions: [{contrast: 4}]}", r"phantom\.lesions\.0\.centre_m"),
         ("- exam", r"want a mapping of fields, not list"),
@@ -39,6 +42,16 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
 def test_what_cannot_be_is_named(text: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match=words):
         load_scenario(scenario(tmp_path, text))
+
+
+def test_a_value_is_blamed_on_the_setting_that_wrote_it() -> None:
+    with pytest.raises(ScenarioError, match=r"^--set exam\.depth_m: exam\.depth_m = 5: .*less than"):
+        load_scenario("healthy", ["exam.speed_mps=0.02", "exam.depth_m=5"])
+
+
+def test_a_scenario_that_is_not_there_is_guessed() -> None:
+    with pytest.raises(ScenarioError, match=r"helthy: no such scenario.*Did you mean healthy\?"):
+        load_scenario("helthy")
 
 
 def test_a_merged_section_may_be_overridden(tmp_path: Path) -> None:

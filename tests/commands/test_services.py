@@ -65,6 +65,20 @@ def test_a_file_that_is_no_service_is_refused(tmp_path: Path, text: str | None, 
         chosen(f"assessment={file}")
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 / 0\ndef create(scenario): ...", "line 1: ZeroDivisionError"),
+        ("import math\ndef create(scenario):\n    return math.nosuch", "line 3: AttributeError"),
+    ],
+)
+def test_what_goes_wrong_in_a_file_is_told_with_its_line(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(text)
+    with pytest.raises(ChoiceError, match=said):
+        load_services(chosen(f"assessment={file}"), ("assessment",))
+
+
 @pytest.mark.parametrize("words", [["run"], ["run", "--composed"]])
 def test_nothing_starts_with_a_service_that_there_is_not(words: list[str], tmp_path: Path) -> None:
     called = CliRunner().invoke(app_for("run"), [*words, "--service", "robot=bullet", "--out", str(tmp_path / "out")])

@@ -1,0 +1,61 @@
+"""Why a scenario cannot be used: where each wrong value came from, what is wrong with it, and what was probably meant."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+
+def did_you_mean(word: str, known: Collection[str]) -> str:
+    """The known word that is nearest, as a sentence that can follow another one; empty when none is near."""
+    near = get_close_matches(word, known, n=1)
+    return f". Did you mean {near[0]}?" if near else ""
+
+
+def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel], error: ValidationError) -> str:
+    """A line for each wrong value of a scenario called `name`, written as YAML in `text` and changed by `a.b=c` settings."""
+    lines = []
+    for item in error.errors():
+        field = [str(part) for part in item["loc"]]
+        path = ".".join(field) or "scenario"
+        what = item["msg"]
+        if item["type"] == "extra_forbidden":
+            what = f"there is no such field{did_you_mean(field[-1], _fields(model.model_json_schema()))}"
+        lines.append(f"{_origin(name, text, settings, field)}: {path} = {item['input']!r}: {what}")
+    return "\n".join(lines)
+
+
+def _fields(schema: dict[str, Any]) -> set[str]:
+    """The names of all fields of a model and of the models within it."""
+    return {field for part in (schema, *schema.get("$defs", {}).values()) for field in part.get("properties", ())}
+
+
+def _origin(name: str, text: str, settings: Sequence[str], field: Sequence[str]) -> str:
+    """Where a field got its value: the last setting that wrote it, else the file with the line."""
+    for setting in reversed(settings):
+        words = setting.partition("=")[0].split(".")
+        if words == list(field[: len(words)]):
+            return f"--set {words[0] if len(words) == 1 else '.'.join(words)}"
+    line = _line(yaml.compose(text, yaml.SafeLoader), field)
+    return name if line is None else f"{name}, line {line}"
+
+
+def _line(node: yaml.Node | None, field: Iterable[str]) -> int | None:
+    """The line on which a field stands, counted from 1; None where the document does not have it."""
+    line = None
+    for word in field:
+        if isinstance(node, yaml.MappingNode):
+            found = [(key, value) for key, value in node.value if key.value == word]
+        elif isinstance(node, yaml.SequenceNode) and word.isdigit() and int(word) < len(node.value):
+            found = [(node.value[int(word)],) * 2]
+        else:
+            found = []
+        if not found:
+            return line  # a validator's own words may go deeper than the document
+        key, node = found[0]
+        line = key.start_mark.line + 1
+    return line
