@@ -39,10 +39,11 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: install  ## docs/topics.md from the contract, settings.md and errors.md from their tables
+docs: install  ## docs/topics.md from the contract; settings.md, errors.md and scenario.md from their tables and models
 	$(BIN)/python -m palpate_bus.contract.doc
 	$(BIN)/python -m palpate_bus.settings --doc
 	$(BIN)/python -m palpate_models.errors_page
+	$(BIN)/python -m palpate_models.scenario_page
 
 install: $(VENV)/.installed
 

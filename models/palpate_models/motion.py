@@ -28,7 +28,9 @@ class Motion(Section):
     kind: Literal["none", "shift", "turn"] = "none"
     """`shift`: along the table. `turn`: about the long axis. Direction and side are drawn from the seed."""
     shift_m: Annotated[float, Field(gt=0, le=0.02)] = 0.010
+    """How far it shifts."""
     turn_rad: Annotated[float, Field(gt=0, le=0.2)] = math.radians(3)
+    """By how much it turns."""
     at_s: NonNegative | None = None
     """When it begins; None: at a moment drawn from the seed, between 40 and 90 s."""
     over_s: Annotated[float, Field(ge=0.1, le=10)] = 0.5

@@ -95,7 +95,9 @@ class Phantom(Section):
     stiffness: Stiffness = Stiffness()
     background: Background = Background()
     lesions: tuple[Lesion, ...] = ()
+    """Lumps, stiffer or softer than their surroundings."""
     guarding: tuple[Guarding, ...] = ()
+    """Contracted muscles: wide and smooth."""
     breathing: Breathing = Breathing()
     motion: Motion = Motion()
 

@@ -41,7 +41,9 @@ class Exam(Section):
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Pattern = Pattern.SNAKE
+    """`snake`: every other line is followed back; `raster`: every line from the feet to the head."""
     mode: Mode = Mode.CONTINUOUS
+    """`continuous`: slides at depth; `point`: presses, holds and lifts at each point."""
     depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
     """Indentation along the inward normal from the perceived rest surface."""
     spacing_m: Annotated[float, Field(ge=0.004, le=0.05)] = 0.0125
@@ -97,6 +99,7 @@ class Robot(Section):
 
     lbr: LbrConnection = LbrConnection()
     indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
+    """Radius of the sphere that presses."""
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Nominal mass below the F/T sensor: stand-off and indenter."""
     base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 1.17
@@ -120,9 +123,13 @@ class Camera(Section):
     position_m: Vec3 = (0.95, -0.45, 1.85)
     """Optical centre in world, as calibrated. The true pose differs by `errors.hand_eye`."""
     look_at_m: Vec3 = (0.56, 0.0, 0.90)
+    """Point in world at the centre of its picture."""
     width_px: Annotated[int, Field(ge=64, le=1920)] = 640
+    """Columns of a depth image."""
     height_px: Annotated[int, Field(ge=48, le=1080)] = 480
+    """Rows of a depth image."""
     focal_px: Positive = 585.0
+    """Focal length."""
     frames: Annotated[int, Field(ge=1, le=200)] = 20
     """Frames fused for a perceived surface."""
 
@@ -145,7 +152,9 @@ class Limits(Section):
     force_emergency_n: Force = 40.0
     """The driver holds safely."""
     depth_m: Annotated[float, Field(gt=0, le=0.05)] = 0.020
+    """Greatest indentation: the exam commands no more, and beyond it the supervisor stops."""
     joint_margin_rad: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    """Distance that is kept from the ends of each joint's range."""
     speed_mps: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Of the tool in free motion."""
     contact_speed_mps: Annotated[float, Field(gt=0, le=0.5)] = 0.25
@@ -204,11 +213,14 @@ class Services(Section):
 
 
 class Scenario(Section):
-    """All of a run. `palpate_models.load.seen_by` gives the part that a role may know."""
+    """All of a run. `palpate_models.load.seen` gives the part that a role may know."""
 
     name: str = "unnamed"
+    """Names the run's results; by default the file's name."""
     description: str = ""
+    """A sentence for people."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Patient and equipment are drawn from it, and noise: equal seeds give equal runs."""
     phantom: Phantom = Phantom()
     errors: Errors = Errors()
     exam: Exam = Exam()

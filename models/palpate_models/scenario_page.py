@@ -1,0 +1,111 @@
+"""docs/scenario.md, from the fields of a scenario: `python -m palpate_models.scenario_page`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, get_args, get_origin
+
+from pydantic_core import PydanticUndefined
+
+from palpate_models.scenario import Scenario
+from palpate_models.section import Section
+
+PAGE: Final = Path("docs/scenario.md")
+_HEAD: Final = """# Fields of a scenario
+
+Made from the models in [`palpate_models`](../models/palpate_models/scenario.py) by `make docs`.
+
+A scenario is a YAML file; what it does not mention has the default. `palpate scenarios` lists those that come with Palpate, and
+`--set` changes a field for one run:
+
+    palpate run my_patient.yaml --set exam.depth_m=0.008 --set errors=none
+
+A field's name ends with its unit: `_m` metres, `_mm` millimetres, `_n` newtons, `_rad` radians, `_deg` degrees, `_s` seconds,
+`_mps` metres a second, `_kg` kilograms, `_px` pixels; without one it is a plain number, a name or a yes or no. An unknown field
+is refused, with the line it stands on and the field that was probably meant.
+"""
+_ELSEWHERE: Final = {
+    "errors": "All fields with their levels and sources: [errors.md](errors.md).",
+    "phantom.anatomy": "Nobody sets it: it is what the seed has drawn, see [persons.md](persons.md).",
+}
+"""Sections that are described on a page of their own."""
+_BOUNDS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
+
+
+def page() -> str:
+    """The page's text."""
+    return _HEAD + "".join(_section("", Scenario, Scenario()))
+
+
+def _section(path: str, model: type[Section], given: Section | None) -> Iterator[str]:
+    """A table of the section's own fields, then the sections within it. `given`: its default; None for an item of a list."""
+    schema = model.model_json_schema()
+    yield f"\n## {f'`{path}`' if path else 'At the top'}\n\n{_line(model.__doc__ or '')}\n"
+    if path in _ELSEWHERE:
+        yield f"\n{_ELSEWHERE[path]}\n"
+        return
+    inner: list[tuple[str, type[Section], Section | None]] = []
+    yield "\n| field | default | allowed | what it is |\n|---|---|---|---|\n"
+    for name, field in model.model_fields.items():
+        where = f"{path}.{name}".strip(".")
+        meaning = _line(field.description or "")
+        default = field.default if given is None else getattr(given, name)
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, Section):
+            inner.append((where, kind, default))
+            meaning = meaning or _line(kind.__doc__ or "")
+            yield f"| `{name}` | | a section: [`{where}`](#{_anchor(where)}) | {meaning} |\n"
+            continue
+        inner += [
+            (f"{where}[]" if get_origin(kind) is tuple else where, item, None)
+            for item in get_args(kind)
+            if isinstance(item, type) and issubclass(item, Section)
+        ]
+        allowed = _allowed(schema["properties"][name], schema.get("$defs", {}))
+        yield f"| `{name}` | {_default(default)} | {allowed} | {meaning} |\n"
+    for place, section, instance in inner:
+        yield from _section(place, section, instance)
+
+
+def _default(value: Any) -> str:
+    if value is PydanticUndefined:
+        return "has to be given"
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"`{value:.6g}`"
+    return f"`{value if isinstance(value, str) else json.dumps(value)}`" if value != "" else ""
+
+
+def _allowed(schema: dict[str, Any], parts: dict[str, Any]) -> str:
+    """What a field may be, in words."""
+    if "$ref" in schema:
+        return _allowed(parts[schema["$ref"].rpartition("/")[2]], parts)
+    if "anyOf" in schema:
+        return " or ".join(_allowed(one, parts) for one in schema["anyOf"])
+    if "enum" in schema or "const" in schema:
+        return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
+    if schema.get("type") == "array":
+        items = schema.get("prefixItems")
+        return (
+            f"{len(items)} of: {_allowed(items[0], parts)}" if items else f"a list of: {_allowed(schema.get('items', {}), parts)}"
+        )
+    if schema.get("type") == "object":
+        return f"a section ({schema.get('title', 'any fields')})"
+    bounds = [f"{word} {schema[key]:.10g}" for key, word in _BOUNDS.items() if key in schema]
+    kind = {"number": "a number", "integer": "a whole number", "string": "text", "boolean": "true, false", "null": "none"}
+    return " ".join([kind.get(str(schema.get("type")), "anything"), *([", ".join(bounds)] if bounds else [])])
+
+
+def _anchor(path: str) -> str:
+    return path.replace(".", "").replace("[]", "")
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
