@@ -39,11 +39,14 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: install  ## docs/topics.md from the contract; settings.md, errors.md and scenario.md from their tables and models
+docs: install  ## the pages that are made from contract, tables and models; then the site, out/site/index.html
 	$(BIN)/python -m palpate_bus.contract.doc
 	$(BIN)/python -m palpate_bus.settings --doc
 	$(BIN)/python -m palpate_models.errors_page
 	$(BIN)/python -m palpate_models.scenario_page
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-docs.txt
+	$(BIN)/python docs/site.py out/site-pages
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
 install: $(VENV)/.installed
 
