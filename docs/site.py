@@ -2,8 +2,8 @@
 
     python docs/site.py out/site-pages && mkdocs build --strict
 
-So links between pages hold as they stand in the repository. A link to a folder leads to its README. A link to a file that the site
-does not have, such as source code, becomes the words alone.
+So links between pages hold as they stand in the repository. A link to a folder leads to its README. A link to a file that the
+site does not have, such as source code, becomes the words alone.
 """
 
 from __future__ import annotations
