@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from palpate.command_line import fail, refuse
+from palpate.command_line import fail, refuse, say
 from palpate.report.page import write_page
 from palpate.report.results import print_findings, write_results
 from palpate.run.composed import run_composed
@@ -24,6 +24,7 @@ from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, ServiceChoices, workers, write_scenario_files
 from palpate.run.secure import SecureBus
+from palpate.run.space import WatchedRoom, another_folder, check_room
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError
@@ -114,15 +115,15 @@ def run(  # noqa: PLR0913 - the options of a command
             console.print("[dim]look at it from another terminal: palpate doctor, palpate topic list[/]", highlight=False)
     try:
         with results_folder(folder, overwrite=overwrite):
+            check_room(folder, chosen.exam, recorded=record)
             with RunDisplay(console, quiet) as display:
+                tell = WatchedRoom(folder, display.tell, say).tell
                 if composed:
-                    result = run_composed(chosen, folder.resolve(), display.tell, observers)
+                    result = run_composed(chosen, folder.resolve(), tell, observers)
                 else:
                     timing = Timing(wallclock, 1.0 if realtime else None, handover_s=handover)
                     with SecureBus(keys) if secure else nullcontext() as bus:
-                        result = run_distributed(
-                            chosen, folder.resolve(), display.tell, observers, timing, secure=bus, absent=absent
-                        )
+                        result = run_distributed(chosen, folder.resolve(), tell, observers, timing, secure=bus, absent=absent)
             _conclude(console, folder, chosen, result, quiet, as_json)
     except (ProcessListError, ChoiceError, PlaceError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
@@ -133,18 +134,28 @@ def run(  # noqa: PLR0913 - the options of a command
 def _conclude(
     console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
 ) -> None:
-    """Writes the results, prints the findings, and leaves with status 3 when the run failed."""
+    """Writes the results, prints the findings, and leaves with status 3 when the run failed or its folder took no results."""
     with nullcontext() if quiet else console.status("writing report and maps"):
-        report = write_results(folder, scenario, result)
-        page = write_page(folder)
+        trouble = ""
+        try:
+            report = write_results(folder, scenario, result)
+            page = write_page(folder)
+        except OSError as error:
+            trouble = f"{folder}: the results cannot be written there ({error.strerror})"
+            folder = another_folder()
+            write_scenario_files(scenario, folder)
+            report = write_results(folder, scenario, result)
+            page = write_page(folder)
     if as_json:
         print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
     else:
         print_findings(Console(), report)
-    if not quiet:
+    if not quiet or trouble:
         console.print(f"to read: {page}", highlight=False, soft_wrap=True)
     if result.failure:
         fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+    if trouble:
+        fail(f"{trouble}; they are in {folder}")
 
 
 def prepare(

@@ -1,0 +1,68 @@
+"""Room on the disk of the results."""
+
+from __future__ import annotations
+
+import shutil
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+import typer
+from conductor_messages import SETTINGS, collected, result
+from rich.console import Console
+
+from palpate.command_line import EXIT_FAILED
+from palpate.run.command import _conclude
+from palpate.run.folder import FolderError
+from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration
+from palpate_conductor.collector import Collected
+from palpate_conductor.result import RunProgress
+from palpate_models.load import load_scenario
+from palpate_models.scenario import Exam
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def leave(megabytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, megabytes * 1_000_000))
+
+
+def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leave(50, monkeypatch)
+    with pytest.raises(FolderError, match=r"50 MB are free there, and this run needs about \d{3} MB; without recordings"):
+        check_room(tmp_path, Exam(), recorded=True)
+    check_room(tmp_path, Exam(), recorded=False)
+    leave(1000, monkeypatch)
+    check_room(tmp_path, Exam(), recorded=True)
+
+
+def test_a_larger_region_and_points_take_longer() -> None:
+    assert expected_duration(Exam(region_m=(0.1, 0.1))) < expected_duration(Exam()) < expected_duration(Exam(mode="point"))
+
+
+def test_a_disk_that_fills_up_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    told: list[RunProgress] = []
+    room = WatchedRoom(tmp_path, told.append, said.append)
+    for megabytes in (500, 10, 5):
+        leave(megabytes, monkeypatch)
+        room.tell(RunProgress(0, 1.0, Collected(), ()))
+    assert len(told) == 3
+    assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination goes on"]
+
+
+def test_what_a_folder_does_not_take_is_written_to_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    lost = tmp_path / "gone"
+    with pytest.raises(typer.Exit) as left:
+        _conclude(Console(quiet=True), lost, load_scenario("clean", SETTINGS, seed=3), result(collected()), quiet=True)
+    assert left.value.exit_code == EXIT_FAILED
+    (other,) = tmp_path.glob("palpate-results-*")
+    assert {"report.json", "report.html", "map.png"} <= {path.name for path in other.iterdir()}
+    out, err = capsys.readouterr()
+    assert "RLQ" in out
+    assert str(other) in err.replace("\n", "")
+    assert another_folder() != other
