@@ -18,7 +18,7 @@ from palpate.run.space import WatchedRoom, another_folder, check_room, expected_
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunProgress
 from palpate_models.load import load_scenario
-from palpate_models.scenario import Exam
+from palpate_models.scenario import Exam, Mode
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -37,7 +37,7 @@ def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, m
 
 
 def test_a_larger_region_and_points_take_longer() -> None:
-    assert expected_duration(Exam(region_m=(0.1, 0.1))) < expected_duration(Exam()) < expected_duration(Exam(mode="point"))
+    assert expected_duration(Exam(region_m=(0.1, 0.1))) < expected_duration(Exam()) < expected_duration(Exam(mode=Mode.POINT))
 
 
 def test_a_disk_that_fills_up_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
