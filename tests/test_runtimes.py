@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ sys.path.insert(0, str(TOYS.parent))
 import toy_services  # noqa: E402
 
 ROLES = tuple(toy_services.TOYS)
+APART = tuple((role,) for role in ROLES)
 
 
 @dataclass
@@ -58,10 +59,11 @@ def run_toys(
     patience: Patience | None = None,
     wallclock: bool = False,
     faults: Mapping[str, tuple[str, ...]] | None = None,
+    groups: Sequence[tuple[str, ...]] = APART,
 ) -> RunOutcome:
-    """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second)."""
+    """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second); `groups`: who shares a process."""
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
-        bus = mesh(("conductor", *ROLES), Path(folder), lowlatency=("robot", "control", "tissue"))
+        bus = mesh(("conductor", *(group[0] for group in groups)), Path(folder), lowlatency=("robot", "control", "tissue"))
         session = open_session(bus["conductor"])
         base = {
             **os.environ,
@@ -69,14 +71,15 @@ def run_toys(
             "PALPATE_SCENARIO": "none",
             "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         }
-        processes = {
-            role: subprocess.Popen(
-                [sys.executable, str(TOYS), role, *(faults or {}).get(role, ())],
-                env={**base, **bus[role].to_env()},
+        started = {
+            group: subprocess.Popen(
+                [sys.executable, str(TOYS), ",".join(group), *(faults or {}).get(group[0], ())],
+                env={**base, **bus[group[0]].to_env()},
                 stderr=subprocess.DEVNULL,
             )
-            for role in ROLES
+            for group in groups
         }
+        processes = {role: child for group, child in started.items() for role in group}
         conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, Timing(wallclock=wallclock))
         running = Running(processes, session, conductor)
 
