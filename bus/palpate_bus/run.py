@@ -101,9 +101,7 @@ def run_service(role: str, make: Callable[[], Service], transport: Callable[[zen
     host(lambda: [Hosted(role, BusOptions.from_settings(Settings.read()), make)], role, transport)
 
 
-def host(
-    hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[[zenoh.Session], Transport] = Transport
-) -> None:
+def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[[zenoh.Session], Transport] = Transport) -> None:
     """Runs services to their end in this process, which is called `name` in the log, and leaves as `main` does.
 
     Those that join the bus in the same way share a session.

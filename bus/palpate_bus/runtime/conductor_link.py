@@ -63,9 +63,7 @@ class Reports:
 
     def __init__(self, member: Member) -> None:
         self._member = member
-        self._publisher = member.internal_publisher(
-            f"palpate/report/{member.role}", "palpation_msgs/msg/ServiceReport", "event"
-        )
+        self._publisher = member.internal_publisher(f"palpate/report/{member.role}", "palpation_msgs/msg/ServiceReport", "event")
         self._encode = codec.encoder("palpation_msgs/msg/ServiceReport")
         self._sequence = 0
         self._last = 0.0

@@ -1,8 +1,8 @@
 """Distributed lockstep: processes over zenoh, conservative synchronisation with no master in the data path.
 
 A node hosts one service, or a group of them that hear each other without the bus. It waits until each blocking input from another
-process has advanced far enough, steps the service, and sends. The conductor only says how far simulated time may go (grants), which
-roles were lost, and when to stop. A node never hangs: it leaves when the conductor falls silent.
+process has advanced far enough, steps the service, and sends. The conductor only says how far simulated time may go (grants),
+which roles were lost, and when to stop. A node never hangs: it leaves when the conductor falls silent.
 """
 
 from __future__ import annotations

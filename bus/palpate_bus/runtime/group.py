@@ -1,9 +1,9 @@
 """The services of one process, stepped in the contract's order: what one of them sends, the others hear at once.
 
 A message is encoded once, since the run hash covers its bytes, and decoded by the first reader that looks at it. Whoever drives a
-group, `composed` without any transport or `distributed` between others, does so in the same order: by tick, then as the contract's
-same_tick edges demand among all roles, not only those of the group. So of all the steps that are still to be made anywhere, the
-first in this order has all its inputs, and groups that wait for each other always go on.
+group, `composed` without any transport or `distributed` between others, does so in the same order: by tick, then as the same_tick
+edges of the contract demand among all roles, not only those of the group. So of all the steps that are still to be made anywhere,
+the first in this order has all its inputs, and groups that wait for each other always go on.
 """
 
 from __future__ import annotations

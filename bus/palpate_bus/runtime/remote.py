@@ -1,7 +1,7 @@
 """What a service in lockstep hears from other processes, and how it waits for it.
 
-A periodic topic is its own announcement that the producer has advanced. The event topics of a producer are advanced by the Advance
-message that closes each of its ticks.
+A periodic topic is its own announcement that the producer has advanced. The event topics of a producer are advanced by the
+Advance message that closes each of its ticks.
 """
 
 from __future__ import annotations
