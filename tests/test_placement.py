@@ -5,7 +5,10 @@ from __future__ import annotations
 import signal
 from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 
+import pytest
+from examination import SHORT, Finished, palpate_run
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from toy_runs import ROLES, Running, at, composed_hash, run_toys, toy_services
@@ -81,3 +84,25 @@ def test_a_frozen_process_is_blamed() -> None:
     outcome = run_toys(freeze, {"TOY_END_S": "30"}, Patience(soft=0.5, hard=2.0), groups=[pair, *others])
     assert outcome.failure is not None
     assert outcome.failure.startswith("planning blocks the run")
+
+
+@pytest.fixture(scope="module")
+def one_process(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    return palpate_run("clean", tmp_path_factory.mktemp("one"), "--composed", "--no-record", settings=SHORT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--group", "robot,tissue,control"),
+        ("--group", "robot,camera", "--group", "control,perception,planning", "--no-record"),
+        ("--processes", "2", "--secure", "--no-record"),
+    ],
+)
+def test_an_examination_has_one_run_hash_however_it_is_placed(
+    options: tuple[str, ...], one_process: Finished, tmp_path: Path
+) -> None:
+    placed = palpate_run("clean", tmp_path, *options, settings=SHORT)
+    assert placed.status == 0, placed.output
+    assert placed.report["run_hash"] == one_process.report["run_hash"]
