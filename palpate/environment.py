@@ -6,7 +6,10 @@ seed. All of these are read when the interpreter and the libraries start.
 
 from __future__ import annotations
 
+import os
 import platform
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 KERNELS = {"x86_64": "Haswell"}
 """OpenBLAS kernels by machine: those of AVX2. With its own choice a surface fit differed in the last bit between processors."""
@@ -17,3 +20,18 @@ FIXED = {
     **({"OPENBLAS_CORETYPE": KERNELS[platform.machine()]} if platform.machine() in KERNELS else {}),
 }
 """docker-compose.yml sets the same."""
+
+
+@contextmanager
+def given(variables: Mapping[str, str]) -> Iterator[None]:
+    """Gives what is made meanwhile, and nothing else, these variables of the environment."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

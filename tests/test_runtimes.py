@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-import zenoh
 from rerun.chunk import RrdReader
+from toy_runs import ROLES, Running, at, composed_hash, run_toys, toy_services
 
 from palpate_bus.contract import MS, Topic, contract
 from palpate_bus.messages import DiagnosticStatus, codec
@@ -29,77 +25,11 @@ from palpate_bus.wire.transport import Subscription
 from palpate_bus.wire.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.outcome import Patience, RunFailed, RunOutcome
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import Patience, RunFailed
 from palpate_dashboard.replay import draw
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.scenario import Scenario
-
-TOYS = Path(__file__).parents[1] / "bus" / "tests" / "toy_services.py"
-sys.path.insert(0, str(TOYS.parent))
-import toy_services  # noqa: E402
-
-ROLES = tuple(toy_services.TOYS)
-
-
-@dataclass
-class Running:
-    """A toy run that is on."""
-
-    processes: dict[str, subprocess.Popen[bytes]]
-    session: zenoh.Session
-    conductor: Conductor
-
-
-def run_toys(
-    meddle: Callable[[Running], None] = lambda _: None,
-    environment: Mapping[str, str] | None = None,
-    patience: Patience | None = None,
-    wallclock: bool = False,
-    faults: Mapping[str, tuple[str, ...]] | None = None,
-) -> RunOutcome:
-    """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second)."""
-    with tempfile.TemporaryDirectory(prefix="toy-") as folder:
-        bus = mesh(("conductor", *ROLES), Path(folder), lowlatency=("robot", "control", "tissue"))
-        session = open_session(bus["conductor"])
-        base = {
-            **os.environ,
-            **(environment or {}),
-            "PALPATE_SCENARIO": "none",
-            "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
-        }
-        processes = {
-            role: subprocess.Popen(
-                [sys.executable, str(TOYS), role, *(faults or {}).get(role, ())],
-                env={**base, **bus[role].to_env()},
-                stderr=subprocess.DEVNULL,
-            )
-            for role in ROLES
-        }
-        conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, Timing(wallclock=wallclock))
-        running = Running(processes, session, conductor)
-
-        def died() -> dict[str, str]:
-            return {role: f"status {code}" for role, child in processes.items() if (code := child.poll()) is not None}
-
-        try:
-            return conductor.run(died, lambda _: meddle(running))
-        finally:
-            for child in processes.values():
-                try:
-                    child.wait(timeout=3)
-                except subprocess.TimeoutExpired:
-                    child.kill()
-                    child.wait()
-            close_session(session)
-
-
-def composed_hash() -> str:
-    collector = Collector()
-    run = Composed([*(toy() for toy in toy_services.TOYS.values()), collector])
-    assert run.run(lambda: collector.collected.end_tick, 60 * NS) == toy_services.END
-    return run.run_hash()
 
 
 def test_composed_an_observer_or_a_tap_that_fails_ends_no_run() -> None:
@@ -130,15 +60,6 @@ def test_composed_and_distributed_give_the_same_run_hash() -> None:
     assert outcome.last_tick == toy_services.END
     assert outcome.run_hash == composed_hash()
     assert set(outcome.reports) == set(ROLES)
-
-
-def at(running: Running, seconds: float, done: list[bool]) -> bool:
-    """True once, when the simulated time is reached."""
-    reached = running.conductor.watchdog.progress["robot"].tick > seconds * NS
-    if reached and not done:
-        done.append(True)
-        return True
-    return False
 
 
 def test_killed_controller_is_named_and_the_survivors_run_one_more_second() -> None:

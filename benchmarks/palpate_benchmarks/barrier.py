@@ -69,7 +69,7 @@ def serve(role: str, number: int) -> None:
     service = Trivial(role, tuple(topic.name for topic, _ in contract.inputs(role)))
     with session() as opened:
         member = Member(opened, role, contract, 0)
-        LockstepNode(service, member).run()
+        LockstepNode([service], {role: member}).run()
         member.leave()
 
 

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from palpate.report.evidence import peak_force
 from palpate.run.forks import Forks
+from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, choice, write_scenario_files
 from palpate_benchmarks.faulty import CHANGES, InjectedFault, command
@@ -222,7 +223,7 @@ def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> Fault
     timing = Timing(wallclock=case.wallclock)
     finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
     begin = monotonic()
-    local = LocalProcesses(WORKERS, out, files, timing, forks=forks)
+    local = LocalProcesses(apart(WORKERS), out, files, timing, forks=forks)
     try:
         session = open_session(local.bus["conductor"])
         try:

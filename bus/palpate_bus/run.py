@@ -16,12 +16,13 @@ import gc
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import zenoh
 
-from palpate_bus.contract import MS, Contract, Role, contract
+from palpate_bus.contract import MS, Role, contract
 from palpate_bus.implementations import ChoiceError, create
 from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.distributed import LockstepNode
@@ -36,16 +37,31 @@ from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 
 EXIT_FAILED = 3
-RUNTIMES: dict[str, type[LockstepNode] | type[WallClockNode]] = {"lockstep": LockstepNode, "wallclock": WallClockNode}
 
 
-def node_type(
-    service: Service, rules: Contract, runtime: str
-) -> type[LockstepNode] | type[WallClockNode] | type[ObserverNode] | type[RecorderNode]:
-    """The node that drives a service in a process of its own; `runtime` is `lockstep` or `wallclock`."""
-    if not rules.roles[service.role].observer:
-        return RUNTIMES[runtime]
-    return RecorderNode if isinstance(service, RawRecorder) else ObserverNode
+@dataclass(frozen=True)
+class Hosted:
+    """A service that a process is to host: its role, how it joins the bus, and what makes it."""
+
+    role: str
+    options: BusOptions
+    make: Callable[[], Service]
+
+
+def _node(
+    services: Sequence[Service], members: Mapping[str, Member], runtime: str
+) -> LockstepNode | WallClockNode | ObserverNode | RecorderNode:
+    """What drives the services of a process. Raises BusConfigError for several of which one must have its own."""
+    first = services[0]
+    member = members[first.role]
+    apart = [service.role for service in services if runtime != "lockstep" or member.rules.roles[service.role].observer]
+    if not apart:
+        return LockstepNode(services, members)
+    if len(services) > 1:
+        raise BusConfigError(f"{', '.join(members)} in one process: in {runtime}, {', '.join(apart)} must be alone")
+    if not member.rules.roles[first.role].observer:
+        return WallClockNode(first, member)
+    return RecorderNode(first, member) if isinstance(first, RawRecorder) else ObserverNode(first, member)
 
 
 def runtime() -> str:
@@ -82,22 +98,36 @@ def chosen(role: str, load: Callable[[str], NamesServices], words: Sequence[str]
 
 def run_service(role: str, make: Callable[[], Service], transport: Callable[[zenoh.Session], Transport] = Transport) -> None:
     """As `main`, for the service that `make` returns; `transport` carries its messages."""
+    host(lambda: [Hosted(role, BusOptions.from_settings(Settings.read()), make)], role, transport)
+
+
+def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[[zenoh.Session], Transport] = Transport) -> None:
+    """Runs services to their end in this process, which is called `name` in the log, and leaves as `main` does.
+
+    Those that join the bus in the same way share a session.
+    """
     status = 0
-    session = None
-    log = logging.getLogger(role)
+    sessions: dict[BusOptions, zenoh.Session] = {}
+    log = logging.getLogger(name)
     try:
         settings = Settings.read()
-        logging.basicConfig(level=settings.log, format=f"%(asctime)s {role} %(levelname)s %(message)s", stream=sys.stderr)
+        logging.basicConfig(level=settings.log, format=f"%(asctime)s {name} %(levelname)s %(message)s", stream=sys.stderr)
         rules = contract()
-        service = make()
-        if stands_back(rules.roles[role], settings.runtime):
+        places = hosted()
+        services = [place.make() for place in places]
+        if all(stands_back(rules.roles[place.role], settings.runtime) for place in places):
             in_the_background()
-        session = open_session(BusOptions.from_settings(settings))
-        member = Member(session, role, rules, settings.domain, transport(session))
-        node = node_type(service, rules, settings.runtime)(service, member)
+        sessions = {options: open_session(options) for options in dict.fromkeys(place.options for place in places)}
+        transports = {options: transport(session) for options, session in sessions.items()}
+        members = {
+            place.role: Member(sessions[place.options], place.role, rules, settings.domain, transports[place.options])
+            for place in places
+        }
+        node = _node(services, members, settings.runtime)
         gc.freeze()  # else a full collection goes through all that was loaded: 0.06 to 0.17 s in mid-run, now 0.02 ms
         node.run()
-        member.leave()
+        for member in members.values():
+            member.leave()
     except RunAborted as aborted:
         log.warning("run ended early: %s", aborted)
         status = EXIT_FAILED
@@ -107,14 +137,14 @@ def run_service(role: str, make: Callable[[], Service], transport: Callable[[zen
         log.error("%s", error)
         status = EXIT_FAILED
     except Exception:
-        log.exception("%s failed", role)
+        log.exception("%s failed", name)
         status = EXIT_FAILED
-    leave(session, status)
+    leave(sessions.values(), status)
 
 
-def leave(session: zenoh.Session | None, status: int) -> None:
-    """Closes the session and ends the process: zenoh's own threads are not waited for."""
-    if session is not None:
+def leave(sessions: Iterable[zenoh.Session], status: int) -> None:
+    """Closes the sessions and ends the process: zenoh's own threads are not waited for."""
+    for session in sessions:
         close_session(session)
     sys.stderr.flush()
     sys.stdout.flush()

@@ -1,6 +1,6 @@
 """A small dataflow with every kind of edge, for tests of the runtimes: numbers that depend on every input and its delay.
 
-Run as a program it is the process of one role: `python toy_services.py ROLE`.
+Run as a program it is the process of one role, or of several: `python toy_services.py ROLE[,ROLE ...]`.
 """
 
 from __future__ import annotations
@@ -40,9 +40,11 @@ from palpate_bus.messages import (
     WrenchStamped,
 )
 from palpate_bus.messages.stamps import NS, duration_message, header
-from palpate_bus.run import run_service
+from palpate_bus.run import Hosted, host
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_bus.wire.transport import Transport
+from palpate_bus.wire.zenoh_config import BusOptions
 
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]
 END = int(float(os.environ.get("TOY_END_S", "2")) * NS)
@@ -209,4 +211,5 @@ def transport(session: zenoh.Session) -> Transport:
 
 
 if __name__ == "__main__":
-    run_service(sys.argv[1], TOYS[sys.argv[1]], transport)
+    here = BusOptions.from_settings(Settings.read())
+    host(lambda: [Hosted(role, here, TOYS[role]) for role in sys.argv[1].split(",")], sys.argv[1], transport)

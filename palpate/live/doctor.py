@@ -92,7 +92,8 @@ def diagnose(bus: Joined, rules: Contract, live: LiveMonitor) -> Diagnosis:
     """What is known by now."""
     found = list(live.graph.alive.values())
     findings = [
-        *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(rules, live), *_waiting(live),
+        *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(rules, live), *_processes(live),
+        *_waiting(live),
     ]  # fmt: skip
     differing = mismatches(found)
     findings += [Remark("types", Severity.BAD, sentence) for sentence in differing]
@@ -176,6 +177,12 @@ def _who(rules: Contract, live: LiveMonitor) -> list[Remark]:
     if live.graph.garbage:
         findings.append(Remark("roles", Severity.WARN, f"{live.graph.garbage} liveliness tokens are not rmw_zenoh's"))
     return findings
+
+
+def _processes(live: LiveMonitor) -> list[Remark]:
+    """Who shares a process with whom."""
+    shared = [f"{', '.join(names)} share one" for names in graph.processes(live.graph.alive.values()) if len(names) > 1]
+    return [Remark("processes", Severity.OK, "; ".join([*shared, "every other role has its own"]) if shared else "one a role")]
 
 
 def _waiting(live: LiveMonitor) -> list[Remark]:

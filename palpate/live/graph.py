@@ -87,6 +87,14 @@ def nodes(found: Iterable[Entity]) -> dict[str, LiveNode]:
     return dict(sorted(by_name.items()))
 
 
+def processes(found: Iterable[Entity]) -> list[tuple[str, ...]]:
+    """The nodes of each process, sorted: those with a session in common. On a secure bus each node has its own session."""
+    by_session: dict[str, set[str]] = {}
+    for entity in found:
+        by_session.setdefault(entity.zid, set()).add(entity.node)
+    return sorted(tuple(sorted(names)) for names in by_session.values())
+
+
 def missing(rules: Contract, found: Iterable[Entity]) -> list[str]:
     """Roles of the contract that are not on the bus, the critical ones first."""
     there = {entity.node for entity in found}

@@ -19,6 +19,7 @@ from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
 from palpate.run.folder import FolderError, results_folder
 from palpate.run.inputs import Settings, usable
+from palpate.run.placement import PlacementError, placement
 from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
@@ -48,6 +49,13 @@ def run(  # noqa: PLR0913 - the options of a command
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Remove the results of an earlier run from the folder.")] = False,
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     composed: Annotated[bool, typer.Option("--composed", help="All services in this process.")] = False,
+    group: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ROLE,ROLE", help="These services in one process, all others in one each; may be repeated."),
+    ] = None,
+    processes: Annotated[
+        int | None, typer.Option(metavar="N", help="The services in N processes, the 1 kHz loop together.")
+    ] = None,
     realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
     wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer, as with hardware.")] = False,
     handover: Annotated[
@@ -89,26 +97,32 @@ def run(  # noqa: PLR0913 - the options of a command
       palpate run --secure                          encrypted, and each role may do only what it has to
 
       palpate run my.yaml --composed                all services in one process, for sweeps and debugging
+
+      palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
     """
     console = Console(stderr=True)
     quiet = quiet or as_json
     chosen = usable(scenario, settings, seed, services)
+    observers = OBSERVERS if record else ()
+    shared = bool(group) or processes is not None
+    for contradiction, why in (
+        (composed and (realtime or wallclock), "--composed runs as fast as it can: it takes neither --realtime nor --wallclock"),
+        (chosen.services.tissue == NONE and not wallclock, NEEDS_WALLCLOCK),
+        (without and composed, "--without ROLE leaves out a process: it goes without --composed"),
+        (shared and composed, "--composed is one process for all: it takes neither --group nor --processes"),
+        (shared and wallclock, "--wallclock needs a process for each service: it takes neither --group nor --processes"),
+        (handover and not wallclock, "--handover is for --wallclock: in lockstep every message of a service is awaited"),
+        (composed and secure, "--secure is for processes, so it goes without --composed"),
+        (keys and not secure, "--keys goes with --secure"),
+    ):
+        if contradiction:
+            refuse(why)
     try:
         absent = Absent(tuple(without or ()), wait, partial(console.print, highlight=False, soft_wrap=True))
-    except PlaceError as error:
+        groups = placement((*workers(chosen), *observers), group or (), processes)
+    except (PlaceError, PlacementError) as error:
         refuse(error)
-    if composed and (realtime or wallclock):
-        refuse("--composed runs as fast as it can: it takes neither --realtime nor --wallclock")
-    if chosen.services.tissue == NONE and not wallclock:
-        refuse(NEEDS_WALLCLOCK)
-    if without and composed:
-        refuse("--without ROLE leaves out a process: it goes without --composed")
-    if handover and not wallclock:
-        refuse("--handover is for --wallclock: in lockstep every message of a service is awaited")
-    if (composed and secure) or (keys and not secure):
-        refuse("--secure is for processes, so it goes without --composed; --keys goes with --secure")
     folder = out or Path("out") / f"{chosen.name}-{datetime.now():%Y%m%d-%H%M%S}"
-    observers = OBSERVERS if record else ()
     if not quiet:
         console.print(f"[bold]{chosen.name}[/] seed {chosen.seed}, results in {folder}", highlight=False)
         if not composed:
@@ -123,9 +137,9 @@ def run(  # noqa: PLR0913 - the options of a command
                 else:
                     timing = Timing(wallclock, 1.0 if realtime else None, handover_s=handover)
                     with SecureBus(keys) if secure else nullcontext() as bus:
-                        result = run_distributed(chosen, folder.resolve(), tell, observers, timing, secure=bus, absent=absent)
+                        result = run_distributed(chosen, folder.resolve(), tell, observers, timing, bus, absent, groups)
             _conclude(console, folder, chosen, result, quiet, as_json)
-    except (ProcessListError, ChoiceError, PlaceError, BusConfigError, KeysError, FolderError, OSError) as error:
+    except (ProcessListError, ChoiceError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
     except RunFailed as error:
         fail(error)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import gc
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from time import perf_counter
 
+from palpate.environment import given
 from palpate.run.roles import OBSERVERS, WORKERS, choice, write_scenario_files
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
@@ -34,22 +33,12 @@ def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
     return [create(role, choice(scenario, role), seen(scenario, view_of(role))) for role in roles]
 
 
-@contextmanager
-def _writing_to(out: Path) -> Iterator[None]:
-    """Tells services that are made meanwhile the results folder, and no others: its name may tell of the patient."""
-    os.environ["PALPATE_OUT"] = str(out)
-    try:
-        yield
-    finally:
-        del os.environ["PALPATE_OUT"]
-
-
 def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
     """Runs all services in this process. Raises ChoiceError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
     collector = Collector(tree=FrameTree(exam_input(scenario)))
-    with _writing_to(out):
+    with given({"PALPATE_OUT": str(out)}):  # the others are not told the results folder: its name may tell of the patient
         observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+from palpate.run.placement import Groups, PlacementError, apart
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, override_files, read_processes
 from palpate.run.roles import OBSERVERS, choice, workers, write_scenario_files
@@ -28,16 +29,16 @@ def run_distributed(
     tell: Tell,
     observers: tuple[str, ...] = OBSERVERS,
     timing: Timing | None = None,
-    patience: Patience | None = None,
     secure: SecureBus | None = None,
     absent: Absent | None = None,
+    groups: Groups | None = None,
 ) -> RunResult:
     """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
 
-    The roles of `absent` are left to somebody else to start.
+    The roles of `absent` are left to somebody else to start; `groups` are the roles of each process, by default one each.
 
-    Raises ProcessListError when the compose file cannot be used, ChoiceError when a service cannot, BusConfigError when the
-    certificates cannot; later failures are in the result.
+    Raises ProcessListError when the compose file cannot be used, ChoiceError when a service cannot, PlacementError when it cannot
+    share a process, BusConfigError when the certificates cannot; later failures are in the result.
     """
     begin = perf_counter()
     timing = timing or Timing()
@@ -46,15 +47,19 @@ def run_distributed(
     absent.check(roles)
     processes = read_processes(compose_file(), roles, override_files())
     started = [process for role, process in processes.items() if role not in absent.roles]
+    groups = groups or apart(roles)
     for process in started:
         _check(process, scenario)
+    for role in (role for group in groups if len(group) > 1 for role in group):
+        _check_shares(processes[role], absent)
     files = write_scenario_files(scenario, out)
-    local = LocalProcesses(roles, out, files, timing, "recorder" in observers, secure)
+    local = LocalProcesses(groups, out, files, timing, "recorder" in observers, secure)
     try:
         options = local.bus["conductor"]
         session = open_session(replace(options, drop_wait_us=WALL_CLOCK_DROP_WAIT_US) if timing.wallclock else options)
-        for process in started:
-            local.start(process)
+        for group in groups:
+            if mine := [processes[role] for role in group if role not in absent.roles]:
+                local.start(*mine)
         others = (*absent.roles, *(ROLES if timing.handover_s else ()))
         places = {
             role: ServicePlace(process.command, local.environment(process), role in absent.roles)
@@ -63,8 +68,9 @@ def run_distributed(
         }
         if places:
             write_places(out, places)
+        patience = Patience()
         if absent.roles:
-            patience = replace(patience or Patience(), absent=absent.roles, join=absent.wait_s)
+            patience = Patience(absent=absent.roles, join=absent.wait_s)
             absent.call(out, places)
         try:
             tree = FrameTree(exam_input(scenario))
@@ -80,8 +86,14 @@ def run_distributed(
 
 def _check(process: ServiceProcess, scenario: Scenario) -> None:
     """Raises ChoiceError when what plays a role cannot be started here. A program that is none of ours is not looked at."""
-    python, *words = process.command
-    if python == "python" and words[:2] == ["-m", f"palpate_{process.role}"]:
-        name = words[2] if len(words) > 2 else choice(scenario, process.role)
+    if process.words is not None:
+        name = process.words[0] if process.words else choice(scenario, process.role)
         implementations.check(process.role, name)
         implementations.check_libraries(process.role, name)
+
+
+def _check_shares(process: ServiceProcess, absent: Absent) -> None:
+    """Raises PlacementError for a service that cannot share a process."""
+    if process.role in absent.roles:
+        raise PlacementError(f"--without {process.role}: who starts it places it; leave it out of --group and --processes")
+    process.shared_words()

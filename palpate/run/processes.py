@@ -20,6 +20,9 @@ import yaml
 
 from palpate.environment import FIXED
 from palpate.run.forks import Child, Forks
+from palpate.run.group import GroupMember
+from palpate.run.group import command as group_command
+from palpate.run.placement import Groups, PlacementError
 from palpate.run.secure import SecureBus
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Announcement, Run
@@ -31,8 +34,8 @@ from palpate_models.load import view_of
 COMPOSE = "docker-compose.yml"
 OBSERVERS = frozenset(name for name, role in contract().roles.items() if role.observer)
 """Roles that write into the results folder."""
-BARRIER = ("robot", "control", "tissue")
-"""The roles of the 1 kHz loop: they talk over zenoh's low-latency transport (see palpate_bus.wire.zenoh_config)."""
+BARRIER = frozenset(("robot", "control", "tissue"))
+"""The roles of the 1 kHz loop: processes of no others talk over the low-latency transport (see palpate_bus.wire.zenoh_config)."""
 
 
 class ProcessListError(ValueError):
@@ -46,6 +49,18 @@ class ServiceProcess:
     role: str
     command: tuple[str, ...]
     environment: Mapping[str, str]
+
+    @property
+    def words(self) -> tuple[str, ...] | None:
+        """What follows `python -m palpate_ROLE`; None for a program that is none of ours."""
+        ours = ("python", "-m", f"palpate_{self.role}")
+        return self.command[len(ours) :] if self.command[: len(ours)] == ours else None
+
+    def shared_words(self) -> tuple[str, ...]:
+        """`words`, for a process that is to be shared. Raises PlacementError for a program that cannot share one."""
+        if self.words is None:
+            raise PlacementError(f"{self.role} is played by `{' '.join(self.command)}`, which shares no process with others")
+        return self.words
 
 
 def override_files() -> tuple[Path, ...]:
@@ -125,7 +140,7 @@ class LocalProcesses:
 
     def __init__(
         self,
-        roles: tuple[str, ...],
+        groups: Groups,
         out: Path,
         scenario_files: Mapping[str, Path],
         timing: Timing,
@@ -133,7 +148,8 @@ class LocalProcesses:
         secure: SecureBus | None = None,
         forks: Forks | None = None,
     ) -> None:
-        """`scenario_files` gives the scenario that each role may see; with `secure` all are clients of its router.
+        """`groups` gives the roles of each process, `scenario_files` the scenario that each role may see; with `secure` all are
+        clients of its router.
 
         `record` says that the run has a recorder; `forks` starts the processes in place of a fresh interpreter each.
         """
@@ -146,13 +162,15 @@ class LocalProcesses:
             role: file if view_of(role) == "scenario" else self._apart(file) for role, file in scenario_files.items()
         }
         router = secure.endpoint if secure else settings.router
-        bus = mesh(("conductor", *roles), self._folder, lowlatency=BARRIER)
-        self.bus = {role: replace(options, router=router) for role, options in bus.items()}
+        processes = {group[0]: group for group in (("conductor",), *groups)}
+        quick = [name for name, roles in processes.items() if BARRIER.issuperset(roles)]
+        bus = mesh(tuple(processes), self._folder, lowlatency=quick)
+        self.bus = {role: replace(bus[name], router=router) for name, roles in processes.items() for role in roles}
         """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
-        endpoints = {role: options.listen[0] for role, options in bus.items()}
+        endpoints = {role: options.listen[0] for role, options in self.bus.items()}
         if secure is not None:
-            self.bus = {role: secure.options(role) for role in bus}
-            endpoints = dict.fromkeys(bus, secure.endpoint)
+            self.bus = {role: secure.options(role) for role in self.bus}
+            endpoints = dict.fromkeys(self.bus, secure.endpoint)
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
         self._announcement = Announcement(
             Run(
@@ -167,6 +185,8 @@ class LocalProcesses:
         )
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, Child] = {}
+        """By role; those that share a process have the same."""
+        self._log_files: dict[str, Path] = {}
         self._ends: dict[str, str] = {}
 
     def _apart(self, file: Path) -> Path:
@@ -189,19 +209,35 @@ class LocalProcesses:
             **self.bus[process.role].to_env(),
         }
 
-    def start(self, process: ServiceProcess) -> None:
-        """Starts a service."""
-        self._ends.pop(process.role, None)
-        environment = {**os.environ, **self.environment(process)}
-        path = self._out / "logs" / f"{process.role}.log"
+    def start(self, *processes: ServiceProcess) -> None:
+        """Starts a service, or several that share a process. Raises PlacementError for a program that cannot share one."""
+        roles = [process.role for process in processes]
+        for role in roles:
+            self._ends.pop(role, None)
+        command, given = processes[0].command, self.environment(processes[0])
+        if len(processes) > 1:
+            command, given = self._group(processes)
+        path = self._out / "logs" / f"{'+'.join(roles)}.log"
+        self._log_files |= dict.fromkeys(roles, path)
+        self.running |= dict.fromkeys(roles, self._started(command, {**os.environ, **given}, path))
+
+    def _group(self, processes: Sequence[ServiceProcess]) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Command and environment of services that share a process: what they do not have in common goes with each."""
+        environments = {process.role: self.environment(process) for process in processes}
+        common = dict(set.intersection(*(set(environment.items()) for environment in environments.values())))
+        members = {}
+        for process in processes:
+            own = dict(environments[process.role].items() - common.items())
+            members[process.role] = GroupMember(process.shared_words(), own)
+        return group_command(self._folder / f"{processes[0].role}.json", members), common
+
+    def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> Child:
         if self._forks is not None:
-            self.running[process.role] = self._forks.start(process.command, environment, path)
-            return
+            return self._forks.start(command, environment, path)
         log = path.open("wb")
         self._logs.append(log)
-        command = [sys.executable if process.command[0] == "python" else process.command[0], *process.command[1:]]
-        self.running[process.role] = subprocess.Popen(
-            command,
+        return subprocess.Popen(
+            [sys.executable if command[0] == "python" else command[0], *command[1:]],
             env=environment,
             stdout=log,
             stderr=subprocess.STDOUT,
@@ -212,13 +248,13 @@ class LocalProcesses:
         """How each process that has ended did so, by role: by a signal, or with a status and the last line of its log."""
         for role, child in self.running.items():
             if role not in self._ends and (code := child.poll()) is not None:
-                self._ends[role] = how(code, self._out / "logs" / f"{role}.log")
+                self._ends[role] = how(code, self._log_files[role])
         return dict(self._ends)
 
     def stop(self, patience_s: float = 5.0) -> None:
         """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets."""
         for send in (None, signal.SIGTERM, signal.SIGKILL):
-            left = [child for child in self.running.values() if child.poll() is None]
+            left = [child for child in dict.fromkeys(self.running.values()) if child.poll() is None]
             deadline = monotonic() + patience_s
             for child in left:
                 if send is not None:

@@ -13,6 +13,7 @@ import pytest
 
 from palpate.run import composed
 from palpate.run.forks import Forks
+from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, WORKERS, write_scenario_files
 from palpate_bus.contract import contract
@@ -62,7 +63,7 @@ def distributed(scenario: Scenario, out: Path, leak: Callable[[Scenario, dict[st
     if leak is not None:
         leak(scenario, files)
     witness = Witness()
-    local = LocalProcesses(ROLES, out, files, Timing(), record=True, forks=cast("Forks", witness))
+    local = LocalProcesses(apart(ROLES), out, files, Timing(), record=True, forks=cast("Forks", witness))
     try:
         for process in read_processes(compose_file(), ROLES).values():
             local.start(process)

@@ -60,7 +60,7 @@ class Run:
         if self.keys is not None:
             router = next(iter(self.endpoints.values()))
             return BusOptions(mode="client", router=router, tls=Path(self.keys) / member, shared_memory=False)
-        return BusOptions(connect=tuple(self.endpoints.values()), router=self.router)
+        return BusOptions(connect=tuple(dict.fromkeys(self.endpoints.values())), router=self.router)
 
 
 class Announcement:

@@ -1,18 +1,15 @@
-"""Composed lockstep: all services in one process, in the order and with the messages of distributed lockstep.
-
-Every message is encoded once, since the run hash covers its bytes, and decoded by the first reader that looks at it.
-"""
+"""Composed lockstep: all services in one process and no transport: one group that waits for nobody (see `group`)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from math import lcm
 from typing import Any
 
-from palpate_bus.contract import MS, Contract, Topic, contract
+from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.runtime.failure import described
-from palpate_bus.runtime.lockstep import OutputPort, Received, Sent, Stepper, run_hash
+from palpate_bus.runtime.group import Group
+from palpate_bus.runtime.lockstep import Sent, Stepper, run_hash
 from palpate_bus.service import Service
 
 Tap = Callable[[Topic, bytes, int, int], None]
@@ -44,19 +41,9 @@ class Composed:
     """
 
     def __init__(self, services: Sequence[Service], rules: Contract | None = None, taps: Sequence[Tap] = ()) -> None:
-        self.contract = rules or contract()
-        by_role = {service.role: service for service in services}
-        order = self.contract.step_order(tuple(role for role in self.contract.roles if role in by_role))
-        workers = [role for role in order if not self.contract.roles[role].observer]
-        observers = [role for role in order if self.contract.roles[role].observer]
-        self.steppers = {role: Stepper(by_role[role], self.contract) for role in (*workers, *observers)}
+        self._group = Group(services, rules or contract())
+        self.steppers = self._group.steppers
         self._taps = tuple(taps)
-        self._readers: dict[OutputPort, tuple[Callable[[Received], None], ...]] = {
-            port: tuple(stepper.buffers[name].deliver for stepper in self.steppers.values() if name in stepper.buffers)
-            for sender in self.steppers.values()
-            for name, port in sender.ports.items()
-        }
-        self._schedule = _schedule(tuple(self.steppers.values()))
         self._started = False
         self.t = 0
         self.lost: dict[str, int] = {}
@@ -65,17 +52,14 @@ class Composed:
         """A sentence for each."""
 
     def _send(self, sent: Sequence[Sent], t: int) -> None:
-        for port, payload, sequence in sent:
-            if readers := self._readers[port]:
-                received = Received(payload, t, sequence)
-                for deliver in readers:
-                    deliver(received)
-            for tap in self._taps:
-                try:
+        self._group.deliver(sent, t)
+        for tap in self._taps:
+            try:
+                for port, payload, sequence in sent:
                     tap(port.topic, payload, t, sequence)
-                except Exception as error:
-                    self._taps = tuple(other for other in self._taps if other is not tap)
-                    self._leave_out("recorder", t, f"{type(error).__name__}: {error}")
+            except Exception as error:
+                self._taps = tuple(other for other in self._taps if other is not tap)
+                self._leave_out("recorder", t, f"{type(error).__name__}: {error}")
 
     def start(self) -> None:
         """Sends the latched messages."""
@@ -87,20 +71,20 @@ class Composed:
         self._started = True
 
     def tick(self) -> None:
-        """Steps every service whose tick this is, then advances simulated time by a millisecond."""
+        """Steps every service whose tick this is, then advances simulated time to the next."""
         t = self.t
-        for stepper in self._schedule[t // MS % len(self._schedule)]:
+        for stepper in self._group.due(t):
             try:
                 sent = stepper.step(t)
             except Exception as error:
                 if not stepper.role.observer or stepper.role.name == CONDUCTOR:
                     raise ServiceFailed(stepper, t, error) from error
                 self._leave_out(stepper.role.name, t, described(error, stepper.buffers.values()))
-                self._schedule = _schedule(tuple(one for role, one in self.steppers.items() if role not in self.lost))
+                self._group.leave_out(frozenset(self.lost))
                 continue
             if sent:
                 self._send(sent, t)
-        self.t = t + MS
+        self.t = t + self._group.period
 
     def _leave_out(self, role: str, t: int, why: str) -> None:
         self.lost[role] = t
@@ -116,7 +100,7 @@ class Composed:
             decided = end()
             if decided is not None:
                 last = min(decided, limit)
-        return self.t - MS
+        return self.t - self._group.period
 
     def finish(self) -> dict[str, Mapping[str, Any]]:
         """Finishes every service; returns what each reports. One that has failed need not."""
@@ -132,13 +116,4 @@ class Composed:
 
     def digests(self) -> dict[str, str]:
         """Digest of each hashed topic."""
-        digests: dict[str, str] = {}
-        for stepper in self.steppers.values():
-            digests.update(stepper.digests())
-        return digests
-
-
-def _schedule(steppers: Sequence[Stepper]) -> tuple[tuple[Stepper, ...], ...]:
-    """The services that step at each tick of one cycle; every cycle is the same."""
-    cycle = lcm(*(stepper.role.period // MS for stepper in steppers))
-    return tuple(tuple(one for one in steppers if not tick * MS % one.role.period) for tick in range(cycle))
+        return self._group.digests()

@@ -33,7 +33,7 @@ class Member:
         self.rules = rules
         self.domain = domain
         self.graph = GraphWatch(session, domain)
-        self._tokens = NodeTokens(session, role, domain)
+        self._tokens = NodeTokens(session, role, domain, self.transport.ids)
         self._said: set[str] = set()
         self._checked = 0.0
         self._changed = False

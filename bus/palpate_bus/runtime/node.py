@@ -1,59 +1,85 @@
-"""What one service in a process of its own goes through, whatever clock drives it: join, start, step, report, leave."""
+"""What the services of a process go through, whatever clock drives them: join, start, step, report, leave."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Final
+from typing import Any
 
 from palpate_bus.messages import RunControl, ServiceReport
-from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
+from palpate_bus.runtime.conductor_link import POLL_S, ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.failure import described
-from palpate_bus.runtime.lockstep import NEVER, Stepper
+from palpate_bus.runtime.lockstep import NEVER, Sent, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.output import ServiceOutput
-from palpate_bus.service import Service
 
-POLL_S: Final = 0.05
-"""How often a waiting node looks for messages of the conductor."""
+
+class Seat:
+    """A service's place in a node: what steps it, what it sends and reports by, and how far it is."""
+
+    def __init__(self, stepper: Stepper, member: Member) -> None:
+        self.stepper = stepper
+        self.service = stepper.service
+        self.role = stepper.role.name
+        self.output = ServiceOutput(member)
+        self.reports = Reports(member)
+        self.tick = NEVER
+        """The last tick that was stepped [ns]."""
+
+    def progress(self, waiting_for: str = "") -> None:
+        """Reports progress if the last report is old enough."""
+        self.reports.progress(self.tick, waiting_for)
+
+    def finish(self, counts: Mapping[str, Any]) -> None:
+        """Closes the service and reports its end; `counts` is what the node has counted for it."""
+        self.output.flush(self.tick)
+        facts = dict(self.service.finish())
+        detail = {"blame": self.stepper.blame.per_step_us(), "facts": facts, **counts}
+        self.reports.say(ServiceReport.FINISHED, self.tick, detail=detail)
+
+    def fail(self, why: str) -> None:
+        """Reports a failure and closes the service, whatever else goes wrong."""
+        with suppress(Exception):
+            self.output.flush(self.tick)  # what others have heard belongs in the recording
+        self.reports.say(ServiceReport.FAILED, self.tick, detail={"error": why})
+        with suppress(Exception):
+            self.service.finish()  # what it has open is closed
 
 
 class Node(ABC):
-    """One service on the bus."""
+    """The services of a process on the bus."""
 
-    def __init__(self, service: Service, member: Member, strict: bool) -> None:
-        """`strict`: whether inputs have to come without a gap, see `Stepper`."""
-        self._service = service
-        self._stepper = Stepper(service, member.rules, strict)
-        self._now = member.transport.now
+    def __init__(self, seats: Sequence[Seat], member: Member) -> None:
+        """`member` hears the conductor for all of them."""
+        self._seats = tuple(seats)
         self._link = ConductorLink(member)
-        self._output = ServiceOutput(member)
-        self._tick = NEVER
-        """The last tick that was stepped [ns]."""
+        self._acting = self._seats[0]
+        """Whose turn it is."""
 
     def run(self) -> None:
-        """Runs the service to the end of the run. Raises what the service raises, after reporting it, or RunAborted."""
+        """Runs the services to the end of the run. Raises what a service raises, after reporting it, or RunAborted."""
         try:
             self._join()
-            latched = self._stepper.start()
-            self._output.send(latched)
-            self._output.record(latched, 0)
+            for seat in self._seats:
+                self._acting = seat
+                latched = seat.stepper.start()
+                self._send(seat, latched, 0)
+                seat.output.record(latched, 0)
             self._loop()
-            self._output.flush(self._tick)
-            facts = dict(self._service.finish())
-            detail = {"blame": self._stepper.blame.per_step_us(), "facts": facts, **self._counts()}
-            self._link.report(ServiceReport.FINISHED, self._tick, detail=detail)
+            for seat in self._seats:
+                self._acting = seat
+                seat.finish(self._counts(seat))
             self._await_end()
         except RunAborted:
-            self._service.finish()
+            for seat in self._seats:
+                seat.service.finish()
             raise
         except Exception as error:
-            with suppress(Exception):
-                self._output.flush(self._tick)  # what others have heard belongs in the recording
-            words = described(error, self._stepper.buffers.values())
-            self._link.report(ServiceReport.FAILED, self._tick, detail={"error": words})
-            with suppress(Exception):
-                self._service.finish()  # what it has open is closed
+            culprit = self._acting
+            why = described(error, culprit.stepper.buffers.values())
+            for seat in self._seats:
+                seat.fail(why if len(self._seats) == 1 else f"{culprit.role}: {why}")
             raise
 
     @abstractmethod
@@ -62,11 +88,15 @@ class Node(ABC):
 
     @abstractmethod
     def _loop(self) -> None:
-        """Steps the service until the run ends."""
+        """Steps the services until the run ends."""
 
     @abstractmethod
-    def _counts(self) -> dict[str, Any]:
-        """What the node has counted and computed about its messages, for the conductor."""
+    def _send(self, seat: Seat, sent: Sequence[Sent], t: int) -> None:
+        """Sends what a service gave out at `t` [ns]."""
+
+    @abstractmethod
+    def _counts(self, seat: Seat) -> dict[str, Any]:
+        """What the node has counted and computed about a service's messages, for the conductor."""
 
     def _await_end(self) -> None:
         """Waits for the conductor's receipt."""

@@ -13,7 +13,7 @@ import zenoh
 
 from palpate_bus.contract import Topic
 from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
+from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Received, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.service import Service
@@ -128,6 +128,7 @@ class ObserverNode:
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
         self._link = ConductorLink(member)
+        self._reports = Reports(member)
         self._observed = ObservedService(service, member)
 
     def run(self) -> None:
@@ -140,7 +141,7 @@ class ObserverNode:
                 if message is None:
                     if not busy:
                         sleep(IDLE_S)
-                    self._link.progress(observed.now)
+                    self._reports.progress(observed.now)
                 elif message.command == RunControl.HELLO:
                     self._hello()
                 elif message.command == RunControl.LOST:
@@ -156,10 +157,10 @@ class ObserverNode:
             raise
         facts = dict(self._service.finish())
         detail = {"blame": observed.stepper.blame.per_step_us(), "facts": facts, **observed.counters()}
-        self._link.report(ServiceReport.FINISHED, observed.now, detail=detail)
+        self._reports.say(ServiceReport.FINISHED, observed.now, detail=detail)
 
     def _hello(self) -> None:
         for publisher in self._observed.publishers.values():
             publisher.hello()
         self._observed.drain_and_step()
-        self._link.report(ServiceReport.READY, NEVER, detail={"missing": []})
+        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": []})

@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 from palpate_bus.contract import Topic
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import nanoseconds
-from palpate_bus.runtime.conductor_link import ConductorLink, RunAborted
+from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
@@ -44,6 +44,7 @@ class RecorderNode:
         self._recorder: RawRecorder = service
         self._topics = member.rules.topics
         self._link = ConductorLink(member)
+        self._reports = Reports(member)
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
@@ -70,11 +71,11 @@ class RecorderNode:
                 if message is None:
                     if not busy:
                         sleep(IDLE_S)
-                    self._link.progress(self.covered)
+                    self._reports.progress(self.covered)
                 elif message.command == RunControl.HELLO:
                     self._drain()
                     missing = [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.heard]
-                    self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
+                    self._reports.say(ServiceReport.READY, NEVER, detail={"missing": missing})
                 elif message.command == RunControl.LOST:
                     self._lost.add(message.role)
                 elif message.command == RunControl.HANDOVER and message.role in self._chunks:
@@ -93,7 +94,7 @@ class RecorderNode:
             "messages": self._messages,
             "garbage": self._garbage + sum(chunk.garbage for chunk in self._chunks.values()),
         }
-        self._link.report(ServiceReport.FINISHED, max(self._covered.values()), detail=detail)
+        self._reports.say(ServiceReport.FINISHED, max(self._covered.values()), detail=detail)
 
     def _drain(self) -> bool:
         busy = False

@@ -9,7 +9,7 @@ helps nobody and stamps must stay on the common clock. No service waits for anot
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
 
@@ -18,9 +18,9 @@ from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.latency import LatencyHistogram
-from palpate_bus.runtime.lockstep import NEVER, Received, Sent
+from palpate_bus.runtime.lockstep import NEVER, Received, Sent, Stepper
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.node import Node
+from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.priority import by_period, give_way
 from palpate_bus.service import Service
 
@@ -48,7 +48,10 @@ class WallClockNode(Node):
     """One service on its own timer."""
 
     def __init__(self, service: Service, member: Member) -> None:
-        super().__init__(service, member, strict=False)
+        self._stepper = Stepper(service, member.rules, strict=False)
+        self._seat = Seat(self._stepper, member)
+        super().__init__((self._seat,), member)
+        self._now = member.transport.now
         self._data = {
             name: member.subscription(buffer.topic, history=buffer.topic.latched)
             for name, buffer in self._stepper.buffers.items()
@@ -78,11 +81,11 @@ class WallClockNode(Node):
             if message is None:
                 continue
             if message.command == RunControl.HELLO:
-                self._output.hello()
+                self._seat.output.hello()
                 missing = [
                     name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
                 ]
-                self._link.report(ServiceReport.READY, NEVER, detail={"missing": missing})
+                self._seat.reports.say(ServiceReport.READY, NEVER, detail={"missing": missing})
             elif message.command == RunControl.GRANT and message.last:
                 raise RunAborted("the run is already ending")
             elif message.command == RunControl.GRANT:
@@ -104,7 +107,7 @@ class WallClockNode(Node):
     def _loop(self) -> None:
         epoch = self._epoch
         period = self._stepper.role.period
-        catch_up = CATCH_UP if self._stepper.role.critical and self._service.catches_up else period
+        catch_up = CATCH_UP if self._stepper.role.critical and self._seat.service.catches_up else period
         t = self._await_inputs(epoch)
         while self._end is None or t <= self._end:
             due = epoch + t
@@ -120,14 +123,14 @@ class WallClockNode(Node):
             everything: list[Sent] = []
             for sent in self._stepper.parts(t):
                 start = perf_counter_ns()
-                self._output.send(sent)
+                self._send(self._seat, sent, t)
                 self._stepper.blame.send += perf_counter_ns() - start
                 everything += sent
-            self._output.record(everything, t)
-            self._tick = t
+            self._seat.output.record(everything, t)
+            self._seat.tick = t
             while (message := self._link.poll()) is not None:
                 self._obey(message)
-            self._link.progress(t)
+            self._seat.progress()
             t += period
 
     def _await_inputs(self, epoch: int) -> int:
@@ -166,7 +169,10 @@ class WallClockNode(Node):
                     continue
                 buffer.deliver(received)
 
-    def _counts(self) -> dict[str, Any]:
+    def _send(self, seat: Seat, sent: Sequence[Sent], t: int) -> None:
+        seat.output.send(sent)
+
+    def _counts(self, seat: Seat) -> dict[str, Any]:
         return {
             "digests": {},
             "garbage": sum(s.garbage for s in self._data.values()) + self._link.garbage,

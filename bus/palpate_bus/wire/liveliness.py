@@ -13,7 +13,7 @@ and `qos.cpp`; the numbers of the policies are those of ros2/rmw, `rmw/types.h`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import count
@@ -134,10 +134,12 @@ class NodeTokens:
     Keep it as long as the role lives. `undeclare` withdraws all of them; the process's end does so too.
     """
 
-    def __init__(self, session: zenoh.Session, role: str, domain: int) -> None:
+    def __init__(self, session: zenoh.Session, role: str, domain: int, ids: Iterator[int] | None = None) -> None:
+        """`ids` number the entities of the session, where it has more nodes than this one."""
         self._liveliness = session.liveliness()
-        self._ids = count(1)
-        self.node = Entity(domain, str(session.zid()), 0, 0, EntityKind.NODE, role)
+        self._ids = count() if ids is None else ids
+        number = next(self._ids)
+        self.node = Entity(domain, str(session.zid()), number, number, EntityKind.NODE, role)
         self._tokens: list[Any] = [self._liveliness.declare_token(self.node.token)]
 
     def publisher(self, topic: Topic, qos: Qos) -> bytes:

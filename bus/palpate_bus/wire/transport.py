@@ -6,6 +6,7 @@ No callback computes: a received sample goes into a queue of its own, which the 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import count
 from queue import Empty, SimpleQueue
 from time import time_ns
 from typing import Any, NamedTuple, Protocol
@@ -144,13 +145,15 @@ class Subscription:
 
 
 class Transport:
-    """A member's way onto the bus: its publishers, its subscriptions and its wall clock.
+    """The members' way onto the bus by one session: their publishers, their subscriptions and their wall clock.
 
     The runtimes are given theirs, so that a test can hand them one that loses, changes or delays messages.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
+        self.ids = count()
+        """Numbers of the entities that members declare."""
 
     def now(self) -> int:
         """The wall time [ns]."""

@@ -67,6 +67,8 @@ class Conductor:
         self._reports = {
             role: member.internal_subscription(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport") for role in roles
         }
+        self._beside = {role: (role,) for role in roles}
+        """By role, who shares its process, itself included."""
         self._sequence = 0
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = RunOutcome()
@@ -164,10 +166,13 @@ class Conductor:
                     raise RunFailed(f"{role} failed at start: {detail.get('error')}")
                 if message.state != ServiceReport.READY:
                     continue
+                self._beside[role] = tuple(detail.get("process", (role,)))
                 ready[role] = [name for name in detail.get("missing", []) if not self._absent(name)]
-            for role, how in died().items():
-                self.abort(f"{role} died at start")
-                raise RunFailed(f"{role} died at start: {how}")
+            if dead := died():
+                how = next(iter(dead.values()))
+                who = ", ".join(role for role, end in dead.items() if end == how)
+                self.abort(f"{who} died at start")
+                raise RunFailed(f"{who} died at start: {how}")
             if not ours <= ready.keys():
                 met = monotonic()
             waits_for_others = bool(self._patience.absent) and ours <= ready.keys()
@@ -251,21 +256,25 @@ class Conductor:
         self.outcome.trouble.append(sentence)
 
     def _lose(self, role: str, how: str) -> None:
-        """Marks a role lost at its last reported tick, and lets the others react."""
+        """Marks a role and all that share its process lost at their last reported tick, and lets the others react."""
         if role in self.outcome.lost:
             return
-        tick = max(self.watchdog.progress[role].tick, 0)
-        row = self._rules.roles[role]
-        self.outcome.lost[role] = tick
-        sentence = f"{role} lost at tick {tick / 1e9:.3f} s: {how}"
-        self.outcome.trouble.append(sentence)
-        if row.observer:
+        lost = self._beside[role]
+        sentences = []
+        for one in lost:
+            tick = max(self.watchdog.progress[one].tick, 0)
+            self.outcome.lost[one] = tick
+            sentences.append(f"{one} lost at tick {tick / NS:.3f} s: {how}")
+        self.outcome.trouble += sentences
+        sentence = "; ".join(sentences)
+        if self._rules.roles[role].observer:
             log.warning("%s; the run goes on", sentence)
             return
         self.outcome.failure = self.outcome.failure or sentence
-        if row.critical:
+        if any(self._rules.roles[one].critical for one in lost):
             raise RunFailed(sentence)
-        self._say(RunControl.LOST, tick, role=role, reason=how)
+        for one in lost:
+            self._say(RunControl.LOST, self.outcome.lost[one], role=one, reason=how)
         reached = max(progress.tick for progress in self.watchdog.progress.values())
         self.grants.grant(reached - reached % MS + AFTER_LOSS, last=True)
 
