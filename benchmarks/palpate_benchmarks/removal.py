@@ -26,6 +26,7 @@ from palpate.run.composed import load_services
 from palpate.run.roles import WORKERS
 from palpate_bus.contract import MS
 from palpate_bus.messages import codec
+from palpate_bus.messages.struct_codecs import STRUCT_CODECS
 from palpate_bus.runtime.composed import Composed
 from palpate_conductor.collector import Collector
 from palpate_conductor.tree import FrameTree
@@ -39,7 +40,6 @@ MODULES: dict[str, tuple[str, ...]] = {
     "driver's limits": ("palpate_robot.driver",),
     "arm's kinematics": ("palpate_robot.backends.dart.kinematics",),
     "tissue's step": ("palpate_tissue.backends.winkler.kernel", "palpate_tissue.friction"),
-    "rest point under the indenter": ("palpate_tissue.surface",),
     "path and its splines": ("palpate_planning.path", "palpate_planning.poses", "palpate_planning.compiled_splines"),
     "perceived surface": ("palpate_planning.surface", "palpate_planning.compiled_splines"),
     "nearest vertex": ("palpate_models.nearest",),
@@ -90,7 +90,7 @@ def measure(scenario: Scenario) -> dict[str, list[float]]:
     tree = FrameTree(exam_input(scenario))
     run = Composed([*load_services(scenario, WORKERS), collector := Collector(tree=tree)])
     removals: dict[str, Callable[[], Any]] = {name: partial(_interpreted, modules) for name, modules in MODULES.items()}
-    removals |= {kind: partial(_by_rosbags, run, kind) for kind in codec.OWN_CODECS}
+    removals |= {kind: partial(_by_rosbags, run, kind) for kind in STRUCT_CODECS}
     run.start()
 
     def slot() -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import Checker
 from palpate_bus.messages import Duration, ImpedanceSetpoint
 from palpate_bus.messages.geometry import Array, pose_message, rotation, twist, twist_message, vector, wrench, wrench_message
@@ -100,4 +100,4 @@ def _checker() -> Checker:
 
 @cache
 def _validity() -> Duration:
-    return duration_message((contract().topics[TOPIC].expiry_ms or 0) * MS)
+    return duration_message(contract().topics[TOPIC].expiry)

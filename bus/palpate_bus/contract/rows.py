@@ -103,6 +103,22 @@ class Topic(_Row):
         return self.period_ms * MS
 
     @property
+    def max_age(self) -> int:
+        """Age [ns] from which the newest message is stale. Raises ValueError if the contract gives none."""
+        return self._given("max_age_ms") * MS
+
+    @property
+    def expiry(self) -> int:
+        """Time [ns] after its stamp at which a message expires. Raises ValueError if the contract gives none."""
+        return self._given("expiry_ms") * MS
+
+    def _given(self, field: str) -> int:
+        value: int | None = getattr(self, field)
+        if value is None:
+            raise ValueError(f"contract.yaml: topic {self.name} has no {field}")
+        return value
+
+    @property
     def periodic(self) -> bool:
         """Whether the topic carries exactly one message on each of its ticks, and so is its own advance."""
         return not (self.event or self.latched)

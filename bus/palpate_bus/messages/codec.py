@@ -1,7 +1,6 @@
 """ROS 2 messages to and from little-endian CDR with its four-byte encapsulation header.
 
-The types of the control loop and the states of the examination have codecs of their own (`struct_codecs`, `exam_codecs`); rosbags
-does the rest. The bytes are the same.
+The types of the 1 kHz topics have codecs of their own (`struct_codecs`); rosbags does the rest. The bytes are the same.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from rosbags.interfaces import Nodetype
 
 from palpate_bus.messages.arrays import array_dtype, fitted
 from palpate_bus.messages.cdr import ENCAPSULATION
-from palpate_bus.messages.exam_codecs import EXAM_CODECS
 from palpate_bus.messages.struct_codecs import STRUCT_CODECS
 from palpate_bus.messages.typestore import CodecError, message_type, palpation_definitions, store, type_hash
 
@@ -34,9 +32,6 @@ __all__ = [
 ]
 
 _LITTLE_ENDIAN = ENCAPSULATION[:2]
-OWN_CODECS = STRUCT_CODECS | EXAM_CODECS
-"""By message type."""
-
 Message = Any
 """A message of any class. Where the class is known, `palpate_bus.messages` has it with its fields."""
 
@@ -55,7 +50,7 @@ def decode(payload: bytes | memoryview, name: str) -> Message:
 def encoder(name: str) -> Callable[[Message], bytes]:
     """`encode` for one type, for hot paths."""
     message_type(name)
-    own = OWN_CODECS.get(name)
+    own = STRUCT_CODECS.get(name)
     encode_message = own.encode if own else _rosbags_encoder(name)
 
     def encode(message: Message) -> bytes:
@@ -71,7 +66,7 @@ def encoder(name: str) -> Callable[[Message], bytes]:
 def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
     """`decode` for one type, for hot paths."""
     message_type(name)
-    own = OWN_CODECS.get(name)
+    own = STRUCT_CODECS.get(name)
 
     def decode(payload: bytes | memoryview) -> Message:
         try:

@@ -1,9 +1,7 @@
 """Little-endian CDR of the messages of the control loop, written out with `struct`. `codec` uses rosbags for all others.
 
-These are the types of the 1 kHz topics, and the two of the 100 Hz topics that cost rosbags most: set-point and robot status.
-
-All these messages begin with a header, whose `frame_id` has any length, so that what follows it is aligned anew and then has a
-fixed layout.
+These are the types of the 1 kHz topics. All of them begin with a header, whose `frame_id` has any length, so that what follows it
+is aligned anew and then has a fixed layout.
 
 The encoders raise whatever goes wrong with a field, the decoders whatever goes wrong with the bytes; `codec` makes it a
 CodecError. A decoder returns the message and the position of its end.
@@ -19,13 +17,11 @@ from numpy.typing import NDArray
 
 from palpate_bus.messages import (
     Duration,
-    ImpedanceSetpoint,
     JointState,
     JointTorqueCommand,
     Point,
     Pose,
     Quaternion,
-    RobotStatus,
     ToolState,
     Twist,
     Vector3,
@@ -37,13 +33,10 @@ from palpate_bus.messages.cdr import LENGTH, StructCodec, pack_header, pack_text
 
 _FLOAT64 = np.dtype(np.float64)
 
-_BYTE = Struct("<B")
 _WRENCH = Struct("<6d")  # force, torque
 _TOOL = Struct("<3d4d6dd")  # position, orientation, twist, radius
 _COMMAND = Struct("<56siII")  # torques, seconds and nanoseconds of valid_for, length of problem with its NUL
-_SETPOINT = Struct("<3d4d6d6d48s48s56s56s56siI")  # pose, twist, wrench, gains [6] x 2, joints [7] x 3, valid_for
 _JOINTS = {gap: Struct(f"<I{gap}x56sI4x56sI4x56s") for gap in (0, 4)}  # position, velocity, effort of seven joints
-_STATUS = Struct("<56s56s6d56sI")  # position, velocity, wrench, applied torque, commands rejected
 
 
 def encode_wrench_stamped(message: WrenchStamped) -> bytes:
@@ -171,90 +164,9 @@ def _read_array(data: bytes, start: int) -> tuple[NDArray[np.float64], int]:
     return np.frombuffer(data, _FLOAT64, count, begin), begin + 8 * count
 
 
-def encode_impedance_setpoint(message: ImpedanceSetpoint) -> bytes:
-    """`palpation_msgs/ImpedanceSetpoint`."""
-    data = pack_header(message.header, 1) + _BYTE.pack(message.mode)
-    p, q = message.pose.position, message.pose.orientation
-    v, w = message.twist.linear, message.twist.angular
-    force, torque = message.wrench.force, message.wrench.torque
-    return data + bytes(padding(len(data), 8)) + _SETPOINT.pack(
-        p.x, p.y, p.z, q.x, q.y, q.z, q.w,
-        v.x, v.y, v.z, w.x, w.y, w.z,
-        force.x, force.y, force.z, torque.x, torque.y, torque.z,
-        fitted(message.stiffness, _FLOAT64, 6, "stiffness").tobytes(),
-        fitted(message.damping_ratio, _FLOAT64, 6, "damping_ratio").tobytes(),
-        fitted(message.joint_position, _FLOAT64, 7, "joint_position").tobytes(),
-        fitted(message.joint_velocity, _FLOAT64, 7, "joint_velocity").tobytes(),
-        fitted(message.joint_stiffness, _FLOAT64, 7, "joint_stiffness").tobytes(),
-        message.valid_for.sec, message.valid_for.nanosec,
-    )  # fmt: skip
-
-
-def decode_impedance_setpoint(data: bytes) -> tuple[ImpedanceSetpoint, int]:
-    """`palpation_msgs/ImpedanceSetpoint`."""
-    header, place = read_header(data, 1)
-    (mode,) = _BYTE.unpack_from(data, place)
-    start = place + _BYTE.size + padding(place + _BYTE.size, 8)
-    (
-        px, py, pz, qx, qy, qz, qw, vx, vy, vz, wx, wy, wz, fx, fy, fz, tx, ty, tz,
-        stiffness, damping_ratio, position, velocity, joint_stiffness, sec, nanosec,
-    ) = _SETPOINT.unpack_from(data, start)  # fmt: skip
-    message = ImpedanceSetpoint(
-        header,
-        mode,
-        Pose(Point(px, py, pz), Quaternion(qx, qy, qz, qw)),
-        Twist(Vector3(vx, vy, vz), Vector3(wx, wy, wz)),
-        Wrench(Vector3(fx, fy, fz), Vector3(tx, ty, tz)),
-        np.frombuffer(stiffness),
-        np.frombuffer(damping_ratio),
-        np.frombuffer(position),
-        np.frombuffer(velocity),
-        np.frombuffer(joint_stiffness),
-        Duration(sec, nanosec),
-    )
-    return message, start + _SETPOINT.size
-
-
-def encode_robot_status(message: RobotStatus) -> bytes:
-    """`palpation_msgs/RobotStatus`."""
-    data = pack_header(message.header, 1) + _BYTE.pack(message.mode) + _BYTE.pack(message.cause)
-    data += bytes(padding(len(data), 4)) + pack_text(message.reason)
-    force, torque = message.wrench.force, message.wrench.torque
-    return data + bytes(padding(len(data), 8)) + _STATUS.pack(
-        fitted(message.position, _FLOAT64, 7, "position").tobytes(),
-        fitted(message.velocity, _FLOAT64, 7, "velocity").tobytes(),
-        force.x, force.y, force.z, torque.x, torque.y, torque.z,
-        fitted(message.applied_torque, _FLOAT64, 7, "applied_torque").tobytes(),
-        message.commands_rejected,
-    )  # fmt: skip
-
-
-def decode_robot_status(data: bytes) -> tuple[RobotStatus, int]:
-    """`palpation_msgs/RobotStatus`."""
-    header, place = read_header(data, 1)
-    (mode,), (cause,) = _BYTE.unpack_from(data, place), _BYTE.unpack_from(data, place + 1)
-    reason, end = read_text(data, place + 2)
-    start = end + padding(end, 8)
-    position, velocity, fx, fy, fz, tx, ty, tz, applied, rejected = _STATUS.unpack_from(data, start)
-    message = RobotStatus(
-        header,
-        mode,
-        cause,
-        reason,
-        np.frombuffer(position),
-        np.frombuffer(velocity),
-        Wrench(Vector3(fx, fy, fz), Vector3(tx, ty, tz)),
-        np.frombuffer(applied),
-        rejected,
-    )
-    return message, start + _STATUS.size
-
-
 STRUCT_CODECS: dict[str, StructCodec] = {
     "geometry_msgs/msg/WrenchStamped": StructCodec(encode_wrench_stamped, decode_wrench_stamped),
-    "palpation_msgs/msg/ImpedanceSetpoint": StructCodec(encode_impedance_setpoint, decode_impedance_setpoint),
     "palpation_msgs/msg/JointTorqueCommand": StructCodec(encode_joint_torque_command, decode_joint_torque_command),
-    "palpation_msgs/msg/RobotStatus": StructCodec(encode_robot_status, decode_robot_status),
     "palpation_msgs/msg/ToolState": StructCodec(encode_tool_state, decode_tool_state),
     "sensor_msgs/msg/JointState": StructCodec(encode_joint_state, decode_joint_state),
 }

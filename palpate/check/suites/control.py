@@ -17,7 +17,7 @@ from palpate_models.frames import Array
 from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
 
 TORQUE = "control/joint_torque"
-VALID = (contract().topics["planning/setpoint"].expiry_ms or 0) * MS
+VALID = contract().topics["planning/setpoint"].expiry
 
 
 def joints(q: Any = lbr.HOME, names: tuple[str, ...] = lbr.JOINT_NAMES) -> Source:

@@ -46,7 +46,7 @@ def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
 def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> Feed:
     """The same with a torque command [N m], shape (7,), on every tick."""
     values = np.asarray(torque, dtype=float)
-    valid_ns = (rig.rules.topics[COMMAND].expiry_ms or 0) * MS
+    valid_ns = rig.rules.topics[COMMAND].expiry
     return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns), "")}
 
 

@@ -43,9 +43,9 @@ class ControlService(Service):
         topics = contract().topics
         self._controller = ImpedanceController(self.model, limits.joint_margin_rad, contract().roles[self.role].period / NS)
         self._reference = Extrapolator(topics[TOPIC].period)
-        self._setpoint_expiry = (topics[TOPIC].expiry_ms or 0) * MS
-        self._joint_states_age = (topics["joint_states"].max_age_ms or 0) * MS
-        self._validity = (topics["control/joint_torque"].expiry_ms or 0) * MS
+        self._setpoint_expiry = topics[TOPIC].expiry
+        self._joint_states_age = topics["joint_states"].max_age
+        self._validity = topics["control/joint_torque"].expiry
         self._valid = duration_message(self._validity)
         self._expired = duration_message(0)
         self._expires: int | None = None

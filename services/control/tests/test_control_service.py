@@ -78,7 +78,7 @@ def test_command_is_what_the_contract_says(rig: Rig) -> None:
     again = codec.decode(codec.encode(command, topic.type), topic.type)
     np.testing.assert_array_equal(again.torque, command.torque)
     assert nanoseconds(command.header.stamp) == rig.t - MS
-    assert valid_for(command) == EXPIRY == (topic.expiry_ms or 0) * MS
+    assert valid_for(command) == EXPIRY == topic.expiry
     low, high = topic.ranges["torque"]
     assert (low <= command.torque).all() and (command.torque <= high).all()
     assert np.abs(command.torque).max() > 1

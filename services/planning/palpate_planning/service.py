@@ -47,7 +47,7 @@ class PlanningService(Service):
         self._X_WA = np.array(known.X_WA)
         _let_the_worker_give_way()
         self._exam = ExamSequence(known, Periods(roles["planning"].period, roles["camera"].period), lockstep=lockstep)
-        self._supervisor_silence = (contract().topics["planning/setpoint"].expiry_ms or 0) * MS
+        self._supervisor_silence = contract().topics["planning/setpoint"].expiry
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
         self._peak_force = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -30,6 +31,20 @@ NO_STIFFNESS: Final = _fixed([0.0] * 7)
 _NO_TWIST: Final = _fixed([0.0] * 6)
 _NO_WRENCH: Final = _fixed([0.0] * 6)
 _JOINTS_AT_REST: Final = _fixed([0.0] * 7)
+_AT_REST: Final = Setpoint(
+    stamp=0,
+    mode=ControlMode.JOINT,
+    R_WD=np.eye(3),
+    p_WD=np.zeros(3),
+    V_WD=_NO_TWIST,
+    F_W=_NO_WRENCH,
+    stiffness=CARTESIAN_STIFFNESS,
+    damping_ratio=DAMPING_RATIO,
+    q=_JOINTS_AT_REST,
+    qd=_JOINTS_AT_REST,
+    joint_stiffness=JOINT_STIFFNESS,
+)
+"""What both kinds have in common."""
 
 
 def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTS_AT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
@@ -37,19 +52,7 @@ def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTS_AT_REST, s
 
     X_WI, shape (4, 4), tells readers of the message where the indenter is; the controller does not use it.
     """
-    return Setpoint(
-        stamp=t,
-        mode=ControlMode.JOINT,
-        R_WD=X_WI[:3, :3],
-        p_WD=X_WI[:3, 3],
-        V_WD=_NO_TWIST,
-        F_W=_NO_WRENCH,
-        stiffness=CARTESIAN_STIFFNESS,
-        damping_ratio=DAMPING_RATIO,
-        q=q,
-        qd=qd,
-        joint_stiffness=stiffness,
-    )
+    return replace(_AT_REST, stamp=t, R_WD=X_WI[:3, :3], p_WD=X_WI[:3, 3], q=q, qd=qd, joint_stiffness=stiffness)
 
 
 def cartesian_setpoint(
@@ -65,16 +68,5 @@ def cartesian_setpoint(
 
     Shapes and units as in `Setpoint`.
     """
-    return Setpoint(
-        stamp=t,
-        mode=ControlMode.CARTESIAN,
-        R_WD=R_WD,
-        p_WD=p_WD,
-        V_WD=V_WD,
-        F_W=F_W,
-        stiffness=CARTESIAN_STIFFNESS,
-        damping_ratio=DAMPING_RATIO,
-        q=q,
-        qd=qd,
-        joint_stiffness=POSTURE_STIFFNESS,
-    )
+    motion = {"R_WD": R_WD, "p_WD": p_WD, "V_WD": V_WD, "F_W": F_W, "q": q, "qd": qd}
+    return replace(_AT_REST, stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=POSTURE_STIFFNESS, **motion)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, World, known
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import (
     Findings,
     OperatorRequest,
@@ -129,7 +129,7 @@ def test_the_first_step_asks_the_arm_for_nothing() -> None:
     out = sent(service.step(0, HandInbox()))
     assert out["planning/setpoint"].mode == ControlMode.JOINT
     assert not np.any(out["planning/setpoint"].joint_stiffness)
-    assert nanoseconds(out["planning/setpoint"].valid_for) == contract().topics["planning/setpoint"].expiry_ms * MS
+    assert nanoseconds(out["planning/setpoint"].valid_for) == contract().topics["planning/setpoint"].expiry
     assert out["exam/state"].phase == Phase.HOME
     assert out["exam/state"].end_tick == -1
 

@@ -9,7 +9,6 @@ warming up, and x(t), which a tare does not take away: an Ornstein-Uhlenbeck pro
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import add
 from typing import Final
 
 import numpy as np
@@ -29,6 +28,7 @@ class FtSensor:
         """A sensor that is switched on at the first reading and read every `period_s` [s]; `rng` makes its noise."""
         given = drawn.given
         self._drawn = drawn
+        self._sensitivity = np.ascontiguousarray(drawn.sensitivity)
         self._deviation = np.repeat((given.noise_n, given.noise_nm), 3)
         self._scale = np.repeat((1.0, MOMENT_PER_FORCE_M), 3)
         self._rng = rng
@@ -39,14 +39,16 @@ class FtSensor:
         self._blocks = 0
         self._wander = given.tare_n * self._scale * self._slow.standard_normal(6)
         self._walk = np.zeros(6)
-        self._errors: list[list[float]] = []
+        self._errors: list[Array] = []
+        """Of readings to come, the last one first, shape (6,) each."""
 
     def read(self, wrench: Sequence[float]) -> list[float]:
         """A reading of the true wrench."""
         if not self._errors:
             errors = self._drift() + self._deviation * self._rng.standard_normal((_BLOCK, 6))
-            self._errors = errors[::-1].tolist()
-        return list(map(add, (self._drawn.sensitivity @ wrench).tolist(), self._errors.pop()))
+            self._errors = list(errors[::-1])
+        reading: list[float] = (self._sensitivity.dot(wrench) + self._errors.pop()).tolist()
+        return reading
 
     def _drift(self) -> Array:
         """All errors of the next block but the white noise, shape (_BLOCK, 6)."""

@@ -8,17 +8,15 @@ from zlib import crc32
 
 import numpy as np
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import (
     Header,
     JointState,
-    OperatorRequest,
     Point,
     Pose,
     Quaternion,
     RobotStatus,
     String,
-    SupervisorState,
     TFMessage,
     Time,
     ToolState,
@@ -41,11 +39,12 @@ from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 from palpate_robot.ft_sensor import FtSensor
 from palpate_robot.joint_sensor import JointSensor
 from palpate_robot.plant import DT, PlantFactory
+from palpate_robot.stop_requests import StopRequests
 
 _TICK = round(DT * NS)
 _STATUS_PERIOD = contract().topics["robot/status"].period
 _LINKS_PERIOD = contract().topics["sim/link_poses"].period
-_CONTACT_AGE = (contract().topics["sim/contact_wrench"].max_age_ms or 0) * MS
+_CONTACT_AGE = contract().topics["sim/contact_wrench"].max_age
 _MOST_STEPS = 50
 """Steps of the plant that one tick may catch up with, in wall-clock mode after an overrun."""
 _NAMES = list(lbr.JOINT_NAMES)
@@ -66,10 +65,10 @@ class RobotService(Service):
         self._sensor = FtSensor(drawn.force, ft_rng, DT)
         self._joints = JointSensor(drawn.arm, joint_rng, self._plant.q, self._plant.gravity_torque())
         self._driver = Driver(known.limits.force_emergency_n)
+        self._stop_requests = StopRequests(self._driver)
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
         self._command: Command | None = None
-        self._releases = 0
         self._command_message: Message | None = None
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
@@ -91,7 +90,7 @@ class RobotService(Service):
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
         """The same: first what control waits for, then what tissue does."""
-        self._obey_operator(t, inbox)
+        self._stop_requests.obey(t, inbox)
         self._drive(t, inbox)
         stamp = Time(t // NS, t % NS)
         yield {"joint_states": self._joint_state(stamp)}
@@ -116,17 +115,6 @@ class RobotService(Service):
             "commands_rejected": driver.rejected,
             "peak_external_force_N": self._peak_force,
         }
-
-    def _obey_operator(self, t: int, inbox: Inbox) -> None:
-        for message in inbox.new("operator/request"):
-            if message.request == OperatorRequest.STOP:
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
-        for message in inbox.new("supervisor/state"):
-            if message.releases != self._releases:
-                self._releases = message.releases
-                self._driver.release(t)
-            if message.level == SupervisorState.LEVEL_EMERGENCY:
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
 
     def _drive(self, t: int, inbox: Inbox) -> None:
         """Driver, then plant, up to `t`. The first tick is the state at the start."""

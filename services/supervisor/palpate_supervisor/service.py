@@ -41,7 +41,7 @@ class SupervisorService(Service):
         self._watch = Watch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
         RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it ahead of any deadline
-        self._max_age = (contract().topics["planning/setpoint"].expiry_ms or 0) * MS
+        self._max_age = contract().topics["planning/setpoint"].expiry
         """Age [ns] at which a topic counts as silent: when set-points expire. Control and driver watch their inputs, faster."""
         self._latch = Latch()
         self._began: int | None = None

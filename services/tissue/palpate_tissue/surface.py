@@ -8,15 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_models.nearest import nearest_vertex
 from palpate_models.phantom import PhantomModel
-from palpate_models.vectors import Vector, add, divide, dot, norm, row, scale, subtract
 
 _FAR_M = 0.15
 """Further away than this, the nearest vertex stands for the nearest point."""
-_NO_FACES: NDArray[np.uint32] = np.empty(0, np.uint32)
 
 
 class RestPoint(NamedTuple):
@@ -32,38 +29,36 @@ class RestPoint(NamedTuple):
     """k_w there [N/m^3]."""
 
 
-class Skin(NamedTuple):
-    """The rest surface: n vertices, m triangles."""
-
-    vertices: Array
-    """[m], shape (n, 3)."""
-    normals: Array
-    """Outward unit normals, shape (n, 3)."""
-    breathing: Array
-    """Share of the breathing excursion, shape (n,)."""
-    stiffness: Array
-    """k_w [N/m^3], shape (n,)."""
-    triangles: NDArray[np.uint32]
-    """Shape (m, 3)."""
-
-
 class SkinSurface:
     """Queries on a phantom's surface."""
 
     def __init__(self, model: PhantomModel) -> None:
-        triangles = model.triangles.astype(np.uint32)
-        self._skin = Skin(model.vertices, model.normals, model.breathing, model.stiffness, triangles)
+        self._model = model
         self._normals = np.ascontiguousarray(model.normals.T)
         self._faces = _incident_faces(model)
         self._gradient = _gradient(model)
-        self.nearest(model.vertices[0].copy())  # compiles it before it has a deadline
+        self.nearest(model.vertices[0].copy())  # compiles the search before it has a deadline
 
     def nearest(self, p: Array, excursion: float = 0.0) -> RestPoint:
-        """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m]."""
-        distance, vertex = nearest_vertex(p, self._skin.vertices)
-        faces = self._faces[vertex] if distance <= _FAR_M else _NO_FACES
-        position, normal, height, stiffness = rest_point(self._skin, faces, vertex, tuple(p.tolist()), excursion)
-        return RestPoint(np.array(position), np.array(normal), height, stiffness)
+        """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m].
+
+        It is interpolated between the corners of the nearest triangle; far away it is the nearest vertex.
+        """
+        model = self._model
+        distance, vertex = nearest_vertex(p, model.vertices)
+        far = distance > _FAR_M
+        corner, weights = np.full(3, vertex), np.array((1.0, 0.0, 0.0))
+        if not far:
+            shifted = p - excursion * model.breathing[vertex] * model.normals[vertex]
+            corners = model.triangles[self._faces[vertex]]
+            squares, barycentric = nearest_on_triangles(shifted, model.vertices[corners])
+            least = squares.argmin()
+            corner, weights = corners[least], barycentric[least]
+        normal = weights @ model.normals[corner]
+        normal /= np.linalg.norm(normal)
+        position = weights @ model.vertices[corner] + excursion * (weights @ model.breathing[corner]) * normal
+        height = np.linalg.norm(p - position) if far else (p - position) @ normal
+        return RestPoint(position, normal, float(height), float(weights @ model.stiffness[corner]))
 
     def normals(self, inward: Array) -> Array:
         """Unit normals of the surface whose vertices have moved `inward` by (n,) [m] along their normals, shape (3, n).
@@ -75,77 +70,39 @@ class SkinSurface:
         return tilted
 
 
-@compiled
-def rest_point(
-    skin: Skin, faces: NDArray[np.uint32], vertex: int, p: Vector, excursion: float
-) -> tuple[Vector, Vector, float, float]:
-    """The point of the `faces` around a `vertex` that is nearest to `p` [m], as the fields of `RestPoint`.
+def nearest_on_triangles(p: Array, corners: Array) -> tuple[Array, Array]:
+    """Square distances [m^2] of `p` from k triangles, shape (k,), and the barycentric coordinates of the nearest points, (k, 3).
 
-    At a breathing excursion [m]. It is interpolated between the corners of its face; without faces it is the vertex itself.
+    The nearest point a + v (b - a) + w (c - a) is p's projection on the plane where that lies inside, else that on a side.
+    `corners` [m], shape (k, 3, 3), has a, b and c of each triangle as rows.
     """
-    corner, weights = (vertex, vertex, vertex), (1.0, 0.0, 0.0)
-    shifted = subtract(p, scale(excursion * skin.breathing[vertex], row(skin.normals, vertex)))
-    least = np.inf
-    for face in faces:
-        a, b, c = skin.triangles[face, 0], skin.triangles[face, 1], skin.triangles[face, 2]
-        square, at = nearest_on_triangle(shifted, row(skin.vertices, a), row(skin.vertices, b), row(skin.vertices, c))
-        if square < least:
-            least, corner, weights = square, (int(a), int(b), int(c)), at
-    normal = _mean(skin.normals, corner, weights)
-    normal = divide(normal, norm(normal))
-    rest = _mean(skin.vertices, corner, weights)
-    breathing = stiffness = 0.0
-    for k in range(3):
-        breathing += weights[k] * skin.breathing[corner[k]]
-        stiffness += weights[k] * skin.stiffness[corner[k]]
-    position = add(rest, scale(excursion * breathing, normal))
-    offset = subtract(p, position)
-    return position, normal, dot(offset, normal) if len(faces) else norm(offset), stiffness
+    a, b, c = corners.swapaxes(0, 1)
+    sides = np.stack((b - a, c - a), axis=1)
+    inside = np.linalg.solve(sides @ sides.swapaxes(1, 2), sides @ (p - a)[:, :, None])[..., 0]
+    v, w = inside.T
+    on_ab, on_ac, on_bc = (_share(p - start, end - start) for start, end in ((a, b), (a, c), (b, c)))
+    none = np.zeros_like(v)
+    candidates = np.array(
+        ((1 - v - w, v, w), (1 - on_ab, on_ab, none), (1 - on_ac, none, on_ac), (none, 1 - on_bc, on_bc))
+    ).transpose(2, 0, 1)  # (k, 4, 3)
+    squares = ((p - candidates @ corners) ** 2).sum(axis=-1)
+    squares[(candidates < 0).any(axis=-1)] = np.inf
+    nearest = squares.argmin(axis=1)
+    each = np.arange(len(corners))
+    return squares[each, nearest], candidates[each, nearest]
 
 
-@compiled
-def nearest_on_triangle(p: Vector, a: Vector, b: Vector, c: Vector) -> tuple[float, Vector]:
-    """Square distance [m^2] of `p` from a triangle, and the barycentric coordinates of its nearest point.
-
-    The point a + v (b - a) + w (c - a) is p's projection on the plane where that lies inside, else the nearest one of a side.
-    """
-    ab, ac, ap = subtract(b, a), subtract(c, a), subtract(p, a)
-    bc = subtract(c, b)
-    g11, g12, g22, r1, r2 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ab, ap), dot(ac, ap)
-    determinant = g11 * g22 - g12 * g12
-    v, w = (g22 * r1 - g12 * r2) / determinant, (g11 * r2 - g12 * r1) / determinant
-    if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
-        return _square_distance(ap, ab, ac, v, w), (1.0 - v - w, v, w)
-    on_ab, on_ac = min(max(r1 / g11, 0.0), 1.0), min(max(r2 / g22, 0.0), 1.0)
-    on_bc = min(max(dot(bc, subtract(p, b)) / dot(bc, bc), 0.0), 1.0)
-    least, best = np.inf, (1.0, 0.0, 0.0)
-    for v, w in ((on_ab, 0.0), (0.0, on_ac), (1.0 - on_bc, on_bc)):
-        square = _square_distance(ap, ab, ac, v, w)
-        if square < least:
-            least, best = square, (1.0 - v - w, v, w)
-    return least, best
+def _share(offset: Array, side: Array) -> Array:
+    """Where points at `offset` [m] from the start of each `side` [m] project on it, as a share of it from 0 to 1, shape (k,)."""
+    return np.clip((offset * side).sum(axis=1) / (side * side).sum(axis=1), 0.0, 1.0)
 
 
-@compiled
-def _square_distance(ap: Vector, ab: Vector, ac: Vector, v: float, w: float) -> float:
-    """|ap - v ab - w ac|^2."""
-    offset = subtract(ap, add(scale(v, ab), scale(w, ac)))
-    return dot(offset, offset)
-
-
-@compiled
-def _mean(table: Array, corner: tuple[int, int, int], weights: Vector) -> Vector:
-    """The rows of three corners, weighted."""
-    mean = add(scale(weights[0], row(table, corner[0])), scale(weights[1], row(table, corner[1])))
-    return add(mean, scale(weights[2], row(table, corner[2])))
-
-
-def _incident_faces(model: PhantomModel) -> list[NDArray[np.uint32]]:
+def _incident_faces(model: PhantomModel) -> list[NDArray[np.intp]]:
     """The triangles at each vertex."""
     corner = model.triangles.ravel()
     order = np.argsort(corner, kind="stable")
     first = np.searchsorted(corner[order], np.arange(1, len(model.vertices)))
-    return np.split((order // 3).astype(np.uint32), first)
+    return np.split(order // 3, first)
 
 
 def _gradient(model: PhantomModel) -> sparse.csr_array:

@@ -19,7 +19,7 @@ from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Exam, Scenario
 from palpate_models.section import Pose as TruePose
 from palpate_tissue.backends.winkler.service import create
-from palpate_tissue.surface import SkinSurface, nearest_on_triangle
+from palpate_tissue.surface import SkinSurface, nearest_on_triangles
 
 LESION = Lesion(centre_m=(-0.02, 0.0))
 
@@ -188,7 +188,7 @@ def test_nearest_rest_point_against_brute_force():
     rng = np.random.default_rng(0)
     corners = model.vertices[model.triangles]
     for p in np.column_stack((rng.uniform(-0.1, 0.1, (40, 2)), rng.uniform(-0.03, 0.05, 40))):
-        brute = np.sqrt(min(nearest_on_triangle(tuple(p), *map(tuple, triangle))[0] for triangle in corners))
+        brute = np.sqrt(nearest_on_triangles(p, corners)[0].min())
         assert abs(surface.nearest(p).height) == pytest.approx(brute, abs=1e-5)
 
 
@@ -199,10 +199,10 @@ def test_nearest_point_of_a_triangle_by_sampling():
     grid = np.column_stack(((1 - v - w)[inside], v[inside], w[inside]))
     for _ in range(200):
         corners, p = rng.normal(size=(3, 3)), 2 * rng.normal(size=3)
-        square, weights = nearest_on_triangle(tuple(p), *map(tuple, corners))
+        (square,), (weights,) = nearest_on_triangles(p, corners[None])
         assert min(weights) >= -1e-12
         assert sum(weights) == pytest.approx(1)
-        distance = np.linalg.norm(np.array(weights) @ corners - p)
+        distance = np.linalg.norm(weights @ corners - p)
         assert distance == pytest.approx(np.sqrt(square))
         sampled = np.linalg.norm(grid @ corners - p, axis=1).min()
         assert distance == pytest.approx(sampled, abs=1e-2)

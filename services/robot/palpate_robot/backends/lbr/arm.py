@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import pinocchio as pin
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_models import lbr
 from palpate_models.frames import Array
 from palpate_models.scenario import Robot
@@ -17,7 +17,7 @@ from palpate_robot.backends.lbr.idl import ClientCommandMode, ConnectionQuality,
 VELOCITY_LAG_S: Final = 0.004
 """Time constant of the low-pass on the differentiated position: LBRState carries no velocity. It keeps the encoder's steps
 (about 1e-5 rad) below 3 mrad/s at 500 Hz and costs the damping 4 ms."""
-STATE_AGE_NS: Final = (contract().topics["joint_states"].max_age_ms or 0) * MS
+STATE_AGE_NS: Final = contract().topics["joint_states"].max_age
 """A state older than this [ns] counts as none."""
 CLOCK_SET_NS: Final = 1_000_000_000
 """A stamp that is so much older than the newest [ns] is of a controller whose clock was set back; any other is a state that was

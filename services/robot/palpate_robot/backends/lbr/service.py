@@ -10,10 +10,8 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.messages import (
     JointState,
-    OperatorRequest,
     RobotStatus,
     String,
-    SupervisorState,
     Vector3,
     Wrench,
     WrenchStamped,
@@ -32,6 +30,7 @@ from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, GravityModel
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort, ZenohPort
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
+from palpate_robot.stop_requests import StopRequests
 
 STATUS_PERIOD = contract().topics["robot/status"].period
 DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
@@ -61,6 +60,7 @@ class LbrService(Service):
         self._arm = Arm()
         self._model = GravityModel(exam.robot)
         self._driver = Driver(exam.limits.force_emergency_n)
+        self._stop_requests = StopRequests(self._driver)
         lbr_side = exam.robot.lbr
         self._emulated = lbr_side.emulated
         yaw = np.deg2rad(lbr_side.ft_yaw_deg)
@@ -69,7 +69,6 @@ class LbrService(Service):
         self._command: Command | None = None
         self._command_message: Message | None = None
         self._commanding_since: int | None = None
-        self._releases = 0
         self._wrench = np.zeros(6)
         self._wrench_at: int | None = None
         self._tool: Message | None = None
@@ -90,7 +89,7 @@ class LbrService(Service):
         """One tick: what the arm said, what the driver makes of it, what the arm is to do."""
         outbox: dict[str, Message] = {}
         fresh = self._listen(t)
-        self._obey(t, inbox)
+        self._stop_requests.obey(t, inbox)
         if self._inner is not None:
             self._inner.listen(inbox)
         if self._arm.heard is not None and t - self._arm.heard <= STATE_AGE_NS:
@@ -148,17 +147,6 @@ class LbrService(Service):
             self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench))
             self._summed += 1
         return fresh
-
-    def _obey(self, t: int, inbox: Inbox) -> None:
-        for message in inbox.new("operator/request"):
-            if message.request == OperatorRequest.STOP:
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
-        for message in inbox.new("supervisor/state"):
-            if message.releases != self._releases:
-                self._releases = message.releases
-                self._driver.release(t)
-            if message.level == SupervisorState.LEVEL_EMERGENCY:
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
 
     def _judge_connection(self, t: int) -> str:
         """Latches a hold when the arm was active and does not take commands any more; returns why it does not."""

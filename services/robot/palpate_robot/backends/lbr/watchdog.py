@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.frames import Array
@@ -30,7 +30,7 @@ from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueComma
 
 log = logging.getLogger("watchdog")
 
-TIMEOUT_NS: Final = (contract().topics["control/joint_torque"].expiry_ms or 0) * MS
+TIMEOUT_NS: Final = contract().topics["control/joint_torque"].expiry
 """Without a command for so long [ns] the watchdog takes over."""
 DAMPING: Final = np.full(7, 8.0)
 """[N m s/rad], below the arm's own friction: stable with any delay."""
