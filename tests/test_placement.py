@@ -13,6 +13,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from toy_runs import ROLES, Running, at, composed_hash, run_toys, toy_services
 
+from palpate_bus.contract import MS
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.outcome import Patience
 
@@ -47,11 +48,11 @@ def test_when_a_process_dies_each_of_its_roles_is_named_and_the_others_run_one_m
 
     pair = ("control", "planning")
     outcome = run_toys(kill, {"TOY_END_S": "30"}, groups=[pair, *((role,) for role in ROLES if role not in pair)])
-    assert outcome.lost.keys() == set(pair)
+    assert outcome.lost.keys() == set(pair), outcome.trouble
     assert outcome.failure is not None
     for role in pair:
         assert f"{role} lost at tick" in outcome.failure
-    assert abs(outcome.last_tick - outcome.lost["control"] - NS) <= NS // 2
+    assert outcome.last_tick >= outcome.lost["control"] + NS - MS
 
 
 def test_when_the_loop_dies_the_run_ends_at_once_and_names_its_roles() -> None:
@@ -62,12 +63,12 @@ def test_when_the_loop_dies_the_run_ends_at_once_and_names_its_roles() -> None:
             running.processes["tissue"].kill()
 
     outcome = run_toys(kill, {"TOY_END_S": "30"}, groups=[LOOP, *REST])
-    assert outcome.lost.keys() == set(LOOP)
+    assert outcome.lost.keys() == set(LOOP), outcome.trouble
 
 
 def test_of_a_process_the_service_that_raised_is_named() -> None:
     outcome = run_toys(environment={"TOY_CONTROL_FAILS_AT": "700"}, groups=[LOOP, *REST])
-    assert outcome.lost.keys() == set(LOOP)
+    assert outcome.lost.keys() == set(LOOP), outcome.trouble
     assert outcome.failure is not None
     assert "control: ArithmeticError: toy failure" in outcome.failure
 

@@ -17,6 +17,7 @@ import numpy as np
 from palpate_bus.contract import MS, Contract, parse
 from palpate_bus.messages import JointTorqueCommand, RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.runtime.collection import rare_collections
 from palpate_bus.runtime.distributed import LockstepNode
 from palpate_bus.runtime.member import Member
 from palpate_bus.service import Inbox, Outbox, Service
@@ -69,7 +70,8 @@ def serve(role: str, number: int) -> None:
     service = Trivial(role, tuple(topic.name for topic, _ in contract.inputs(role)))
     with session() as opened:
         member = Member(opened, role, contract, 0)
-        LockstepNode([service], {role: member}).run()
+        with rare_collections():
+            LockstepNode([service], {role: member}).run()
         member.leave()
 
 

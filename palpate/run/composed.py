@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from time import perf_counter
@@ -11,6 +10,7 @@ from palpate.environment import given
 from palpate.run.roles import OBSERVERS, WORKERS, choice, write_scenario_files
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
+from palpate_bus.runtime.collection import rare_collections
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.recording import RawRecorder
 from palpate_bus.service import Service
@@ -20,9 +20,6 @@ from palpate_conductor.timing import SIM_LIMIT
 from palpate_conductor.tree import FrameTree
 from palpate_models.load import exam_input, seen, view_of
 from palpate_models.scenario import Scenario
-
-RARE_COLLECTION = 100_000
-"""New objects before the garbage collector looks for circles. Messages form none: a run of 50 s leaves 2000 objects in them."""
 
 
 def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
@@ -58,11 +55,9 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
 
     lost: dict[str, int] = {}
     interrupted = False
-    gc.freeze()  # full collections in mid-run need not go through all that was loaded
-    thresholds = gc.get_threshold()
-    gc.set_threshold(RARE_COLLECTION)
     try:
-        last = run.run(end, SIM_LIMIT)
+        with rare_collections():
+            last = run.run(end, SIM_LIMIT)
     except KeyboardInterrupt:
         interrupted = True
         failure, last = f"interrupted at tick {run.t / NS:.3f} s", run.t
@@ -70,9 +65,6 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.why}"
         lost = {error.role: error.t}
         last = error.t
-    finally:
-        gc.set_threshold(*thresholds)
-        gc.unfreeze()
     wall = perf_counter() - start
     facts = run.finish()
     for recorder in recorders:
