@@ -5,6 +5,8 @@ PYTHON ?= python3
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export PYTHONHASHSEED := 0
+# Two processes share the tests out; what belongs together, tests/conftest.py says.
+TWO_WORKERS := -n 2 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: run test test-slow test-docker test-browser lint format bench docs install clean
 
@@ -12,7 +14,7 @@ run: install  ## the default examination, as processes on this machine
 	$(BIN)/palpate run $(ARGS)
 
 test: install  ## everything but the slow, Docker, browser and page tests; whole examinations (tests/test_gate.py) too
-	$(BIN)/python -m pytest -q -m "not slow and not docker and not browser and not pages"
+	$(BIN)/python -m pytest -q -m "not slow and not docker and not browser and not pages" $(TWO_WORKERS)
 
 test-slow: install  ## long cases: seeds, scenarios, faults
 	$(BIN)/python -m pytest -q -m "slow"

@@ -20,7 +20,7 @@ from palpate.report.scoring import Truth
 from palpate_reproduction.render import Viewpoint, picture
 from palpate_reproduction.scene import Moment, Stage
 from palpate_validation import drop
-from palpate_validation.check import Section
+from palpate_validation.check import PageSection
 
 DPI: Final = 100
 COLOURS: Final = 192
@@ -45,7 +45,7 @@ def _save(figure: Figure, path: Path) -> None:
     image.quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def transients(path: Path) -> Section:
+def transients(path: Path) -> PageSection:
     """Figure 3: a tool dropped on soft and rigid surfaces. Returns what was measured."""
     section = drop.section()
     figure = _figure(9.0, 4.6)

@@ -11,7 +11,7 @@ from palpate_models.breathing import TABLE_S, Breathing, BreathingCurve
 from palpate_models.frames import Array
 from palpate_models.patient import Phantom
 from palpate_models.phantom import build_phantom
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK
 
 STEP_S = 0.01
@@ -131,7 +131,7 @@ def _memory(breaths: tuple[Breaths, ...], field: str) -> float:
     return float(np.mean([np.corrcoef(getattr(one, field)[:-1], getattr(one, field)[1:])[0, 1] for one in breaths]))
 
 
-def section(found: Measured | None = None) -> Section:
+def section(found: Measured | None = None) -> PageSection:
     """What is read from the curves against what was measured on people, with its bounds."""
     found = found or measure()
     quiet, deep = found.quiet, found.deep
@@ -162,7 +162,7 @@ def section(found: Measured | None = None) -> Section:
     )
     data = {"time_s": found.time, **{f"{name}_m": curve for name, curve in found.curves.items()}}
     data |= {"quiet_duration_s": _pooled(quiet, "duration"), "quiet_depth_m": _pooled(quiet, "depth")}
-    return Section("breathing", "Breathing", text, checks, lambda f: draw(f, found), (7.0, 5.0), data)
+    return PageSection("breathing", "Breathing", text, checks, lambda f: draw(f, found), (7.0, 5.0), data)
 
 
 def draw(figure: Figure, found: Measured) -> None:

@@ -12,7 +12,7 @@ from palpate_models.patient import Lesion
 from palpate_models.phantom import flat_phantom
 from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK
 from palpate_validation.probing import ELASTIC, hold
 
@@ -73,7 +73,7 @@ def measure(lumps: tuple[Buried, ...] = ELASTIC_TIER) -> Array:
     return np.array([on_surface_tier(lump) for lump in lumps])
 
 
-def section(found: Array | None = None) -> Section:
+def section(found: Array | None = None) -> PageSection:
     """The comparison with its bounds."""
     found = measure() if found is None else found
     elastic = np.array([lump.ratio for lump in ELASTIC_TIER])
@@ -100,7 +100,7 @@ def section(found: Array | None = None) -> Section:
         ],
         "surface": found,
     }
-    return Section("buried", "Lumps below the skin", text, checks, lambda f: draw(f, found), (4.2, 3.4), data)
+    return PageSection("buried", "Lumps below the skin", text, checks, lambda f: draw(f, found), (4.2, 3.4), data)
 
 
 def _percent(error: Array) -> float:

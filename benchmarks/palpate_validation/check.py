@@ -45,7 +45,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """One comparison: what it says, its checks, and how to draw it."""
 
     name: str

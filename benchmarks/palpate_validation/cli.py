@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import output_file, output_folder, refuse
-from palpate_validation.check import Section
+from palpate_validation.check import PageSection
 from palpate_validation.report import failures, table, write, write_page
 
 EXIT_MISSED = 3
@@ -36,9 +36,9 @@ SECTIONS = {
 app = typer.Typer(name="validate", help="Measure the physics against independent references.", invoke_without_command=True)
 
 
-def run_section(name: str) -> Section:
+def run_section(name: str) -> PageSection:
     """Measures the section of that name. Raises KeyError if there is none."""
-    section: Section = importlib.import_module(f"palpate_validation.{SECTIONS[name]}").section()
+    section: PageSection = importlib.import_module(f"palpate_validation.{SECTIONS[name]}").section()
     return section
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from palpate_models.frames import Array
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.dart_scene import DartScene, Ellipsoid, Flesh, SoftBox
 from palpate_validation.plots import COLOURS
 from palpate_validation.probing import STILL
@@ -106,7 +106,7 @@ def measure(depths: Array = DEPTHS_M) -> Bodies:
     )  # fmt: skip
 
 
-def section(bodies: Bodies | None = None, depths: Array = DEPTHS_M) -> Section:
+def section(bodies: Bodies | None = None, depths: Array = DEPTHS_M) -> PageSection:
     """The comparison with its bounds."""
     bodies = bodies or measure(depths)
     exact = sliding_vertices(BOX, depths)
@@ -144,7 +144,7 @@ def section(bodies: Bodies | None = None, depths: Array = DEPTHS_M) -> Section:
         "box_slippery_dart_n": bodies.box_slippery.force, "box_slippery_exact_n": exact,
         "ellipsoid_dart_n": bodies.ellipsoid.force, "ellipsoid_ours_n": bodies.ellipsoid_ours.force,
     }  # fmt: skip
-    return Section("dart", "DART's soft bodies", text, checks, lambda f: draw(f, bodies, exact, depths), data=data)
+    return PageSection("dart", "DART's soft bodies", text, checks, lambda f: draw(f, bodies, exact, depths), data=data)
 
 
 def draw(figure: Figure, bodies: Bodies, exact: Array, depths: Array) -> None:

@@ -21,7 +21,7 @@ from palpate_models.gravity import GRAVITY
 from palpate_models.patient import Stiffness
 from palpate_models.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.dart_scene import DartScene, Flesh, SoftBox
 from palpate_validation.plots import COLOURS, INK, QUIET
 
@@ -113,7 +113,7 @@ def measure(seconds: float = SECONDS) -> tuple[Drop, Drop, Drop]:
     return drop_on_tissue(seconds=seconds), drop_in_dart(FLESH, seconds=seconds), drop_in_dart(None, seconds=seconds)
 
 
-def section(drops: tuple[Drop, ...] | None = None) -> Section:
+def section(drops: tuple[Drop, ...] | None = None) -> PageSection:
     """The figure with what the paper says of it as bounds."""
     drops = drops or measure()
     soft, flesh, rigid = drops
@@ -137,7 +137,9 @@ def section(drops: tuple[Drop, ...] | None = None) -> Section:
         "sink 11 mm."
     )
     data = {drop.name: {"time_s": drop.time, "depth_m": drop.depth, "force_n": drop.force} for drop in drops}
-    return Section("drop", "The contact test of the paper (figure 3)", text, checks, lambda f: draw(f, drops), (7.0, 3.6), data)
+    return PageSection(
+        "drop", "The contact test of the paper (figure 3)", text, checks, lambda f: draw(f, drops), (7.0, 3.6), data
+    )
 
 
 def draw(figure: Figure, drops: tuple[Drop, ...]) -> None:

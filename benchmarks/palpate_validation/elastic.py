@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from palpate_models.frames import Array
 from palpate_tissue.backends.elastic.slab import FlatSlab
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.hertz import YOUNG_PA, hertz_force, sneddon_force
 from palpate_validation.plots import COLOURS, INK, QUIET
 
@@ -46,7 +46,7 @@ def measure() -> ElasticCurves:
     )
 
 
-def section(curves: ElasticCurves | None = None) -> Section:
+def section(curves: ElasticCurves | None = None) -> PageSection:
     """The comparison with its bounds."""
     c = curves or measure()
     by_hertz, by_sneddon = 100 * (c.paraboloid / c.hertz - 1), 100 * (c.sphere / c.sneddon - 1)
@@ -69,7 +69,9 @@ def section(curves: ElasticCurves | None = None) -> Section:
     )
     data = {"radii_m": RADII_M, "depths_m": DEPTHS_M, "paraboloid_n": c.paraboloid, "sphere_n": c.sphere, "hertz_n": c.hertz,
             "sneddon_n": c.sneddon}  # fmt: skip
-    return Section("elastic", "Elastic tier on a flat half-space: Hertz", text, checks, lambda f: draw(f, c), (4.5, 2.8), data)
+    return PageSection(
+        "elastic", "Elastic tier on a flat half-space: Hertz", text, checks, lambda f: draw(f, c), (4.5, 2.8), data
+    )
 
 
 def draw(figure: Figure, c: ElasticCurves) -> None:

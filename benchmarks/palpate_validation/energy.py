@@ -13,7 +13,7 @@ from palpate_models.patient import Lesion, Stiffness
 from palpate_models.phantom import PhantomModel, flat_phantom
 from palpate_models.wall import MEDIAN
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK
 
 RADIUS_M = 0.015
@@ -96,7 +96,7 @@ def measure(cycles: int = CYCLES, seed: int = 0) -> list[Cycle]:
     ]
 
 
-def section(cycles: list[Cycle] | None = None) -> Section:
+def section(cycles: list[Cycle] | None = None) -> PageSection:
     """The cycles with their bounds."""
     cycles = cycles or measure()
     in_contact = [cycle for cycle in cycles if cycle.touched > 50]
@@ -114,7 +114,7 @@ def section(cycles: list[Cycle] | None = None) -> Section:
         f"put in, and every cycle costs work: {100 * min(lost):.0f} to {100 * max(lost):.0f} % of what was put in."
     )
     data = {"gained": [c.gained for c in in_contact], "surplus": [c.surplus for c in in_contact]}
-    return Section("energy", "Energy", text, checks, lambda f: draw(f, in_contact), data=data)
+    return PageSection("energy", "Energy", text, checks, lambda f: draw(f, in_contact), data=data)
 
 
 def draw(figure: Figure, cycles: list[Cycle]) -> None:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from palpate_models.frames import Array
 from palpate_models.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.hertz import POISSON, YOUNG_PA, hertz_force
 from palpate_validation.plots import COLOURS, QUIET
 from palpate_validation.probing import ELASTIC, STILL, hold, static_curve
@@ -141,7 +141,7 @@ def measure() -> FlexCurves:
     )
 
 
-def section(curves: FlexCurves | None = None) -> Section:
+def section(curves: FlexCurves | None = None) -> PageSection:
     """The comparison with its bounds."""
     c = curves or measure()
     checks = (
@@ -163,7 +163,7 @@ def section(curves: FlexCurves | None = None) -> Section:
         "Not like for like in cost: its vertices fill a volume, ours the surface that is touched."
     )
     data = {"depths_m": DEPTHS_M, "flex_n": c.flex, "ours_n": c.ours, "hertz_n": c.hertz}
-    return Section("mujoco", "MuJoCo's flex", text, checks, lambda f: draw(f, c), (4.5, 2.8), data)
+    return PageSection("mujoco", "MuJoCo's flex", text, checks, lambda f: draw(f, c), (4.5, 2.8), data)
 
 
 def draw(figure: Figure, c: FlexCurves) -> None:

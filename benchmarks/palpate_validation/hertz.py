@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from palpate_models.frames import Array
 from palpate_models.phantom import flat_phantom
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK, QUIET
 from palpate_validation.probing import static_curve
 
@@ -82,7 +82,7 @@ def measure(radii: tuple[float, ...] = RADII_M, depths: Array = DEPTHS_M) -> Her
     return HertzCurves(radii, depths, force, np.array([hertz_force(depths, radius) for radius in radii]))
 
 
-def section(curves: HertzCurves | None = None) -> Section:
+def section(curves: HertzCurves | None = None) -> PageSection:
     """The comparison with its bounds."""
     curves = curves or measure()
     calibrated = curves.error[curves.radii.index(CALIBRATED_RADIUS_M)]
@@ -120,7 +120,9 @@ def section(curves: HertzCurves | None = None) -> Section:
         "hertz_n": curves.hertz,
         "within_m": ranges,
     }
-    return Section("hertz", "Surface tier on a flat half-space: Hertz", text, tuple(checks), lambda f: draw(f, curves), data=data)
+    return PageSection(
+        "hertz", "Surface tier on a flat half-space: Hertz", text, tuple(checks), lambda f: draw(f, curves), data=data
+    )
 
 
 def draw(figure: Figure, curves: HertzCurves) -> None:

@@ -11,7 +11,7 @@ from palpate_models.frames import Array
 from palpate_models.patient import Lesion
 from palpate_models.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.foundation import lump, static_force, uniform
 from palpate_validation.plots import COLOURS, INK
 from palpate_validation.probing import ELASTIC, hold
@@ -68,7 +68,7 @@ def _radius_of(ratio: float, contrast: float, nominal: float, base: float) -> fl
     return float(np.interp(ratio, [_continuum(r, contrast, SHARP_M) / base for r in radii], radii))
 
 
-def section(ratios: LumpRatios | None = None) -> Section:
+def section(ratios: LumpRatios | None = None) -> PageSection:
     """The comparison with its bounds."""
     ratios = ratios or measure()
     error = 100 * (ratios.tissue / ratios.continuum - 1)
@@ -94,7 +94,7 @@ def section(ratios: LumpRatios | None = None) -> Section:
         "lumps_m": LUMPS_M, "contrasts": CONTRASTS, "tissue": ratios.tissue, "continuum": ratios.continuum,
         "sharp": ratios.sharp, "design": DESIGN, "design_radius_m": ratios.design_radius,
     }  # fmt: skip
-    return Section("lumps", "Lumps: force ratio against contrast", text, checks, lambda f: draw(f, ratios), (4.5, 3.0), data)
+    return PageSection("lumps", "Lumps: force ratio against contrast", text, checks, lambda f: draw(f, ratios), (4.5, 3.0), data)
 
 
 def draw(figure: Figure, ratios: LumpRatios) -> None:

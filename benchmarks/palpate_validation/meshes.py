@@ -12,7 +12,7 @@ from palpate_models.frames import Array
 from palpate_models.patient import Lesion, Stiffness
 from palpate_models.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.foundation import static_force, uniform
 from palpate_validation.plots import COLOURS, INK
 from palpate_validation.probing import ELASTIC, OFFSETS, hold
@@ -99,7 +99,7 @@ def _recover(model: object, start: Array, steps: int = 200) -> Array:
     return tissue.displacement.copy()
 
 
-def section(meshes: MeshForces | None = None, linear: Superposition | None = None) -> Section:
+def section(meshes: MeshForces | None = None, linear: Superposition | None = None) -> PageSection:
     """Convergence and superposition with their bounds."""
     meshes, linear = meshes or measure_meshes(), linear or measure_superposition()
     deep = DEPTHS_M >= FROM_M - 1e-9
@@ -123,7 +123,7 @@ def section(meshes: MeshForces | None = None, linear: Superposition | None = Non
         "edges_m": EDGES_M, "radii_m": RADII_M, "depths_m": DEPTHS_M, "force_n": meshes.force,
         "continuum_n": meshes.continuum, "superposition": [linear.static, linear.recovery],
     }  # fmt: skip
-    return Section("mesh", "Mesh and superposition", text, checks, lambda f: draw(f, meshes), (4.5, 2.8), data)
+    return PageSection("mesh", "Mesh and superposition", text, checks, lambda f: draw(f, meshes), (4.5, 2.8), data)
 
 
 def draw(figure: Figure, meshes: MeshForces) -> None:

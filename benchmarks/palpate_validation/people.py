@@ -12,7 +12,7 @@ from palpate_models import remus2024
 from palpate_models.frames import Array
 from palpate_models.remus2024 import Fit, exponent
 from palpate_models.wall import MEDIAN
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.indentation import SPACING_M, force_along, press, wall_tissue
 from palpate_validation.people_fit import COMPARED_M, RATIO_AT_M, at_depths
 from palpate_validation.plots import COLOURS, INK, QUIET
@@ -54,7 +54,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Loop:
+class HysteresisLoop:
     """A press of the median person's wall and the release, at one speed."""
 
     speed: float
@@ -82,7 +82,7 @@ class People:
     """Median force of all measured places at `COMPARED_M` [N]."""
     median_simulated: Array
     """What the wall `MEDIAN` gives there, with the zero offset that is the median of the places'."""
-    loops: tuple[Loop, ...]
+    loops: tuple[HysteresisLoop, ...]
 
 
 def reproduce(region: str, person: str) -> Place:
@@ -95,11 +95,11 @@ def reproduce(region: str, person: str) -> Place:
     return Place(region, person, fit, measured, at_depths(force, fit.zero_offset_m), float(tensed[at] / force[at]))
 
 
-def loop(speed: float) -> Loop:
+def loop(speed: float) -> HysteresisLoop:
     """Presses the median person to 10 mm and lets go, both at `speed` [m/s]."""
     down = np.linspace(0.0, PRESSED_M, 51)
     depth = np.concatenate((down, down[-2::-1]))
-    return Loop(speed, depth, force_along(wall_tissue(MEDIAN), depth[1:], speed))
+    return HysteresisLoop(speed, depth, force_along(wall_tissue(MEDIAN), depth[1:], speed))
 
 
 def measure(which: Sequence[tuple[str, str]] | None = None) -> People:
@@ -113,7 +113,7 @@ def measure(which: Sequence[tuple[str, str]] | None = None) -> People:
     )
 
 
-def section(found: People | None = None) -> Section:
+def section(found: People | None = None) -> PageSection:
     """The people with the bounds of what a reproduction is."""
     found = found or measure()
     text = (
@@ -132,7 +132,7 @@ def section(found: People | None = None) -> Section:
         "places": [{**vars(p), "fit": _plain(p.fit), "rms_percent": p.rms_percent} for p in found.places],
         "loops": [{**vars(o), "lost_percent": o.lost_percent} for o in found.loops],
     }
-    return Section("people", "Living people", text, checks, lambda f: draw(f, found), (7.0, 4.4), data)
+    return PageSection("people", "Living people", text, checks, lambda f: draw(f, found), (7.0, 4.4), data)
 
 
 def _errors(found: People) -> Iterator[Check]:
@@ -169,7 +169,7 @@ def _tensed(places: Sequence[Place]) -> Check:
     return Check(name, simulated, "", round(0.9 * measured, 2), round(1.1 * measured, 2), f"measured: {measured:.2f}")
 
 
-def _losses(loops: Sequence[Loop]) -> Iterator[Check]:
+def _losses(loops: Sequence[HysteresisLoop]) -> Iterator[Check]:
     """What a press and its release cost."""
     for each in loops:
         name = f"work lost in a press of {1e3 * PRESSED_M:g} mm and its release at {1e3 * each.speed:g} mm/s"

@@ -17,7 +17,7 @@ from palpate_models.person import drawn
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.bones import bone_share
 from palpate_models.phantom.tension import pressed_force
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK, QUIET
 
 SEEDS = ((Build.SLIM, 4), (Build.MEDIAN, 2), (Build.OBESE, 3))
@@ -66,7 +66,7 @@ def force_at_10_mm(model: PhantomModel, wall: Stiffness) -> Array:
     return model.stiffness / wall.k_w_n_per_m3 * np.interp(model.stiffening, _TABLE, unit)
 
 
-def section(found: tuple[Person, ...] | None = None) -> Section:
+def section(found: tuple[Person, ...] | None = None) -> PageSection:
     """The persons, and what must be so in each."""
     found = found or measure()
     checks = []
@@ -81,7 +81,7 @@ def section(found: tuple[Person, ...] | None = None) -> Section:
         "ribs and iliac crests, the dashed square is the default examined region. Below, the crown line from pelvis to "
         "ribs, and the middle section."
     )
-    return Section("persons", "Three persons", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6))
+    return PageSection("persons", "Three persons", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6))
 
 
 def draw(figure: Figure, found: tuple[Person, ...]) -> None:

@@ -16,7 +16,7 @@ from palpate_models.person import drawn
 from palpate_models.phantom.healthy import belly, healthy_wall
 from palpate_models.phantom.tension import pressed_force
 from palpate_models.seeds import generator
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK
 
 PERSONS = 200
@@ -103,7 +103,7 @@ def _places(points: Array, rng: np.random.Generator) -> Array:
     raise RuntimeError(f"population: fewer than {PLACES} places {APART_M} m apart among {len(points)}")
 
 
-def section(found: Sample | None = None) -> Section:
+def section(found: Sample | None = None) -> PageSection:
     """The comparison with its bounds."""
     found, people = found or sampled(), measured()
     checks = tuple(
@@ -119,7 +119,7 @@ def section(found: Sample | None = None) -> Section:
         "were young, male and slim: other builds are models."
     )
     data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
-    return Section("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)
+    return PageSection("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)
 
 
 def draw(figure: Figure, found: Sample, people: Sample) -> None:

@@ -12,7 +12,7 @@ from palpate_models.frames import Array
 from palpate_models.patient import Stiffness
 from palpate_models.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK
 from palpate_validation.probing import ELASTIC, STILL, hold
 
@@ -61,7 +61,7 @@ def measure(hold_s: float = HOLD_S) -> Relaxation:
     return Relaxation(time, ratio, np.array((g1, g2))[order], np.array((tau1, tau2))[order])
 
 
-def section(found: Relaxation | None = None) -> Section:
+def section(found: Relaxation | None = None) -> PageSection:
     """The series read back, with its bounds."""
     found = found or measure()
     checks = []
@@ -77,7 +77,7 @@ def section(found: Relaxation | None = None) -> Section:
         "force without knowledge of the scenario. Displacements are held, so the force must relax by the material's own series."
     )
     data = {"time_s": found.time, "ratio": found.ratio, "g": found.g, "tau_s": found.tau}
-    return Section("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, found), (4.5, 2.8), data)
+    return PageSection("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, found), (4.5, 2.8), data)
 
 
 def draw(figure: Figure, found: Relaxation) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import write_figure
 
 WORDS = {True: "[green]pass[/]", False: "[bold red]FAIL[/]", None: ""}
@@ -25,7 +25,7 @@ def number(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
 
 
-def table(sections: Sequence[Section]) -> Table:
+def table(sections: Sequence[PageSection]) -> Table:
     """All checks, section by section."""
     out = Table("what", "measured", "bound", "against", "", box=None, pad_edge=False)
     out.columns[1].justify = "right"
@@ -37,12 +37,12 @@ def table(sections: Sequence[Section]) -> Table:
     return out
 
 
-def failures(sections: Sequence[Section]) -> list[Check]:
+def failures(sections: Sequence[PageSection]) -> list[Check]:
     """The checks outside their bounds."""
     return [check for section in sections for check in section.checks if check.passed is False]
 
 
-def write(sections: Sequence[Section], out: Path) -> None:
+def write(sections: Sequence[PageSection], out: Path) -> None:
     """Writes validate.json and a PNG for each section that draws into the folder `out`, which is made if need be."""
     out.mkdir(parents=True, exist_ok=True)
     facts = {
@@ -64,7 +64,7 @@ def write(sections: Sequence[Section], out: Path) -> None:
             write_figure(section.draw, out / f"{section.name}.png", section.size_in)
 
 
-def write_page(sections: Sequence[Section], page: Path, images: Path) -> None:
+def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> None:
     """Writes the Markdown page and its small PNGs into the folder `images`, which is made if need be."""
     images.mkdir(parents=True, exist_ok=True)
     where = images.relative_to(page.parent).as_posix()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, Delays, Ringing, press
 from palpate_validation.loop_theory import linearise
 from palpate_validation.plots import COLOURS, QUIET
@@ -80,7 +80,7 @@ def measure() -> Stability:
     return Stability(delay, jitter, margins, linearise(1.0, STIFFNESS_NPM, 0.25).margin_ms(CONTROL_PATH))
 
 
-def section(found: Stability | None = None) -> Section:
+def section(found: Stability | None = None) -> PageSection:
     """Sweeps and margins with their bounds."""
     found = found or measure()
     checks = []
@@ -118,7 +118,7 @@ def section(found: Stability | None = None) -> Section:
         "held_by_jitter": {f"x{c:g}": [r.held for r in found.jitter[c]] for c in CONTRASTS},
         "margins": [vars(margin) for margin in found.margins],
     }
-    return Section(
+    return PageSection(
         "stability", "Contact under bus delay and jitter", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6), data
     )
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from palpate.command_line import EXIT_BAD_INPUT
 from palpate_bus.messages.stamps import NS
 from palpate_validation import stability
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, Delays, press
 from palpate_validation.delays import BusDelay, DelayedInbox
 from palpate_validation.loop_theory import linearise
@@ -110,9 +110,9 @@ def test_stability_under_delay_and_jitter() -> None:
     assert not missed
 
 
-def a_section() -> Section:
+def a_section() -> PageSection:
     checks = (Check("good", 1.0, "N", high=2.0, against="theory"), Check("bad", 3.0, high=2.0), Check("told", 5.0))
-    return Section(
+    return PageSection(
         "name",
         "Title",
         "Text.",

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from palpate_validation import dart_bodies, elastic, flex, hertz
-from palpate_validation.check import Section
+from palpate_validation.check import PageSection
 from palpate_validation.dart_scene import DartScene, Ellipsoid, Flesh, SoftBox
 from palpate_validation.twins import box_surface, ellipsoid_edges, ellipsoid_surface, graph_laplacian, twin
 
 
-def assert_bounds(section: Section) -> None:
+def assert_bounds(section: PageSection) -> None:
     missed = [f"{c.name}: {c.measured} {c.unit}, want {c.bound}" for c in section.checks if c.passed is False and not c.timed]
     assert not missed
 

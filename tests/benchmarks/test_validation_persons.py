@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from palpate_validation import buried, persons, population
-from palpate_validation.check import Section
+from palpate_validation.check import PageSection
 from palpate_validation.population import Sample
 
 
-def assert_bounds(section: Section) -> None:
+def assert_bounds(section: PageSection) -> None:
     missed = [f"{c.name}: {c.measured} {c.unit}, want {c.bound}" for c in section.checks if c.passed is False]
     assert not missed
     assert any(c.passed for c in section.checks)

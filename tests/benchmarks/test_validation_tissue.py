@@ -11,13 +11,13 @@ from hypothesis.extra.numpy import arrays
 from palpate_models.patient import Stiffness
 from palpate_models.remus2024 import relaxed_people
 from palpate_validation import drop, energy, hertz, lumps, meshes, people, relaxation
-from palpate_validation.check import Check, Section
+from palpate_validation.check import Check, PageSection
 from palpate_validation.foundation import lump, static_force, uniform
 from palpate_validation.indentation import SPACING_M
 from palpate_validation.people_fit import at_depths, fit
 
 
-def assert_bounds(section: Section) -> None:
+def assert_bounds(section: PageSection) -> None:
     missed = [f"{c.name}: {c.measured} {c.unit}, want {c.bound}" for c in section.checks if c.passed is False]
     assert not missed
     assert any(c.passed for c in section.checks)
@@ -86,7 +86,7 @@ def test_people_are_fitted_by_the_wall_that_made_the_force() -> None:
 
 def test_a_loop_loses_what_does_not_come_back() -> None:
     depth = np.array((0.0, 1.0, 2.0, 1.0, 0.0)) * 1e-3
-    assert people.Loop(0.01, depth, np.array((0.0, 1.0, 2.0, 0.5, 0.0))).lost_percent == pytest.approx(25.0)
+    assert people.HysteresisLoop(0.01, depth, np.array((0.0, 1.0, 2.0, 0.5, 0.0))).lost_percent == pytest.approx(25.0)
 
 
 def test_random_cycles() -> None:

@@ -22,7 +22,7 @@ _COARSE_M = 0.02
 _BELLY_HALF_M = 0.10
 
 
-class Wall(NamedTuple):
+class HealthyWall(NamedTuple):
     """A person's wall over the wall's mean, at n points."""
 
     stiffness: Array
@@ -48,7 +48,9 @@ def muscle_factor(x: Array, y: Array, muscles: Muscles) -> Array:
     return np.asarray(1 + (muscles.linea_alba - 1) * alba + (muscles.rectus - 1) * (within - alba))
 
 
-def healthy_wall(points: Array, size_m: tuple[float, float, float], anatomy: Anatomy, stiffening: float, seed: int) -> Wall:
+def healthy_wall(
+    points: Array, size_m: tuple[float, float, float], anatomy: Anatomy, stiffening: float, seed: int
+) -> HealthyWall:
     """The wall of a person at points (n, 3) of A [m], whose mean `stiffening` [1/m] is given.
 
     Over the belly the logarithm of the first has the mean 0, and both have the deviations and the correlation that
@@ -67,7 +69,7 @@ def healthy_wall(points: Array, size_m: tuple[float, float, float], anatomy: Ana
     shared = rho * log_level / total if total > 0 else 0.0
     local = np.maximum(stiffening + variation.stiffening_per_m * (shared + np.sqrt(1 - rho**2) * other(points)), 0.0)
     bone = bone_share(x, y, anatomy.skeleton)
-    return Wall(
+    return HealthyWall(
         np.exp(log_level) * (1 + (anatomy.bone - 1) * bone),
         (1 - bone) * local + bone * anatomy.bone_stiffening_per_m,
     )

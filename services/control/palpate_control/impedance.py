@@ -163,7 +163,7 @@ def cartesian_torque(
     Args:
         arm: q, qd, p_WI, J_W, C(q, qd) qd + gravity, and gravity, as `ArmModel` evaluates them.
         R_WD: desired rotation of the indenter, shape (3, 3).
-        x: coordinates of the desired `Motion`, shape (39,).
+        x: coordinates of the desired `ReferenceMotion`, shape (39,).
         phi: rotation vector of R_DI [rad], shape (3,).
         Jlog: derivative of `phi` by a rotation in axes of I, shape (3, 3).
         gains: the fields of `CartesianGains`.

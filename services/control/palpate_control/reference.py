@@ -28,7 +28,7 @@ P, PHI, Q, V, QD, F, QDD = (
 _POSITIONS, _VELOCITIES, _JOINED = slice(0, 13), slice(13, 26), slice(0, 32)
 
 
-class Motion(NamedTuple):
+class ReferenceMotion(NamedTuple):
     """The moving part of a set-point at one moment: its properties are as the fields of `Setpoint`."""
 
     R_WD: Array
@@ -71,7 +71,7 @@ class Reference(NamedTuple):
 
     setpoint: Setpoint
     """The set-point in use: its mode, stiffness and damping hold as they are."""
-    motion: Motion
+    motion: ReferenceMotion
     """Its motion, carried on to the tick."""
 
 
@@ -119,7 +119,7 @@ class Extrapolator:
             raise ValueError("no set-point yet")
         self._tick = t
         x = self._coordinates(setpoint, t, t)
-        return Reference(setpoint, Motion(pin.exp3(x[PHI]).dot(setpoint.R_WD), x))
+        return Reference(setpoint, ReferenceMotion(pin.exp3(x[PHI]).dot(setpoint.R_WD), x))
 
     def _coordinates(self, setpoint: Setpoint, t: int, faded: int) -> Array:
         """Coordinates of the reference at `t`, shape (39,), with the gap as it has faded until `faded` [ns]."""

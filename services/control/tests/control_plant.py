@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.model import ArmModel
-from palpate_control.reference import Motion, Reference, coordinates
+from palpate_control.reference import Reference, ReferenceMotion, coordinates
 from palpate_models.lbr import urdf
 from palpate_models.scenario import Robot
 
@@ -92,4 +92,4 @@ def setpoint(
 
 def reference(setpoint_: Setpoint) -> Reference:
     """A set-point as the law follows it, without extrapolation."""
-    return Reference(setpoint_, Motion(setpoint_.R_WD, coordinates(setpoint_, np.zeros(7))))
+    return Reference(setpoint_, ReferenceMotion(setpoint_.R_WD, coordinates(setpoint_, np.zeros(7))))

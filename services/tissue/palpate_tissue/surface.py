@@ -94,7 +94,7 @@ def nearest_on_triangles(p: Array, corners: Array) -> tuple[Array, Array]:
 
 def _share(offset: Array, side: Array) -> Array:
     """Where points at `offset` [m] from the start of each `side` [m] project on it, as a share of it from 0 to 1, shape (k,)."""
-    return np.clip((offset * side).sum(axis=1) / (side * side).sum(axis=1), 0.0, 1.0)
+    return np.asarray(np.clip((offset * side).sum(axis=1) / (side * side).sum(axis=1), 0.0, 1.0))
 
 
 def _incident_faces(model: PhantomModel) -> list[NDArray[np.intp]]:

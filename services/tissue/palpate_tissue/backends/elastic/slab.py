@@ -50,7 +50,7 @@ def sphere_force(young_pa: float, poisson: float, radius_m: float, depth_m: floa
 
 
 @dataclass(frozen=True)
-class Pressed:
+class PressedSlab:
     """A slab at rest under an indenter."""
 
     force_n: float
@@ -93,7 +93,7 @@ class FlatSlab:
 
     def press(
         self, radius_m: float, depth_m: float, xy_m: tuple[float, float] = (0.0, 0.0), profile: Profile = "sphere"
-    ) -> Pressed:
+    ) -> PressedSlab:
         """The slab at rest under a sphere whose lowest point is `depth_m` below z = 0, over `xy_m`.
 
         `paraboloid` is Hertz's indenter: a sphere to second order.
@@ -115,7 +115,7 @@ class FlatSlab:
             force[free[near]] = solver.solve(held[near])[0]
             displacement[free] = self._matrix[:, near] @ force[free[near]]
         area = float(self.model.areas[force > 0].sum())
-        return Pressed(float(force.sum()), displacement, force, math.sqrt(area / math.pi))
+        return PressedSlab(float(force.sum()), displacement, force, math.sqrt(area / math.pi))
 
     @cached_property
     def border_m(self) -> float:
