@@ -1,1 +1,1 @@
-"""Studies: many examinations of drawn patients, on this machine or a cluster, and what is made of their results."""
+"""Studies: hundreds of examinations by one command, and what they say with intervals."""
