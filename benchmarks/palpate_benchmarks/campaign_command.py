@@ -16,7 +16,7 @@ from palpate.report.files import write_text
 from palpate.report.marked import doc_option, write_part
 from palpate_benchmarks.campaign import KINDS, FaultFinding, as_json, cases, forks, run_case
 from palpate_benchmarks.campaign_tables import markdown, table
-from palpate_benchmarks.case_display import CaseDisplay
+from palpate.case_display import CaseDisplay
 
 WIDE = 200
 

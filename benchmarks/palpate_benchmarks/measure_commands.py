@@ -14,7 +14,7 @@ from palpate.report.files import write_text
 from palpate.run.inputs import Settings, usable
 from palpate_benchmarks.bench import GROUPS
 from palpate_benchmarks.bench import bench as run_bench
-from palpate_benchmarks.case_display import CaseDisplay
+from palpate.case_display import CaseDisplay
 from palpate_benchmarks.evaluate import DEFAULT_CASES, ELSEWHERE, Evaluation
 from palpate_benchmarks.evaluate import evaluate as run_evaluation
 from palpate_benchmarks.evaluate import table as evaluation_table

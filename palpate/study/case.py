@@ -48,6 +48,8 @@ class Attempt(BaseModel):
     code: str = ""
     peak_memory_bytes: int = 0
     wall_time_s: float = 0.0
+    assess_time_s: float | None = None
+    """What of that the assessment took."""
     core_s: float = 0.0
     host: str = ""
 
@@ -61,7 +63,7 @@ def examine(case: Case) -> Attempt:
                 f"{path} is not the file that the study was made with: its SHA-256 begins with {file_hash(path)[:16]}"
             )
     scenario = Scenario.model_validate(case.scenario)
-    report = _quick(scenario) if case.tier == "quick" else _whole(scenario, case)
+    report, assess_s = _quick(scenario) if case.tier == "quick" else _whole(scenario, case)
     return Attempt(
         case_id=case.case_id,
         report=report,
@@ -69,27 +71,31 @@ def examine(case: Case) -> Attempt:
         code=code_digest(),
         peak_memory_bytes=_peak_memory(),
         wall_time_s=perf_counter() - begin,
+        assess_time_s=assess_s,
         core_s=_core_s() - used,
         host=socket.gethostname(),
     )
 
 
-def _whole(scenario: Scenario, case: Case) -> Report:
+def _whole(scenario: Scenario, case: Case) -> tuple[Report, float | None]:
+    """The report, and the real time of the assessment [s] where it is known."""
     with tempfile.TemporaryDirectory(prefix="palpate-case-") as folder:
         if case.runtime == "lockstep":
             result = run_composed(scenario, Path(folder), lambda _: None, observers=())
         else:
             result = run_distributed(scenario, Path(folder), lambda _: None, (), Timing(wallclock=True))
-        if result.interrupted:
-            raise CaseError("interrupted")
-        return assemble(scenario, result, truth_of_run(scenario, result.collected))
+    if result.interrupted:
+        raise CaseError("interrupted")
+    blame = result.blame.get("assessment")
+    report = assemble(scenario, result, truth_of_run(scenario, result.collected))
+    return report, None if blame is None else blame["steps"] * blame["compute"] / 1e6
 
 
-def _quick(scenario: Scenario) -> Report:
+def _quick(scenario: Scenario) -> tuple[Report, float]:
     from palpate.quick.case import run_quick  # noqa: PLC0415 - whole examinations need nothing of it
 
-    report: Report = run_quick(scenario)
-    return report
+    quick = run_quick(scenario)
+    return quick.report, quick.assess_s
 
 
 def _core_s() -> float:

@@ -54,7 +54,12 @@ class CaseProcess:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         late = threading.Event()
-        timer = threading.Timer(limit_s, lambda: (late.set(), self._process.kill()))
+
+        def end() -> None:
+            late.set()
+            self.kill()
+
+        timer = threading.Timer(limit_s, end)
         timer.daemon = True
         timer.start()
         try:

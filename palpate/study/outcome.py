@@ -33,6 +33,8 @@ class Outcome(BaseModel):
     """Largest memory of the process that ran the case."""
     wall_time_s: float
     """From the start of the case to its report."""
+    assess_time_s: float | None
+    """What of that the assessment took."""
     core_s: float
     """Time of the processor that it took."""
     host: str

@@ -99,12 +99,8 @@ def _outcome(folder: Path, case: Case, attempt: Attempt) -> Outcome | None:
         status="done" if attempt.why is None else "failed",
         attempts=len(before) + (attempt.why is None),
         why=attempt.why if report is None else report.failure,
-        code=attempt.code,
+        **attempt.model_dump(exclude={"case_id", "why", "report"}),
         report=report,
-        peak_memory_bytes=attempt.peak_memory_bytes,
-        wall_time_s=attempt.wall_time_s,
-        core_s=attempt.core_s,
-        host=attempt.host,
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 import pyarrow as pa
 from pyarrow import parquet
 
-from palpate.report.rows import FindingRow, Report
+from palpate.report.rows import FindingRow
 from palpate.report.scoring import FindingScore
 from palpate.study.outcome import Outcome
 from palpate_models.scenario import Scenario
@@ -54,8 +54,8 @@ CASES: Final = pa.schema(
     }
 )
 """A row a case. Counts are null and figures NaN where a case has no report. `score`: greatest confidence of any finding or
-candidate, 0 without one. `exam_time_s` is simulated, `sim_time_s` real time of the simulation, `assess_time_s` what of that the
-assessment took, `wall_time_s` all of it from the start of the process, `core_s` the processor's."""
+candidate, 0 without one. `exam_time_s` is simulated time; `sim_time_s` real time of the simulation, in whole examinations with
+the assessment, `assess_time_s` that of the assessment, `wall_time_s` all of it with the truth, `core_s` the processor's."""
 FINDINGS: Final = pa.schema(
     {
         "case_id": pa.string(),
@@ -115,7 +115,7 @@ def _case(study: str, outcome: Outcome, hits: Sequence[Row]) -> Row:
     row |= case.model_dump(include={"case_id", "population", "method", "split", "number", "seed", "tier", "errors"})
     row |= {"study": study, "status": outcome.status, "attempts": outcome.attempts, "why": outcome.why}
     row |= {"completed": outcome.completed, "peak_memory_bytes": outcome.peak_memory_bytes, "core_s": outcome.core_s}
-    row["wall_time_s"] = outcome.wall_time_s
+    row |= {"wall_time_s": outcome.wall_time_s, "assess_time_s": _number(outcome.assess_time_s)}
     if report is None:
         return row
     row |= {
@@ -124,7 +124,6 @@ def _case(study: str, outcome: Outcome, hits: Sequence[Row]) -> Row:
         "peak_force_n": _number(report.max_force_N),
         "exam_time_s": report.sim_time_s,
         "sim_time_s": report.wall_time_s,
-        "assess_time_s": _assessing(report),
     }
     if outcome.completed:
         row["score"] = max((hit["confidence"] for hit in hits), default=0.0)
@@ -197,12 +196,6 @@ def _lumps(outcome: Outcome, hits: Sequence[Row]) -> Iterator[Row]:
             "confidence": max((hit["confidence"] for hit in own), default=0.0),
             "place_error_m": min((hit["place_error_m"] for hit in reported), default=nan),
         }
-
-
-def _assessing(report: Report) -> float:
-    """Real time of the assessment's steps [s]."""
-    blame = report.blame.get("assessment")
-    return nan if blame is None else float(blame["steps"] * blame["compute"]) / 1e6
 
 
 def _number(value: float | None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -62,7 +63,14 @@ def cluster(count: int, scheduler: str | None) -> Iterator[Workers]:
         try:
             if scheduler is None:
                 local = stack.enter_context(
-                    LocalCluster(n_workers=count, threads_per_worker=1, memory_limit=0, host="127.0.0.1", env=FIXED)
+                    LocalCluster(
+                        n_workers=count,
+                        threads_per_worker=1,
+                        memory_limit=0,
+                        host="127.0.0.1",
+                        env=FIXED,
+                        silence_logs=logging.ERROR,
+                    )
                 )
                 client = stack.enter_context(Client(local))
             else:
