@@ -36,7 +36,7 @@ COMMANDS = {
     "keys": "palpate.security.keys:app",
     "router": "palpate.security.router:router",
     "fmu": "palpate.fmu:app",
-    "bench": "palpate_benchmarks.measure_commands:bench",
+    "bench": "palpate_benchmarks.bench_command:bench",
     "study": "palpate.study.command:app",
     "faults": "palpate_benchmarks.campaign_command:faults",
     "fuzz": "palpate.fuzz.command:fuzz",

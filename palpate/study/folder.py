@@ -12,6 +12,7 @@ from palpate.report.files import write_text
 from palpate.study.digest import RunRecord, Session, record, write_record
 from palpate.study.manifest import Case
 from palpate.study.outcome import Outcome, read_outcome
+from palpate.study.real_time import write_real_time
 from palpate.study.spec import StudyError
 from palpate.study.summary import summarise
 from palpate.study.tables import write_tables
@@ -104,5 +105,6 @@ def conclude(folder: Path, manifest: Manifest) -> tuple[RunRecord, list[Outcome]
     write_tables(folder, manifest.study, outcomes)
     found = record(manifest.study, outcomes, sessions(folder))
     write_record(folder, found)
+    write_real_time(folder, outcomes)
     summarise(folder)
     return found, outcomes

@@ -8,6 +8,8 @@ The folder of a study is all that there is of it: whenever the run is stopped, a
     cases/ID.json              the outcome of a case
     failures/ID.json           why earlier attempts at a case failed
     cases.parquet, findings.parquet, lumps.parquet
+    sessions.jsonl             how long each go at it took
+    real_time.md               with examinations by the wall clock: how late they were
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from palpate.run.roles import OBSERVERS, WORKERS
 from palpate_models.draw import MOST_LUMPS, Draw, Range
-from palpate_models.errors import Errors, Level, levels, table
+from palpate_models.errors import Errors, Level, table
 from palpate_models.load import ScenarioError, explain, parse_yaml
 from palpate_models.section import Length, Section
 
@@ -127,43 +127,43 @@ class Study(Section):
     populations: Annotated[dict[Name, Population], Field(min_length=1)]
     errors: dict[Name, Errors] = Field(default_factory=dict)
     """What is wrong with the equipment, by a name for it; as the scenarios have it where there is none."""
+    each_error: tuple[str, ...] = ()
+    """Besides, each of these alone, a section of the errors such as `camera` or a field such as `force.tare_n` ..."""
     each_error_at: tuple[Level, ...] = ()
-    """Besides, each row of the table of errors alone at these levels, all others as in the first of `errors`."""
+    """... at each of these levels, with all others as in the first of `errors`."""
     methods: Annotated[dict[Name, Method], Field(min_length=1)] = Field(default_factory=lambda: {"palpate": Method()})
     record: Literal["none"] = "none"
     """Nothing is recorded: a recording of one examination has 255 MB."""
 
     @model_validator(mode="after")
     def _each(self) -> Self:
-        if self.each_error_at and not self.errors:
-            raise ValueError("each_error_at needs errors: its first entry is what all other errors are")
+        if bool(self.each_error) != bool(self.each_error_at) or (self.each_error and not self.errors):
+            raise ValueError(
+                "each_error and each_error_at need each other, and errors: its first entry is what all other errors are"
+            )
+        allowed = [*table(), *(f"{section}.{field}" for section, rows in table().items() for field in rows)]
+        if wrong := [name for name in self.each_error if name not in allowed]:
+            raise ValueError(f"each_error = {wrong[0]!r}: want one of {', '.join(allowed)}")
         if self.tier == "quick" and any(method.runtime == "wallclock" for method in self.methods.values()):
             raise ValueError("methods.*.runtime = 'wallclock' needs tier: whole")
         return self
 
     def error_levels(self) -> dict[str, Errors | None]:
-        """What is wrong with the equipment, by name: `errors`, and `section.field=level` for each error of its own.
+        """What is wrong with the equipment, by name: `errors`, and `name=level` for each error of its own.
 
         None stands for what the scenario says. An error that a level leaves as it is in the first of `errors` is left out.
         """
         if not self.errors:
             return {"": None}
         found: dict[str, Errors | None] = dict(self.errors)
-        base = next(iter(self.errors.values())).model_dump(mode="json")
-        for section, rows in table().items():
-            usual = type(getattr(Errors(), section))()
-            for field, level in product(rows, self.each_error_at):
-                value = levels()[level][section][field] if level in levels() else getattr(usual, field)
-                if value != base[section][field]:
-                    found[f"{section}.{field}={level}"] = Errors.model_validate(
-                        {**base, section: {**base[section], field: value}}
-                    )
+        base = next(iter(self.errors.values()))
+        for name, level in product(self.each_error, self.each_error_at):
+            section, _, field = name.partition(".")
+            usual, changed = getattr(Errors(level=level), section), getattr(base, section)
+            changed = changed.model_copy(update={field: getattr(usual, field)}) if field else usual
+            if changed != getattr(base, section):
+                found[f"{name}={level}"] = base.model_copy(update={section: changed})
         return found
-
-    @property
-    def has_digest(self) -> bool:
-        """Whether its results can be repeated to the last bit."""
-        return all(method.runtime == "lockstep" for method in self.methods.values())
 
 
 def study_names() -> tuple[str, ...]:
