@@ -77,5 +77,5 @@ def cluster(count: int, scheduler: str | None) -> Iterator[Workers]:
                 client = stack.enter_context(Client(scheduler, timeout=CONNECT_S))
         except (OSError, ValueError, TimeoutError) as error:
             raise WorkersError(f"--scheduler {scheduler}: {error}" if scheduler else f"--workers {count}: {error}") from error
-        known = sum(client.nthreads().values()) or count
+        known = sum(client.nthreads().values()) or 1
         yield Workers(client.get_executor(pure=False), known, client.dashboard_link, (KilledWorker,))
