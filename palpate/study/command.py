@@ -33,9 +33,12 @@ SPLITS = ("tune", "test")
 class _RunByDefault(typer.core.TyperGroup):
     """`palpate study NAME` is short for `palpate study run NAME`."""
 
+    usual = "run"
+    """The command of a word that is none."""
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """The words, with `run` before a name that is no command."""
-        words = ["run", *args] if args and not args[0].startswith("-") and args[0] not in self.commands else args
+        words = [self.usual, *args] if args and not args[0].startswith("-") and args[0] not in self.commands else args
         return super().parse_args(ctx, words)
 
 

@@ -29,7 +29,9 @@ from palpate.study.outcome import ATTEMPTS, Outcome, case_file, read_outcome, wr
 from palpate.study.workers import Workers
 
 BATCH: Final = {"whole": 1, "quick": 8}
-"""Cases a task."""
+"""Most cases a task ..."""
+SHARE: Final = 4
+"""... and so many tasks a worker at least, so that none waits for another at the end."""
 Tell = Callable[[Outcome], None]
 """Hears of every case that has an outcome now."""
 
@@ -59,7 +61,7 @@ def run_cases(folder: Path, cases: Sequence[Case], workers: Workers, tell: Tell)
     def submit(batch: list[Case]) -> None:
         running[workers.executor.submit(run_batch, [case.model_dump_json() for case in batch])] = batch
 
-    size = BATCH[cases[0].tier] if cases else 1
+    size = max(1, min(BATCH[todo[0].tier], len(todo) // (SHARE * workers.count))) if todo else 1
     for first in range(0, len(todo), size):
         submit(todo[first : first + size])
     while running:

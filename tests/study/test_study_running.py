@@ -97,14 +97,18 @@ def test_parts_of_different_studies_are_not_put_together(folder: Path, tmp_path:
         merge([folder, tmp_path], tmp_path / "whole")
 
 
+def command(tmp_path: Path, *options: str) -> list[str]:
+    """The toy by the command line, into `tmp_path / "out"`."""
+    (tmp_path / "toy.yaml").write_text(yaml.safe_dump(TOY))
+    return [sys.executable, "-m", "palpate", "study", str(tmp_path / "toy.yaml"), "-o", str(tmp_path / "out"), *options]
+
+
 def test_a_killed_worker_costs_no_case(folder: Path, tmp_path: Path) -> None:
     """Dask starts it anew, and gives its cases to whoever is free."""
-    open_folder(tmp_path, manifest_of("toy", CASES))
-    with cluster(2, None) as workers:
-        killed = _strike(_case_process, lambda process: os.kill(process.ppid(), signal.SIGKILL))
-        run_cases(tmp_path, CASES, workers, lambda _: None)
+    killed = _strike(_case_process, lambda process: os.kill(process.ppid(), signal.SIGKILL))
+    subprocess.run(command(tmp_path, "--workers", "2"), check=True)
     assert killed.is_set()
-    assert digest_of(tmp_path) == digest_of(folder)
+    assert digest_of(tmp_path / "out") == digest_of(folder)
 
 
 def test_a_study_goes_on_after_its_scheduler_was_killed(
@@ -123,27 +127,15 @@ def test_a_study_goes_on_after_its_command_was_killed(folder: Path, tmp_path: Pa
     """Killed when the first case is done, then called again; what is done is not done again."""
     (tmp_path / "toy.yaml").write_text(yaml.safe_dump(TOY))
     out = tmp_path / "out"
-    command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "study",
-        str(tmp_path / "toy.yaml"),
-        "-o",
-        str(out),
-        "--shard",
-        "1/1",
-        "--workers",
-        "1",
-    ]
-    first = subprocess.Popen(command)
+    words = command(tmp_path, "--shard", "1/1", "--workers", "1")
+    first = subprocess.Popen(words)
     while not list((out / "cases").glob("*.json")):
         assert first.poll() is None
         time.sleep(0.1)
     first.kill()
     first.wait()
     done = {path.name: path.stat().st_mtime_ns for path in (out / "cases").glob("*.json")}
-    subprocess.run(command, check=True)
+    subprocess.run(words, check=True)
     assert done.items() <= {path.name: path.stat().st_mtime_ns for path in (out / "cases").glob("*.json")}.items()
     assert digest_of(out) == digest_of(folder) == json.loads((out / "run.json").read_text())["digest"]
     assert (out / "study.html").is_file()
