@@ -144,8 +144,8 @@ class Study(Section):
         allowed = [*table(), *(f"{section}.{field}" for section, rows in table().items() for field in rows)]
         if wrong := [name for name in self.each_error if name not in allowed]:
             raise ValueError(f"each_error = {wrong[0]!r}: want one of {', '.join(allowed)}")
-        if self.tier == "quick" and any(method.runtime == "wallclock" for method in self.methods.values()):
-            raise ValueError("methods.*.runtime = 'wallclock' needs tier: whole")
+        if self.tier == "quick" and any(method.runtime == "wallclock" or method.periods for method in self.methods.values()):
+            raise ValueError("runtime: wallclock and periods of a method need tier: whole")
         return self
 
     def error_levels(self) -> dict[str, Errors | None]:

@@ -20,7 +20,7 @@ def test_ids_do_not_depend_on_what_things_are_called() -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"tier": "whole"},
+        {"tier": "quick"},
         {"errors": {"poor": "poor"}},
         {"methods": {"m": {"settings": {"exam.depth_m": 0.008}}}},
         {"methods": {"m": {"periods": {"control": 5}}}},
@@ -28,8 +28,8 @@ def test_ids_do_not_depend_on_what_things_are_called() -> None:
     ],
 )
 def test_ids_depend_on_everything_that_decides_a_result(changes: dict[str, object]) -> None:
-    ids = {case.case_id for case in cases_of(study())}
-    assert ids.isdisjoint(case.case_id for case in cases_of(study(**changes)))
+    ids = {case.case_id for case in cases_of(study(tier="whole"))}
+    assert ids.isdisjoint(case.case_id for case in cases_of(study(**{"tier": "whole", **changes})))
 
 
 def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path) -> None:

@@ -125,7 +125,6 @@ def test_a_study_goes_on_after_its_scheduler_was_killed(
 
 def test_a_study_goes_on_after_its_command_was_killed(folder: Path, tmp_path: Path) -> None:
     """Killed when the first case is done, then called again; what is done is not done again."""
-    (tmp_path / "toy.yaml").write_text(yaml.safe_dump(TOY))
     out = tmp_path / "out"
     words = command(tmp_path, "--shard", "1/1", "--workers", "1")
     first = subprocess.Popen(words)

@@ -35,6 +35,7 @@ def written(tmp_path: Path, text: str) -> str:
         (PLAIN + "errors: {bad: awful}", ("errors.bad", "awful", "typical")),
         (PLAIN + "errors: {t: typical}\neach_error: [force.x]\neach_error_at: [poor]", ("force.x", "force.gain")),
         (PLAIN + "populations: {b: {scenario: person}}", ("mine.yaml", "populations stands twice")),
+        (PLAIN + "tier: quick\nmethods: {m: {runtime: wallclock}}", ("mine.yaml", "wallclock", "tier: whole")),
         (PLAIN + "record: all", ("record", "'all'", "'none'")),
         ("[1, 2]", ("mine.yaml", "mapping")),
     ],
