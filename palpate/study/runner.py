@@ -32,6 +32,8 @@ BATCH: Final = {"whole": 1, "quick": 8}
 """Most cases a task ..."""
 SHARE: Final = 4
 """... and so many tasks a worker at least, so that none waits for another at the end."""
+LOOK_S: Final = 2.0
+"""How often it is looked whether the workers are still there."""
 Tell = Callable[[Outcome], None]
 """Hears of every case that has an outcome now."""
 
@@ -65,7 +67,9 @@ def run_cases(folder: Path, cases: Sequence[Case], workers: Workers, tell: Tell)
     for first in range(0, len(todo), size):
         submit(todo[first : first + size])
     while running:
-        finished, _ = wait(running, return_when=FIRST_COMPLETED)
+        finished, _ = wait(running, timeout=LOOK_S, return_when=FIRST_COMPLETED)
+        if not finished and not workers.alive():
+            raise StudyStopped("the scheduler is gone")
         for future in finished:
             batch = running.pop(future)
             for case, attempt in zip(batch, _attempts(future, batch, workers), strict=True):

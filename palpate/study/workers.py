@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -31,8 +31,10 @@ class Workers:
     """How many cases are examined at a time, as far as is known now: a cluster may grow."""
     dashboard: str | None
     """Where Dask shows what its workers do."""
-    killers: tuple[type[Exception], ...]
+    killers: tuple[type[Exception], ...] = ()
     """What a task raises whose worker was lost again and again."""
+    alive: Callable[[], bool] = lambda: True
+    """Whether anything can still come back: a client that has lost its scheduler waits for results for ever."""
 
 
 def cores() -> int:
@@ -45,7 +47,7 @@ def threads(count: int) -> Iterator[Workers]:
     """Threads of this process, each with a process of its own for its case; no scheduler."""
     executor = ThreadPoolExecutor(count)
     try:
-        yield Workers(executor, count, None, ())
+        yield Workers(executor, count, None)
     finally:
         executor.shutdown(wait=False, cancel_futures=True)
         kill_all()
@@ -81,4 +83,6 @@ def cluster(count: int, scheduler: str | None) -> Iterator[Workers]:
         except (OSError, ValueError, TimeoutError) as error:
             raise WorkersError(f"--scheduler {scheduler}: {error}" if scheduler else f"--workers {count}: {error}") from error
         known = sum(client.nthreads().values()) or 1
-        yield Workers(client.get_executor(pure=False), known, client.dashboard_link, (KilledWorker,))
+        yield Workers(
+            client.get_executor(pure=False), known, client.dashboard_link, (KilledWorker,), lambda: client.status == "running"
+        )
