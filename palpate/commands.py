@@ -47,14 +47,12 @@ GROUPS = {
         "conduct": "palpate.run.command:conduct",
     },
     "Measure": {
-        "evaluate": "palpate_benchmarks.measure_commands:evaluate",
+        "study": "palpate.study.command:app",
         "validate": "palpate_validation.cli:app",
         "reproduce": "palpate_reproduction.command:reproduce",
-        "swaps": "palpate_benchmarks.swaps_command:swaps",
-        "wallclock": "palpate_benchmarks.wallclock_command:wallclock",
     },
     "Maintain": {
-        "bench": "palpate_benchmarks.measure_commands:bench",
+        "bench": "palpate_benchmarks.bench_command:bench",
         "faults": "palpate_benchmarks.campaign_command:faults",
         "fuzz": "palpate.fuzz.command:fuzz",
     },

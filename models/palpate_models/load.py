@@ -91,7 +91,7 @@ def _override(raw: dict[str, Any], setting: str) -> None:
         node = node[_index(node, parent, setting)] if isinstance(node, list) else node.setdefault(parent, {})
         if not isinstance(node, dict | list):
             raise ScenarioError(f"--set {setting}: {parent!r} is a value, not a section")
-    node[_index(node, last, setting) if isinstance(node, list) else last] = _parse(value, f"--set {setting}")
+    node[_index(node, last, setting) if isinstance(node, list) else last] = parse_yaml(value, f"--set {setting}")
 
 
 def _index(items: list[Any], word: str, setting: str) -> int:
@@ -101,13 +101,13 @@ def _index(items: list[Any], word: str, setting: str) -> int:
     return int(word)
 
 
-def _parse(text: str, name: str) -> Any:
-    """YAML as Python values. PyYAML raises ValueError for a date such as 2001-13-45, and RecursionError for deep nesting."""
+def parse_yaml(text: str, name: str) -> Any:
+    """YAML as Python values. Raises ScenarioError naming the file `name` and what is wrong."""
     try:
         return yaml.load(text, _Loader)
     except _TwiceError as error:
         raise ScenarioError(f"{name}: {error}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError for 2001-13-45, RecursionError for deep nesting
         raise ScenarioError(f"{name}: not YAML: {error}") from error
 
 
@@ -117,7 +117,7 @@ def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = 
     Raises ScenarioError naming file, field, value and what is allowed.
     """
     text, name = _read(source)
-    raw = _parse(text, name) or {}
+    raw = parse_yaml(text, name) or {}
     if not isinstance(raw, dict):
         raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)

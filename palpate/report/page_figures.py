@@ -31,6 +31,7 @@ from palpate_models.frames import Array
 MEASURED: Final = "#c2410c"
 TRUE: Final = "#7c3aed"
 LIMIT: Final = "#b91c1c"
+GRID: Final = "#e5e9ec"
 _PHASE_TINTS: Final = {
     ExamState.PHASE_LOOK: ("look", "#dbeafe"),
     ExamState.PHASE_PLAN: ("plan", "#ede9fe"),
@@ -58,11 +59,12 @@ def _png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def _plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
+def plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
+    """Labels and a light grid."""
     axes.set_ylabel(ylabel, color=INK, fontsize=9)
     axes.set_xlabel(xlabel, color=INK, fontsize=9)
     axes.tick_params(labelsize=8.5, colors=INK)
-    axes.grid(color="#e5e9ec", lw=0.7)
+    axes.grid(color=GRID, lw=0.7)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -122,12 +124,12 @@ def record(evidence: Evidence, limit_n: float) -> bytes | None:
     if evidence.force_limited.any():
         at = evidence.force_limited
         force.plot(evidence.time[at], evidence.force[at], ".", ms=2, color=LIMIT, label="depth yields to the limit")
-    _plain(force, "normal force [N]")
+    plain(force, "normal force [N]")
     measured = np.where(evidence.depth * 1e3 > _FREE_MM, evidence.depth * 1e3, np.nan)
     wanted = np.where(evidence.setpoint * 1e3 > _FREE_MM, evidence.setpoint * 1e3, np.nan)
     depth.plot(evidence.time, wanted, color=QUIET, lw=1.4, label="set-point")
     depth.plot(evidence.time, measured, color=MEASURED, lw=0.7, label="measured depth")
-    _plain(depth, "depth [mm]", "simulated time [s]")
+    plain(depth, "depth [mm]", "simulated time [s]")
     depth.set_ylim(-5, None)
     for axes in (force, depth):
         axes.legend(fontsize=8.5, ncols=9, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
@@ -145,7 +147,7 @@ def force_depth(evidence: Evidence) -> bytes | None:
     image = axes.scatter(
         evidence.depth[held] * 1e3, evidence.force[held], c=evidence.time[held], s=2, cmap="viridis", rasterized=True
     )
-    _plain(axes, "measured normal force [N]", "measured depth [mm]")
+    plain(axes, "measured normal force [N]", "measured depth [mm]")
     colour_bar(figure, image, axes, "simulated time [s]")
     return _png(figure)
 
@@ -183,6 +185,6 @@ def _depth_errors(axes: Axes, evidence: Evidence) -> None:
         (evidence.depth - true, MEASURED, "measured less true depth"),
     ):
         axes.hist(np.clip(values[steady] * 1e3, -0.6, 0.6), bins=bins.tolist(), color=color, alpha=0.55, label=label)
-    _plain(axes, "readings in steady contact", "depth error [mm]")
+    plain(axes, "readings in steady contact", "depth error [mm]")
     axes.legend(fontsize=8.5, frameon=False)
     panel_title(axes, "f", "Error of the depth", "in steady contact")

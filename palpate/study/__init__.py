@@ -1,0 +1,1 @@
+"""Studies: hundreds of examinations by one command, and what they say with intervals."""

@@ -1,0 +1,51 @@
+"""How well people do it, for every plot of detection: published figures with their sources, and what they are not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+SOURCE: Final = (
+    "Fletcher et al., Physicians' abilities to detect lumps in silicone breast models, JAMA 1985;253:2224-2228,"
+    " doi:10.1001/jama.1985.03350390066027"
+)
+CAVEAT: Final = (
+    "80 physicians searched silicone breast models by hand: another organ, smaller lumps, no abdomen that breathes."
+    " The line says what trained hands reach where it was measured; it is no comparison on equal patients."
+)
+FOUND: Final = 0.44
+"""Part of all lumps that the 80 physicians found, the mean (range 0.17 to 0.83)."""
+BY_HARDNESS: Final = {"hard": 0.56, "soft": 0.40}
+
+RESIDENTS: Final = (
+    "How do women compare with internal medicine residents in breast lump detection?, J Gen Intern Med, doi:10.1007/BF02597396"
+)
+
+
+@dataclass(frozen=True)
+class HumanPoint:
+    """A rate of detection by hand at one size of lump."""
+
+    size_m: float
+    """As the source gives it, 0.3 and 1.0 cm lumps; drawn here as their diameter, which is what lumps of models are sold by."""
+    found: float
+
+
+BY_SIZE: Final = (HumanPoint(0.003, 0.14), HumanPoint(0.010, 0.87))
+
+RESIDENTS_SENSITIVITY: Final = 0.58
+"""Part of 18 lumps in six silicone models that 62 residents found."""
+RESIDENTS_SPECIFICITY: Final = 0.52
+"""Part of the models that they examined without a false finding."""
+
+
+def as_json() -> dict[str, object]:
+    """The same for study.json."""
+    return {
+        "source": SOURCE,
+        "caveat": CAVEAT,
+        "found": FOUND,
+        "by_size": [{"size_m": point.size_m, "found": point.found} for point in BY_SIZE],
+        "by_hardness": BY_HARDNESS,
+        "residents": {"source": RESIDENTS, "sensitivity": RESIDENTS_SENSITIVITY, "specificity": RESIDENTS_SPECIFICITY},
+    }

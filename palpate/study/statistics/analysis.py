@@ -1,0 +1,56 @@
+"""All statistics of one method, with the curves that its plots need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pandas as pd
+
+from palpate.study.statistics.calibration import Calibration, calibration
+from palpate.study.statistics.detectability import FELT, MADE, Surface, observed, surface
+from palpate.study.statistics.effort import COVERED, MEASURED, Spread, coverage, spread
+from palpate.study.statistics.errors import FindingErrors, finding_errors
+from palpate.study.statistics.estimate import Bootstrap, Estimate
+from palpate.study.statistics.froc import Froc, froc
+from palpate.study.statistics.rates import Rates, by_population, rates
+from palpate.study.statistics.reading import Variant
+from palpate.study.statistics.roc import Roc, roc
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """One method. None stands for what its cases cannot give."""
+
+    name: str
+    cases: pd.DataFrame
+    rates: Rates
+    populations: dict[str, Rates]
+    roc: Roc | None
+    froc: Froc | None
+    felt: Surface | None
+    made: Surface | None
+    observed: dict[str, list[tuple[float, Estimate]]]
+    """Part of the lumps found, in bins over each covariate."""
+    errors: FindingErrors
+    calibration: Calibration | None
+    effort: dict[str, Spread]
+    coverage: dict[str, Estimate]
+
+
+def analyse(variant: Variant, bootstrap: Bootstrap) -> Analysis:
+    """The statistics of one method."""
+    return Analysis(
+        name=variant.name,
+        cases=variant.cases,
+        rates=rates(variant, bootstrap),
+        populations=by_population(variant, bootstrap),
+        roc=roc(variant, bootstrap),
+        froc=froc(variant, bootstrap),
+        felt=surface(variant, FELT, bootstrap),
+        made=surface(variant, MADE, bootstrap),
+        observed={name: observed(variant, name, bootstrap) for name in dict.fromkeys((*FELT, *MADE))},
+        errors=finding_errors(variant, bootstrap),
+        calibration=calibration(variant, bootstrap),
+        effort={name: spread(variant, name, bootstrap) for name in MEASURED},
+        coverage={name: coverage(variant, name, bootstrap) for name in COVERED},
+    )

@@ -1,0 +1,196 @@
+"""Two methods on the same patients: paired differences, McNemar's test, and equivalence by two one-sided tests."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+from statsmodels.stats.contingency_tables import mcnemar
+from statsmodels.stats.weightstats import ttost_paired
+
+from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, estimate, percentiles, wilson
+from palpate.study.statistics.froc import froc
+from palpate.study.statistics.reading import Variant
+from palpate.study.statistics.roc import roc
+
+
+class Quantity(NamedTuple):
+    """What is compared patient by patient."""
+
+    words: str
+    unit: str
+    margin: float
+    """Two methods are equivalent when their mean difference is within it."""
+
+
+QUANTITIES: Final = {
+    "lumps_found": Quantity("part of a patient's lumps that is found", "", 0.10),
+    "false_findings": Quantity("false findings an examination", "", 0.10),
+    "score": Quantity("greatest confidence", "", 0.10),
+    "place_error_m": Quantity("error of place of the findings", "m", 0.003),
+    "log_ratio": Quantity("logarithm of the findings' stiffness ratio", "", 0.10),
+    "peak_force_n": Quantity("greatest force", "N", 1.0),
+    "exam_time_s": Quantity("time of the examination", "s", 10.0),
+}
+"""The margins were set before any study was run: what would change nothing for a clinician."""
+
+COUNTED: Final = ("lumps_found", "false_findings")
+"""Quantities of which equal values in every patient say no more than how rare unequal ones are."""
+
+
+class McNemar(BaseModel):
+    """Patients in whom two methods differ (McNemar, Psychometrika 1947;12:153), by the exact binomial test."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    only_reference: int
+    """Right with the reference alone."""
+    only_other: int
+    """Right with the other alone."""
+    n: int
+    difference: Estimate
+    """Rate of the other less that of the reference."""
+    p: float
+
+
+class Difference(BaseModel):
+    """The other method less the reference, patient by patient."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    words: str
+    unit: str
+    mean: Estimate
+    margin: float
+    low_90: float | None
+    """90 % interval of the mean: within the margins where the methods are equivalent."""
+    high_90: float | None
+    p_equivalence: float | None
+    """Greater one of the two one-sided tests' (Schuirmann, J Pharmacokinet Biopharm 1987;15:657); None where all differences are one."""
+    equivalent: bool | None
+    """Whether the 90 % interval is within the margins; None where it is not known."""
+
+
+class Comparison(BaseModel):
+    """Another method against the reference, on the patients that both examined."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    reference: str
+    other: str
+    patients: int
+    auc: Estimate | None
+    """Differences, other less reference."""
+    froc_mean: Estimate | None
+    sensitivity_at_zero: Estimate | None
+    sensitivity: McNemar
+    """Of patients with a lump that can be felt."""
+    specificity: McNemar
+    """Of persons without a lump."""
+    quantities: dict[str, Difference]
+
+
+def compare(reference: Variant, other: Variant, bootstrap: Bootstrap) -> Comparison:
+    """The comparison of two methods. A case that failed counts against its method here too."""
+    shared = np.intersect1d(reference.cases["patient"], other.cases["patient"])
+    a, b = reference.only(shared), other.only(shared)
+    both = a.cases.merge(b.cases, on="patient", suffixes=("_a", "_b"))
+    ill, healthy = both[both["ill_a"] | both["ill_b"]], both[both["healthy_a"] & both["healthy_b"]]
+    return Comparison(
+        reference=reference.name,
+        other=other.name,
+        patients=len(shared),
+        **_curves(a, b, bootstrap),
+        sensitivity=_mcnemar(ill["found_a"] > 0, ill["found_b"] > 0, ill["patient"], bootstrap),
+        specificity=_mcnemar(healthy["false_alarms_a"] == 0, healthy["false_alarms_b"] == 0, healthy["patient"], bootstrap),
+        quantities={name: _difference(name, _values(a, name), _values(b, name), bootstrap) for name in QUANTITIES},
+    )
+
+
+def _curves(a: Variant, b: Variant, bootstrap: Bootstrap) -> dict[str, Estimate | None]:
+    """Differences of what is read off whole curves."""
+    found: dict[str, Estimate | None] = {"auc": None, "froc_mean": None, "sensitivity_at_zero": None}
+    if (roc_a := roc(a, bootstrap)) and (roc_b := roc(b, bootstrap)):
+        found["auc"] = _less(roc_b.auc, roc_a.auc, roc_b.replicates - roc_a.replicates)
+    if (froc_a := froc(a, bootstrap)) and (froc_b := froc(b, bootstrap)):
+        found["froc_mean"] = _less(froc_b.mean, froc_a.mean, froc_b.mean_replicates - froc_a.mean_replicates)
+        found["sensitivity_at_zero"] = _less(froc_b.at_zero, froc_a.at_zero, froc_b.zero_replicates - froc_a.zero_replicates)
+    return found
+
+
+def _less(b: Estimate, a: Estimate, replicates: Array) -> Estimate:
+    """b - a; where both are at the end of their range, with what both intervals allow."""
+    if None in (a.value, a.low, a.high, b.value, b.low, b.high):
+        return Estimate(value=None, n=a.n, of=a.of)
+
+    def of_both() -> Estimate:
+        low, high = (float(x or 0) - float(y or 0) for x, y in ((b.low, a.high), (b.high, a.low)))
+        return Estimate(value=value, low=low, high=high, n=a.n, of=a.of, interval="from both intervals")
+
+    value = float(b.value or 0) - float(a.value or 0)
+    return estimate(value, replicates, a.n, a.of, of_both)
+
+
+def _mcnemar(a: pd.Series, b: pd.Series, patient: pd.Series, bootstrap: Bootstrap) -> McNemar:
+    """Where no patient tells the methods apart, the rates differ by no more than such patients may be (Wilson)."""
+    n, only_a, only_b = len(a), int((a & ~b).sum()), int((b & ~a).sum())
+    if n == 0:
+        nothing = Estimate(value=None, n=0, of="patients")
+        return McNemar(only_reference=0, only_other=0, n=0, difference=nothing, p=1.0)
+    total = bootstrap.counts.shape[1]
+    gain = np.bincount(patient, weights=b.astype(float) - a.astype(float), minlength=total)
+
+    def alike() -> Estimate:
+        most = wilson(only_a + only_b, n, "patients").high
+        low, high = (-1.0 if most is None else -most), most
+        return Estimate(value=(only_b - only_a) / n, low=low, high=high, n=n, of="patients", interval="Wilson, of patients who differ")
+
+    seen = np.bincount(patient, minlength=total).astype(np.float64)
+    difference = estimate((only_b - only_a) / n, bootstrap.ratio(gain, seen), n, "patients", alike)
+    p = float(mcnemar([[0, only_a], [only_b, 0]], exact=True).pvalue) if only_a + only_b else 1.0
+    return McNemar(only_reference=only_a, only_other=only_b, n=n, difference=difference, p=p)
+
+
+def _values(variant: Variant, name: str) -> pd.Series:
+    """A quantity of each patient, by his index; missing where it is not defined or not known."""
+    cases = variant.cases.set_index("patient")
+    if name == "lumps_found":
+        return (cases["found"] / cases["lumps"])[cases["ill"]]
+    if name == "false_findings":
+        return cases["false_alarms"]
+    if name in {"place_error_m", "log_ratio"}:
+        matched = variant.findings[variant.findings["reported"].astype(bool) & (variant.findings["lump"] >= 0)]
+        values = matched["place_error_m"] if name == "place_error_m" else np.log(matched["ratio"])
+        return values.astype(float).groupby(matched["patient"]).mean()
+    return cases[name].astype(float)[~cases["failed"]]
+
+
+def _difference(name: str, a: pd.Series, b: pd.Series, bootstrap: Bootstrap) -> Difference:
+    words, unit, margin = QUANTITIES[name]
+    pairs = pd.concat((a, b), axis=1, join="inner").dropna().astype(float)
+    x, y = pairs.to_numpy().T
+    patient: NDArray[np.intp] = pairs.index.to_numpy(dtype=np.intp)
+    n, gain = len(pairs), y - x
+    total = bootstrap.counts.shape[1]
+    sums, seen = (np.bincount(patient, weights=weights, minlength=total) for weights in (gain, np.ones(n)))
+    replicates = bootstrap.ratio(sums, seen)
+    varies = n > 2 and float(gain.std()) > 1e-12
+    ends = percentiles(replicates, 2 * LEVEL - 1) if n > 2 else None
+    mean = estimate(float(gain.mean()) if n else np.nan, replicates, n, "patients")
+    if n and not varies and name in COUNTED:
+        most = float(wilson(0, n, "patients").high or 1)
+        ends = (-most, most)
+        mean = mean.model_copy(update={"low": -most, "high": most, "interval": "Wilson, of patients who differ"})
+    return Difference(
+        words=words,
+        unit=unit,
+        mean=mean,
+        margin=margin,
+        low_90=ends and ends[0],
+        high_90=ends and ends[1],
+        p_equivalence=float(ttost_paired(y, x, -margin, margin)[0]) if varies else None,
+        equivalent=None if ends is None else bool(-margin < ends[0] and ends[1] < margin),
+    )

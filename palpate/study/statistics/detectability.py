@@ -1,0 +1,186 @@
+"""Detectability: the probability that a lump is found, against how it is felt and how big and deep it is; the smallest one found.
+
+A psychometric surface: P(found) = (1 - lapse) / (1 + exp(-(b_0 + sum b_i z_i))) with standardised covariates z (Wichmann and
+Hill, Percept Psychophys 2001;63:1293). The lapse, lumps that are missed however clear they are, is kept where AIC wants it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit, logit
+
+from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, bounded, percentiles
+from palpate.study.statistics.reading import Variant
+
+FELT: Final = ("felt_contrast", "felt_radius_m", "depth_m")
+"""What of a lump reaches the skin: force with it over force without it, radius of the circle as big as its felt area, depth."""
+MADE: Final = ("contrast", "radius_m", "depth_m")
+"""The lump itself: its stiffness over that of its surroundings, radius, depth."""
+LOGARITHMIC: Final = ("felt_contrast", "contrast")
+GREATEST_LAPSE: Final = 0.25
+PRIOR_SD: Final = 10.0
+"""Standard deviation of the weak normal prior on every standardised slope: where found and missed lumps do not overlap at all,
+the likelihood alone would have no greatest value (Gelman et al., Ann Appl Stat 2008;2:1360)."""
+QUARTILES: Final = (0.25, 0.5, 0.75)
+FEWEST: Final = 10
+"""Lumps found, and lumps missed, below which no surface is fitted."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A fitted psychometric surface over lumps with the covariates `names`."""
+
+    names: tuple[str, ...]
+    left_out: tuple[str, ...]
+    """Covariates that all lumps share."""
+    centre: Array
+    """Of the covariates, contrasts in logarithms; shape (k,)."""
+    scale: Array
+    range: dict[str, tuple[float, float]]
+    """Of each covariate among the lumps, in its own unit."""
+    quartiles: dict[str, tuple[float, float, float]]
+    """Of each covariate."""
+    weights: Array
+    """b_0 and b_i, shape (k + 1,)."""
+    lapse: float
+    replicates: Array
+    """Of the weights and the lapse, shape (folds, k + 2)."""
+    n: int
+    found: int
+
+    def typical(self, name: str) -> float:
+        """The median of a covariate."""
+        return self.quartiles[name][1]
+
+    def probability(self, lumps: dict[str, Array]) -> tuple[Array, Array, Array]:
+        """P(found) and its pointwise interval of lumps with these covariates, each of shape (m,); typical where not given."""
+        m = max(map(len, lumps.values()))
+        z = self._z({name: lumps.get(name, np.full(m, self.typical(name))) for name in self.names})
+        replicates = (1 - self.replicates[:, -1:]) * expit(self.replicates[:, :-1] @ z.T)
+        low, high = np.array([percentiles(column) or (np.nan, np.nan) for column in replicates.T]).T
+        return (1 - self.lapse) * expit(z @ self.weights), low, high
+
+    def threshold(self, name: str, chance: float = 0.9, **others: float) -> Estimate:
+        """The value of the covariate `name` at which lumps are found with probability `chance`; others typical where not given.
+
+        It is the least such value where more of the covariate helps, and the greatest where it hinders. None where that is
+        not within the range of the lumps: a surface says nothing of lumps that it has not seen.
+        """
+        i = self.names.index(name)
+        z = self._z({key: np.array([others.get(key, self.typical(key))]) for key in self.names})[0]
+        parameters = np.vstack((np.append(self.weights, self.lapse), self.replicates))
+        rest = parameters[:, :-1] @ np.where(np.arange(len(z)) == i + 1, 0, z)
+        direction = np.sign(self.weights[i + 1])
+        slope = parameters[:, i + 1] * direction
+        wanted = logit(np.minimum(chance / (1 - parameters[:, -1]), 1.0)) - rest
+        at = direction * np.divide(wanted, slope, out=np.full(len(slope), np.inf), where=slope > 0)
+        values = self.centre[i] + self.scale[i] * at
+        values = np.exp(np.minimum(values, 700)) if name in LOGARITHMIC else values
+        least, greatest = self.range[name]
+        if not least <= values[0] <= greatest:
+            beyond = "below the least" if values[0] < least else "above the greatest"
+            return Estimate(value=None, n=self.n, of="lumps", interval=f"{beyond} of the study, {least:.4g} to {greatest:.4g}")
+        low, high = np.clip(np.quantile(values[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest"), least, greatest)
+        return Estimate(value=float(values[0]), low=float(low), high=float(high), n=self.n, of="lumps")
+
+    def _z(self, lumps: dict[str, Array]) -> Array:
+        x = np.column_stack([np.log(lumps[name]) if name in LOGARITHMIC else lumps[name] for name in self.names])
+        return np.column_stack((np.ones(len(x)), (x - self.centre) / self.scale))
+
+
+def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Surface | None:
+    """The surface of one method over its lumps; None with fewer than FEWEST lumps found or missed, or where all are alike."""
+    lumps = variant.lumps.dropna(subset=list(names))
+    lumps = lumps[(lumps[[name for name in names if name in LOGARITHMIC]] > 0).all(axis=1)]
+    found = lumps["found"].to_numpy(dtype=bool)
+    if min(found.sum(), (~found).sum()) < FEWEST:
+        return None
+    varied = tuple(name for name in names if np.ptp(lumps[name].to_numpy(dtype=np.float64)) > 1e-9)
+    if not varied:
+        return None
+    x = np.column_stack([_covariate(lumps, name) for name in varied])
+    centre, scale = x.mean(axis=0), x.std(axis=0)
+    z = np.column_stack((np.ones(len(x)), (x - centre) / scale))
+    once = np.ones(len(z))
+    plain, lapsing = (fit(z, found, once, with_lapse) for with_lapse in (False, True))
+    with_lapse = lapsing[1] + 2 < plain[1] - 1e-9
+    best = (lapsing if with_lapse else plain)[0]
+    patient = lumps["patient"].to_numpy()
+    replicates = np.array([fit(z, found, drawn[patient], with_lapse, best)[0] for drawn in bootstrap.counts])
+    values = {name: lumps[name].to_numpy(dtype=np.float64) for name in varied}
+    return Surface(
+        names=varied,
+        left_out=tuple(name for name in names if name not in varied),
+        centre=centre,
+        scale=scale,
+        range={name: (float(v.min()), float(v.max())) for name, v in values.items()},
+        quartiles={name: (float(q[0]), float(q[1]), float(q[2])) for name, v in values.items() for q in [np.quantile(v, QUARTILES)]},
+        weights=best[:-1],
+        lapse=float(best[-1]),
+        replicates=replicates,
+        n=len(lumps),
+        found=int(found.sum()),
+    )
+
+
+def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, start: Array | None = None) -> tuple[Array, float]:
+    """Weights and lapse of greatest likelihood, shape (k + 2,), and twice its negative logarithm.
+
+    Each row of `z`, shape (m, k + 1), was seen `count` times.
+    """
+    k = z.shape[1]
+    sign = np.where(found, 1.0, -1.0)
+
+    def lapse_of(free: float) -> float:
+        return GREATEST_LAPSE * float(expit(free)) if with_lapse else 0.0
+
+    def cost(parameters: Array) -> tuple[float, Array]:
+        b, lapse = parameters[:k], lapse_of(parameters[k]) if with_lapse else 0.0
+        s = expit(z @ b)
+        hit = (1 - lapse) * s
+        p = np.clip(np.where(found, hit, 1 - hit), 1e-12, None)
+        slopes = np.append(0.0, b[1:])
+        d_p = count * sign / p
+        gradient = -(d_p * (1 - lapse) * s * (1 - s)) @ z + slopes / PRIOR_SD**2
+        value = -float(count @ np.log(p)) + float(slopes @ slopes) / (2 * PRIOR_SD**2)
+        if not with_lapse:
+            return value, gradient
+        d_lapse = float(d_p @ s) * lapse * (1 - lapse / GREATEST_LAPSE)
+        return value, np.append(gradient, d_lapse)
+
+    begin = np.zeros(k) if start is None else start[:k]
+    if with_lapse:
+        share = 0.1 if start is None else np.clip(start[k] / GREATEST_LAPSE, 0.02, 0.98)
+        begin = np.append(begin, logit(share))
+    done = minimize(cost, begin, jac=True, method="L-BFGS-B")
+    lapse = lapse_of(done.x[k]) if with_lapse else 0.0
+    return np.append(done.x[:k], lapse), 2 * float(done.fun)
+
+
+def observed(variant: Variant, name: str, bootstrap: Bootstrap, bins: int = 6) -> list[tuple[float, Estimate]]:
+    """Part of the lumps that were found in bins of equal number over the covariate `name`, with the mean of each bin."""
+    lumps = variant.lumps.dropna(subset=[name])
+    if lumps.empty:
+        return []
+    edges = pd.qcut(lumps[name].astype(float), bins, labels=False, duplicates="drop")
+    rows = []
+    for _, part in lumps.groupby(edges):
+        total = bootstrap.counts.shape[1]
+        found = np.bincount(part["patient"], weights=part["found"].astype(float), minlength=total)
+        seen = np.bincount(part["patient"], minlength=total).astype(float)
+        value = float(found.sum() / seen.sum())
+        patients = int((seen > 0).sum())
+        rows.append((float(part[name].mean()), bounded(value, bootstrap.ratio(found, seen), len(part), "lumps", patients)))
+    return rows
+
+
+def _covariate(lumps: pd.DataFrame, name: str) -> Array:
+    values = lumps[name].to_numpy(dtype=np.float64)
+    return np.log(values) if name in LOGARITHMIC else values

@@ -1,0 +1,117 @@
+"""A figure with its interval and its sample size; rates with Wilson intervals, everything else by a bootstrap over patients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import isfinite
+from typing import Final
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict
+from statsmodels.stats.proportion import proportion_confint
+
+Array = NDArray[np.float64]
+
+LEVEL: Final = 0.95
+"""Of every interval."""
+FOLDS: Final = 1000
+"""Resamplings of a bootstrap."""
+
+
+class Estimate(BaseModel):
+    """A figure with its 95 % interval; None where the data do not give it."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    n: int
+    """Sample size: how many of `of` it rests on."""
+    of: str
+    """What was counted: patients, lumps, findings."""
+    interval: str = "bootstrap over patients"
+    """How the interval was made."""
+
+
+def wilson(successes: float, n: int, of: str) -> Estimate:
+    """A rate with Wilson's score interval (Wilson, J Am Stat Assoc 1927;22:209)."""
+    if n == 0:
+        return Estimate(value=None, n=0, of=of, interval="Wilson")
+    low, high = proportion_confint(successes, n, alpha=1 - LEVEL, method="wilson")
+    return Estimate(value=successes / n, low=float(low), high=float(high), n=n, of=of, interval="Wilson")
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """Resamplings of patients with replacement, within each population; the same ones for every method, so that methods are paired.
+
+    A replicate of a statistic is the statistic with every patient counted as often as he was drawn.
+    """
+
+    counts: NDArray[np.int32]
+    """How often each patient was drawn, shape (folds, patients)."""
+
+    @staticmethod
+    def draw(populations: ArrayLike, folds: int = FOLDS, seed: int = 0) -> Bootstrap:
+        """Resamplings of the patients whose population is given, shape (patients,)."""
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, crc32(b"bootstrap over patients")])))
+        names = np.asarray(populations)
+        counts = np.zeros((folds, len(names)), dtype=np.int32)
+        for name in np.unique(names):
+            member = np.flatnonzero(names == name)
+            counts[:, member] = rng.multinomial(len(member), np.full(len(member), 1 / len(member)), size=folds)
+        return Bootstrap(counts)
+
+    def ratio(self, above: Array, below: Array) -> Array:
+        """Replicates of sum(above) / sum(below), each of shape (patients,); NaN where nothing was drawn. Shape (folds,)."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray((self.counts @ above) / (self.counts @ below), dtype=np.float64)
+
+    def quantile(self, values: Array, patient: NDArray[np.intp], q: float) -> Array:
+        """Replicates of the quantile `q` of values, each of a patient's index, shapes (m,). Shape (folds,)."""
+        order = np.argsort(values)
+        drawn = np.cumsum(self.counts[:, patient[order]], axis=1)
+        at = np.argmax(drawn >= q * drawn[:, -1:], axis=1)
+        return np.where(drawn[:, -1] > 0, values[order][at], np.nan)
+
+
+def percentiles(replicates: Array, level: float = LEVEL) -> tuple[float, float] | None:
+    """The percentile interval of replicates (Efron 1979); None where fewer than half of them exist."""
+    known = replicates[np.isfinite(replicates)]
+    if 2 * len(known) < len(replicates) or not len(known):
+        return None
+    low, high = np.quantile(known, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def estimate(
+    value: float, replicates: Array, n: int, of: str, degenerate: Callable[[], Estimate] | None = None
+) -> Estimate:
+    """A figure with its bootstrap interval.
+
+    Where all replicates are one number, as when every lump was found, resampling says nothing of what was not seen;
+    `degenerate` then gives the interval.
+    """
+    if not isfinite(value):
+        return Estimate(value=None, n=n, of=of)
+    ends = percentiles(replicates)
+    if ends is not None and ends[0] == ends[1] and degenerate is not None:
+        return degenerate()
+    low, high = ends or (None, None)
+    return Estimate(value=float(value), low=low, high=high, n=n, of=of)
+
+
+def bounded(value: float, replicates: Array, n: int, of: str, patients: int) -> Estimate:
+    """A figure between 0 and 1 with its bootstrap interval; at 0 or 1 with Wilson's, as of one trial a patient."""
+    if not isfinite(value):
+        return Estimate(value=None, n=n, of=of)
+
+    def at_the_end() -> Estimate:
+        ends = wilson(value * patients, patients, "patients")
+        return Estimate(value=float(value), low=ends.low, high=ends.high, n=n, of=of, interval=f"Wilson, of {patients} patients")
+
+    return estimate(value, replicates, n, of, at_the_end)

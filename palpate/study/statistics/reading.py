@@ -1,0 +1,163 @@
+"""A study's three tables as statistics want them: patients that methods share, and failures counted against the method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from palpate.study.statistics.estimate import Array, Bootstrap
+
+COLUMNS: Final = {
+    "cases": (
+        "case_id study population method split number seed tier errors status why run_hash completed palpable not_palpable false_findings"
+        " score coverage_area coverage_lumps coverage_ratio depth_rms_m peak_force_n exam_time_s"
+    ).split(),
+    "findings": "case_id reported area_m2 ratio ratio_lower ratio_upper confidence lump place_error_m area_true_m2 ratio_true".split(),
+    "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence".split(),
+}
+"""What the statistics read of each table."""
+PATIENT: Final = ["study", "population", "split", "number"]
+"""What tells patients apart: methods, tiers and levels of errors examine the same ones."""
+VARIANT: Final = ["method", "tier", "errors"]
+WORST_ILL, WORST_HEALTHY = -1.0, 2.0
+"""Scores of cases that failed, beyond the confidences 0 to 1: of a patient with lumps, of one without."""
+
+
+class TablesError(ValueError):
+    """Tables that no statistics can be made of. Names the file and what is wrong."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The cases of one method, at one tier, with one setting of the errors: one a patient, in the order of the patients.
+
+    Rows of `cases` have beside the table's columns: `patient` (index), `failed` (failed or not completed), `lumps` (that can
+    be felt), `ill` (has such a lump), `healthy` (has no lump at all), `worst_score`, `false_alarms`, `found` (lumps).
+    """
+
+    name: str
+    cases: pd.DataFrame
+    findings: pd.DataFrame
+    """Findings and candidates of examinations that came to their end, with `patient`."""
+    lumps: pd.DataFrame
+    """With `patient`; those of failed cases are not found, with confidence 0."""
+
+    def only(self, patients: NDArray[np.intp]) -> Variant:
+        """The same of these patients alone."""
+        tables = (table[table["patient"].isin(patients)] for table in (self.cases, self.findings, self.lumps))
+        return Variant(self.name, *tables)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """A study's cases by variant. The first variant is the reference that others are compared with."""
+
+    study: str
+    splits: tuple[str, ...]
+    patients: pd.DataFrame
+    """One row a patient, its index the patient's number in `Variant`."""
+    variants: tuple[Variant, ...]
+
+    @cached_property
+    def bootstrap(self) -> Bootstrap:
+        """Resamplings of the patients, which all statistics share."""
+        return Bootstrap.draw(self.patients["population"].to_numpy(dtype=str))
+
+
+def read_tables(folder: Path) -> Tables:
+    """The tables in `folder`. Raises TablesError."""
+    read = {}
+    for name, columns in COLUMNS.items():
+        path = folder / f"{name}.parquet"
+        try:
+            table = pd.read_parquet(path)
+        except FileNotFoundError as error:
+            raise TablesError(f"{path} is not there: give the folder of a study that has run") from error
+        except (OSError, ValueError) as error:
+            raise TablesError(f"{path} cannot be read: {error}") from error
+        if missing := [column for column in columns if column not in table.columns]:
+            raise TablesError(f"{path} has no column {', '.join(missing)}; it is of another version of Palpate")
+        read[name] = table
+    if read["cases"].empty:
+        raise TablesError(f"{folder / 'cases.parquet'} has no case: run the study first")
+    return tables_of(read["cases"], read["findings"], read["lumps"])
+
+
+def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame) -> Tables:
+    """Tables from their frames. Raises TablesError for two cases of one patient in one variant."""
+    cases = cases.copy()
+    patients = cases[PATIENT].drop_duplicates().sort_values(PATIENT).reset_index(drop=True)
+    cases["patient"] = cases[PATIENT].merge(patients.reset_index(names="patient"), on=PATIENT)["patient"].to_numpy()
+    cases = _against_the_method(cases, lumps)
+    cases["variant"] = _names(cases)
+    doubled = cases[cases.duplicated(["variant", "patient"])]
+    if not doubled.empty:
+        row = doubled.iloc[0]
+        where = f"{row['population']}, {row['split']}, number {row['number']}"
+        raise TablesError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): one a patient is allowed")
+    facts = cases.set_index("case_id")[["patient", "failed"]]
+    findings, lumps = findings.join(facts, on="case_id", how="inner"), lumps.join(facts, on="case_id", how="inner")
+    findings = findings[~findings["failed"]]
+    lumps = lumps.assign(
+        found=lumps["found"].astype(bool) & ~lumps["failed"], confidence=lumps["confidence"].where(~lumps["failed"], 0.0)
+    )
+    hit = lumps[lumps["found"] & lumps["palpable"]].groupby("case_id").size()
+    cases["found"] = cases["case_id"].map(hit).fillna(0).astype(int)
+    variants = []
+    for name in _order(cases):
+        own = cases[cases["variant"] == name].sort_values("patient").reset_index(drop=True)
+        ids = own["case_id"]
+        variants.append(Variant(name, own, findings[findings["case_id"].isin(ids)], lumps[lumps["case_id"].isin(ids)]))
+    study = " + ".join(sorted(cases["study"].unique()))
+    return Tables(study, tuple(sorted(cases["split"].unique())), patients, tuple(variants))
+
+
+def per_patient(values: pd.Series, patients: NDArray[np.intp], total: int) -> Array:
+    """Sums of `values` by the patient's index, shape (total,)."""
+    return np.bincount(patients, weights=values.to_numpy(dtype=np.float64), minlength=total)
+
+
+def _against_the_method(cases: pd.DataFrame, lumps: pd.DataFrame) -> pd.DataFrame:
+    """Failed and not completed cases have the worst score, and a false alarm where there is no lump.
+
+    What is not known of a failed case's patient is taken from other cases of him, else from the median of his population.
+    """
+    failed = (cases["status"] != "done") | ~cases["completed"].fillna(False).astype(bool)
+    known = {}
+    for column in ("palpable", "not_palpable"):
+        values = pd.to_numeric(cases[column]).astype(float).where(cases["status"] == "done")
+        for group in (["patient"], PATIENT[:2]):
+            values = values.fillna(values.groupby([cases[key] for key in group]).transform("median"))
+        known[column] = values.fillna(lumps.groupby("case_id").size().reindex(cases["case_id"]).set_axis(cases.index)).fillna(0)
+    ill = known["palpable"] > 0
+    healthy = ~ill & (known["not_palpable"] == 0)
+    reported = pd.to_numeric(cases["false_findings"]).astype(float).fillna(0)
+    return cases.assign(
+        failed=failed,
+        lumps=known["palpable"],
+        ill=ill,
+        healthy=healthy,
+        worst_score=cases["score"].astype(float).mask(failed, WORST_ILL).mask(failed & healthy, WORST_HEALTHY).fillna(0.0),
+        false_alarms=reported.where(~failed | ~healthy, np.maximum(reported, 1)),
+    )
+
+
+def _names(cases: pd.DataFrame) -> pd.Series:
+    """What tells the cases of one patient apart, in words; the method where there is one case a patient."""
+    by_patient = cases.groupby("patient")
+    parts = [column for column in VARIANT if (by_patient[column].nunique(dropna=False) > 1).any()] or ["method"]
+    names = cases[parts[0]].astype(str)
+    for column in parts[1:]:
+        names = names + ", " + cases[column].astype(str)
+    return names
+
+
+def _order(cases: pd.DataFrame) -> list[str]:
+    """Variants as they first come up in the table, which is in the order of the study's file."""
+    return [str(name) for name in cases["variant"].unique()]

@@ -1,0 +1,238 @@
+"""study.json and study.html of a study, from its three tables alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from palpate.report.files import write_text
+from palpate.study import human_line
+from palpate.study.page import render
+from palpate.study.statistics.analysis import Analysis, analyse
+from palpate.study.statistics.comparison import Comparison, compare
+from palpate.study.statistics.detectability import Surface
+from palpate.study.statistics.effort import Spread
+from palpate.study.statistics.errors import Agreement
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Estimate
+from palpate.study.statistics.rates import Rates
+from palpate.study.statistics.reading import Tables, TablesError, read_tables
+
+JSON: Final = "study.json"
+PAGE: Final = "study.html"
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+
+
+class SurfaceRow(_Row):
+    """A psychometric surface over standardised covariates."""
+
+    covariates: tuple[str, ...]
+    """Contrasts in logarithms."""
+    left_out: tuple[str, ...]
+    """Covariates that all lumps share."""
+    n: int
+    """Lumps."""
+    found: int
+    weights: tuple[float, ...]
+    """Intercept, then one for each covariate: log odds by standard deviation."""
+    centre: tuple[float, ...]
+    scale: tuple[float, ...]
+    lapse: float
+    quartiles: dict[str, tuple[float, float, float]]
+    threshold_90: dict[str, Estimate]
+    """Value of each covariate from which lumps are found with 90 %, the others at their medians."""
+    smallest_90: dict[str, Estimate]
+    """Radius [m] from which lumps are found with 90 %, by contrast (its quartiles), depth at its median."""
+
+
+class AgreementRow(_Row):
+    """Of estimated and true (Bland and Altman)."""
+
+    bias: Estimate
+    lower: Estimate
+    """Limits of agreement."""
+    upper: Estimate
+
+
+class ErrorsRow(_Row):
+    """Of the findings that match a lump."""
+
+    place_mean_m: Estimate
+    place_median_m: Estimate
+    place_p95_m: Estimate
+    size_mean: Estimate
+    """Area over the true area, less one."""
+    ratio_mean: Estimate
+    """Stiffness ratio over the true ratio, less one."""
+    radius_m: AgreementRow
+    """Of the radius of the circle of equal area."""
+    log_ratio: AgreementRow
+    """Of the natural logarithm of the stiffness ratio."""
+    ratio_held: Estimate
+    """Findings whose 90 % band holds the true ratio."""
+
+
+class CalibrationRow(_Row):
+    """Of the confidences."""
+
+    slope: Estimate
+    in_the_large: Estimate
+    expected_error: Estimate
+    expected_error_by_chance: float
+    """95 % of studies with right confidences have less."""
+    brier: Estimate
+
+
+class MethodRow(_Row):
+    """All figures of one method."""
+
+    rates: Rates
+    populations: dict[str, Rates]
+    auc: Estimate | None
+    froc_mean: Estimate | None
+    froc: dict[str, Estimate]
+    """Sensitivity by false findings an examination."""
+    sensitivity_at_zero: Estimate | None
+    felt: SurfaceRow | None
+    """Detectability by what reaches the skin."""
+    made: SurfaceRow | None
+    """Detectability by the lumps themselves."""
+    errors: ErrorsRow
+    calibration: CalibrationRow | None
+    effort: dict[str, Spread]
+    coverage: dict[str, Estimate]
+
+
+class StudySummary(_Row):
+    """study.json."""
+
+    study: str
+    splits: tuple[str, ...]
+    version: str
+    """Of Palpate, by which the statistics were made."""
+    command: str
+    """That runs the study again."""
+    patients: dict[str, int]
+    """By population."""
+    reference: str
+    """The method that others are compared with."""
+    methods: dict[str, MethodRow]
+    comparisons: tuple[Comparison, ...]
+    level: float
+    """Of the intervals."""
+    bootstrap_folds: int
+    human: dict[str, object]
+    """What people find, with its source."""
+
+
+@dataclass(frozen=True)
+class Analysed:
+    """A study's figures, and the curves for its plots."""
+
+    summary: StudySummary
+    analyses: tuple[Analysis, ...]
+
+
+def summarise(folder: Path) -> None:
+    """Reads cases.parquet, findings.parquet and lumps.parquet of `folder`; writes study.json and study.html beside them.
+
+    Raises TablesError.
+    """
+    analysed = analysed_tables(read_tables(folder))
+    write_text(folder / JSON, analysed.summary.model_dump_json(indent=1) + "\n")
+    write_text(folder / PAGE, render(analysed.summary.model_dump(), analysed.analyses, analysed.summary.comparisons))
+
+
+def read_summary(path: Path) -> StudySummary:
+    """A study.json. Raises TablesError."""
+    try:
+        return StudySummary.model_validate_json(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise TablesError(f"{path} cannot be read: {error}") from error
+    except ValidationError as error:
+        wrong = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
+        raise TablesError(f"{path} is no study.json of this version: {'; '.join(wrong)}") from error
+
+
+def analysed_tables(tables: Tables) -> Analysed:
+    """All statistics of a study."""
+    analyses = tuple(analyse(variant, tables.bootstrap) for variant in tables.variants)
+    reference, *others = tables.variants
+    summary = StudySummary(
+        study=tables.study,
+        splits=tables.splits,
+        version=version("palpate"),
+        command=" ".join(["palpate study", tables.study, *(f"--split {split}" for split in tables.splits)]),
+        patients={str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()},
+        reference=reference.name,
+        methods={analysis.name: _method(analysis) for analysis in analyses},
+        comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
+        level=LEVEL,
+        bootstrap_folds=FOLDS,
+        human=human_line.as_json(),
+    )
+    return Analysed(summary, analyses)
+
+
+def _method(a: Analysis) -> MethodRow:
+    e, c = a.errors, a.calibration
+    return MethodRow(
+        rates=a.rates,
+        populations=a.populations,
+        auc=a.roc and a.roc.auc,
+        froc_mean=a.froc and a.froc.mean,
+        froc={} if a.froc is None else {f"{rate:g}": value for rate, value in a.froc.at.items()},
+        sensitivity_at_zero=a.froc and a.froc.at_zero,
+        felt=None if a.felt is None else _surface(a.felt, "felt_contrast", "felt_radius_m"),
+        made=None if a.made is None else _surface(a.made, "contrast", "radius_m"),
+        errors=ErrorsRow(
+            place_mean_m=e.place_mean,
+            place_median_m=e.place_median,
+            place_p95_m=e.place_p95,
+            size_mean=e.size_mean,
+            ratio_mean=e.ratio_mean,
+            radius_m=_agreement(e.radius),
+            log_ratio=_agreement(e.log_ratio),
+            ratio_held=e.ratio_held,
+        ),
+        calibration=c
+        and CalibrationRow(
+            slope=c.slope,
+            in_the_large=c.in_the_large,
+            expected_error=c.expected_error,
+            expected_error_by_chance=c.by_chance,
+            brier=c.brier,
+        ),
+        effort=a.effort,
+        coverage=a.coverage,
+    )
+
+
+def _agreement(a: Agreement) -> AgreementRow:
+    return AgreementRow(bias=a.bias, lower=a.lower, upper=a.upper)
+
+
+def _surface(s: Surface, contrast: str, radius: str) -> SurfaceRow:
+    smallest = {}
+    if radius in s.names:
+        levels = s.quartiles.get(contrast, ())
+        smallest = {f"{contrast} {level:.3g}": s.threshold(radius, **{contrast: level}) for level in levels}
+    return SurfaceRow(
+        covariates=s.names,
+        left_out=s.left_out,
+        n=s.n,
+        found=s.found,
+        weights=tuple(map(float, s.weights)),
+        centre=tuple(map(float, s.centre)),
+        scale=tuple(map(float, s.scale)),
+        lapse=s.lapse,
+        quartiles=s.quartiles,
+        threshold_90={name: s.threshold(name) for name in s.names},
+        smallest_90=smallest,
+    )
