@@ -25,6 +25,7 @@ EXTRA_OF = {
     "palpate": "run",
     "palpate.fmu": "fmu",
     "palpate.fuzz": "fuzz",
+    "palpate.study": "study",
     "palpate_bus": BARE,
     "palpate_bus.recordings": "recordings",
     "palpate_bus.security.keys": "secure",
@@ -70,6 +71,7 @@ DISTRIBUTION = {
     "rerun": "rerun-sdk",
     "rerun_cli": "rerun-sdk",
     "robust_laplacian": "robust-laplacian",
+    "sklearn": "scikit-learn",
     "yaml": "pyyaml",
     "zenoh": "eclipse-zenoh",
 }

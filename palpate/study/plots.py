@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from matplotlib import rc_context
@@ -72,8 +72,8 @@ def _svg(figure: Figure) -> str:
     return text
 
 
-def _legend(axes: Axes, place: str = "best") -> None:
-    axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc=place)
+def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "best", below: bool = False) -> None:
+    axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc=place, bbox_to_anchor=(0, -0.17) if below else None)
 
 
 def _human(axes: Axes) -> None:
@@ -126,11 +126,10 @@ def froc(analyses: Sequence[Analysis]) -> str | None:
     (axes,) = _axes(figure)
     least = RATES[0] / 2
     for color, (name, curve) in zip(COLOURS, shown, strict=False):
-        x = np.append(np.maximum(curve.false_findings, least), RATES[-1])
-        values, low, high = (np.append(y, y[-1]) for y in (curve.sensitivity, curve.low, curve.high))
-        axes.plot(x, values, color=color, lw=1.8, label=f"{name}: mean {curve.mean.value:.3f}")
-        axes.fill_between(x, low, high, color=color, alpha=0.13, lw=0)
-        axes.plot(RATES, [e.value for e in curve.at.values()], "o", ms=4, color=color)
+        x = np.maximum(curve.false_findings, least)
+        axes.plot(x, curve.sensitivity, color=color, lw=1.8, label=f"{name}: mean {curve.mean.value:.3f}")
+        axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.13, lw=0)
+        axes.plot(RATES, [e.value or 0.0 for e in curve.at.values()], "o", ms=4, color=color)
     _human(axes)
     plain(axes, "lumps found", "false findings an examination")
     axes.set_xscale("log", base=2)
@@ -144,14 +143,14 @@ def froc(analyses: Sequence[Analysis]) -> str | None:
 
 
 def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
-    """Probability of detection against each covariate: found parts in bins, and the surface at quartiles of what else matters most.
+    """Probability of detection against each covariate: what was found, in bins, and the surface at quartiles of another one.
 
     None where no lump is known.
     """
     if not any(analysis.observed[name] for name in names):
         return None
     surface = analysis.felt if tuple(names) == FELT else analysis.made
-    figure = _figure(14.5, 4.6)
+    figure = _figure(14.5, 5.6)
     for axes, name in zip(_axes(figure, len(names)), names, strict=True):
         words, scale = COVARIATES[name]
         if surface is not None and name in surface.names:
@@ -161,7 +160,9 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
         _human(axes)
         if name == "radius_m":
             sizes = [point.size_m / 2 * scale for point in human_line.BY_SIZE]
-            axes.plot(sizes, [point.found for point in human_line.BY_SIZE], "D", color=HUMAN, ms=6, label="physicians, by size of lump")
+            axes.plot(
+                sizes, [point.found for point in human_line.BY_SIZE], "D", color=HUMAN, ms=6, label="physicians, by size of lump"
+            )
         plain(axes, "probability of detection" if name == names[0] else "", words)
         if name in LOGARITHMIC:
             axes.set_xscale("log")
@@ -170,7 +171,7 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
             axes.tick_params(which="minor", labelsize=7.5, colors=QUIET)
         _percent(axes)
         axes.set_ylim(-0.02, 1.02)
-        _legend(axes)
+        _legend(axes, "upper left", below=True)
     return _svg(figure)
 
 
@@ -286,5 +287,3 @@ def _percent(axes: Axes, both: bool = False) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if both:
         axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-
-
