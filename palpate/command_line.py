@@ -47,8 +47,11 @@ def output_file(words: str) -> typer.models.OptionInfo:
     return _option(words, check)
 
 
-def output_folder(words: str) -> typer.models.OptionInfo:
-    """The option of a command for the folder that it writes into; it is made before anything is measured."""
+def output_folder(words: str, *names: str) -> typer.models.OptionInfo:
+    """The option of a command for the folder that it writes into; it is made before anything is measured.
+
+    `names` are the option's, where it has others than its parameter.
+    """
 
     def check(path: Path | None) -> Path | None:
         if path is not None:
@@ -57,7 +60,7 @@ def output_folder(words: str) -> typer.models.OptionInfo:
                 raise typer.BadParameter(f"{path}: is no folder that can be written into")
         return path
 
-    return _option(words, check)
+    return _option(words, check, *names)
 
 
 def _make(folder: Path) -> None:
@@ -67,6 +70,6 @@ def _make(folder: Path) -> None:
         raise typer.BadParameter(f"{folder}: cannot be made a folder: {error.strerror}") from None
 
 
-def _option(words: str, check: Callable[[Path | None], Path | None]) -> typer.models.OptionInfo:
-    option: typer.models.OptionInfo = typer.Option(help=words, callback=check)
+def _option(words: str, check: Callable[[Path | None], Path | None], *names: str) -> typer.models.OptionInfo:
+    option: typer.models.OptionInfo = typer.Option(*names, help=words, callback=check)
     return option

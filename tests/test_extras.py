@@ -69,9 +69,9 @@ DISTRIBUTION = {
     "pinocchio": "pin",
     "pydantic_settings": "pydantic-settings",
     "rerun": "rerun-sdk",
+    "sklearn": "scikit-learn",
     "rerun_cli": "rerun-sdk",
     "robust_laplacian": "robust-laplacian",
-    "sklearn": "scikit-learn",
     "yaml": "pyyaml",
     "zenoh": "eclipse-zenoh",
 }
@@ -80,8 +80,8 @@ OPTIONAL = {"atheris", "zenoh_ros2_sdk"}
 """Looked for with find_spec before they are imported: a fuzzer and a client to compare with, in no extra."""
 WHEN_ASKED_FOR = {"playwright": "picture", "palpate_robot.plant.Plant": "robot"}
 """Imported by one function alone, which only those call who have the extra that is named here."""
-NOT_IMPORTED = {"ziglang"}
-"""Run as a program."""
+NOT_IMPORTED = {"bokeh", "ziglang"}
+"""Run as a program, or by another library: Dask draws its dashboard with bokeh."""
 
 
 def extra_of(module: str) -> str:

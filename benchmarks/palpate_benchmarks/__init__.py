@@ -1,1 +1,1 @@
-"""What the parts and whole runs cost, and how well examinations go over seeds, swaps and faults."""
+"""What the parts and whole runs cost, and what examinations do when something fails."""

@@ -17,12 +17,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from palpate.case_display import CaseDisplay
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
 from palpate.run.roles import OBSERVERS
-from palpate_benchmarks.case_display import CaseDisplay
 from palpate_conductor.result import RunResult
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario

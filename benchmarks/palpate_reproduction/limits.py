@@ -55,7 +55,7 @@ def limits(report: Report, deformation_mm: float, peak_ratio: float) -> list[Lim
         Limit(
             "no figure of how accurate the result is",
             "each run is scored against the truth, which only the tissue and the score know",
-            f"localised within {off}, Dice {dice}, the 90 % band holds on {held}; `palpate evaluate` over seeds",
+            f"localised within {off}, Dice {dice}, the 90 % band holds on {held}; `palpate study` over patients",
         ),
         Limit(
             "Gazebo's force sensor does not perceive the changes of stiffness; the force is read from inside the physics engine",

@@ -97,6 +97,9 @@ class BreathingCurve:
         """Largest excursion [m] there will ever be."""
         self.repeats_s = float(self.table[:, 1:4].sum())
         """Length of the table [s]; 0 for somebody who does not breathe."""
+        moving = self.table[:, 1:3].sum(axis=1)
+        self.mean_m = float(self.table[:, 4] @ moving / 2 / self.repeats_s) if self.repeats_s else 0.0
+        """Mean excursion [m]: half of its amplitude while a breath moves, none in its pause."""
         self._rows = self.table.tolist()
         self._starts = self.table[:, 0].tolist()
 

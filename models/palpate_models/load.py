@@ -89,7 +89,7 @@ def _override(raw: dict[str, Any], setting: str) -> None:
         node = node[_index(node, parent, setting)] if isinstance(node, list) else node.setdefault(parent, {})
         if not isinstance(node, dict | list):
             raise ScenarioError(f"--set {setting}: {parent!r} is a value, not a section")
-    node[_index(node, last, setting) if isinstance(node, list) else last] = _parse(value, f"--set {setting}")
+    node[_index(node, last, setting) if isinstance(node, list) else last] = parse_yaml(value, f"--set {setting}")
 
 
 def _index(items: list[Any], word: str, setting: str) -> int:
@@ -99,20 +99,21 @@ def _index(items: list[Any], word: str, setting: str) -> int:
     return int(word)
 
 
-def _parse(text: str, name: str) -> Any:
-    """YAML as Python values. PyYAML raises ValueError for a date such as 2001-13-45, and RecursionError for deep nesting."""
+def parse_yaml(text: str, name: str) -> Any:
+    """YAML as Python values. Raises ScenarioError naming the file `name` and what is wrong."""
     try:
         return yaml.load(text, _Loader)
     except _TwiceError as error:
         raise ScenarioError(f"{name}: {error}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError for 2001-13-45, RecursionError for deep nesting
         raise ScenarioError(f"{name}: not YAML: {error}") from error
 
 
-def _explain(name: str, error: ValidationError) -> str:
+def explain(name: str, error: ValidationError) -> str:
+    """A line for each wrong field of the file `name`: the field, its value, and what is allowed."""
     lines = []
     for item in error.errors():
-        field = ".".join(str(part) for part in item["loc"]) or "scenario"
+        field = ".".join(str(part) for part in item["loc"]) or "file"
         lines.append(f"{name}: {field} = {item['input']!r}: {item['msg']}")
     return "\n".join(lines)
 
@@ -123,7 +124,7 @@ def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = 
     Raises ScenarioError naming file, field, value and what is allowed.
     """
     text, name = _read(source)
-    raw = _parse(text, name) or {}
+    raw = parse_yaml(text, name) or {}
     if not isinstance(raw, dict):
         raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)
@@ -136,7 +137,7 @@ def load_scenario(source: str, settings: Iterable[str] = (), seed: int | None = 
     try:
         return Scenario.model_validate(raw)
     except ValidationError as error:
-        raise ScenarioError(_explain(name, error)) from error
+        raise ScenarioError(explain(name, error)) from error
 
 
 def view_of(role: str) -> View:

@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 import palpate_models
 import palpate_tissue
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate_bus.implementations import create
+from palpate.truth.tissue import true_tissue
 from palpate_models.breathing import Breathing
 from palpate_models.cache import content_key, remembered
 from palpate_models.frames import Array
-from palpate_models.motion import Motion
 from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom.field import edge_distance
 from palpate_models.press import apparent_stiffness
 from palpate_models.scenario import Exam, Scenario
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.service import TissueService
 
 PITCH_M: Final = 0.010
 """Distance of the places that are pressed, over the examined region and a border of as much ..."""
@@ -36,8 +34,6 @@ FINE_PITCH_M: Final = 0.005
 REACH_M: Final = 0.040
 """So far beyond its outline, and for each metre of depth a metre more, a lump is not felt: the influence K0(r / l) is below 3 %
 there, and what is felt goes with its square."""
-_OWN_FMU: Final = "winkler"
-"""The tier whose equations our own FMU has."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +54,12 @@ class Pressed:
     """With no muscle guarded [N], shape (p,)."""
 
 
-class Patient:
+class Copies:
     """Copies of a scenario's tissue, as it is and otherwise."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        still = {"breathing": Breathing(kind="none"), "motion": Motion()}
-        self.phantom = scenario.phantom.model_copy(update=still)
+        self.phantom = scenario.phantom.model_copy(update={"breathing": Breathing(kind="none")})
         """The patient at rest."""
 
     def with_lesions(self, lesions: Sequence[Lesion]) -> TissueBackend | None:
@@ -78,12 +73,7 @@ class Patient:
         return self._copy(self.phantom.model_copy(update={"guarding": ()}))
 
     def _copy(self, phantom: Phantom) -> TissueBackend | None:
-        chosen = self._scenario.services.tissue
-        if chosen == "none" or (chosen == "fmu" and self._scenario.tissue.fmu is not None):
-            return None
-        scenario = self._scenario.model_copy(update={"phantom": phantom})
-        service = create("tissue", _OWN_FMU if chosen == "fmu" else chosen, scenario)
-        return service.backend if isinstance(service, TissueService) else None
+        return true_tissue(self._scenario.model_copy(update={"phantom": phantom}))
 
 
 def press_patient(scenario: Scenario) -> Pressed | None:
@@ -91,16 +81,16 @@ def press_patient(scenario: Scenario) -> Pressed | None:
 
     It takes seconds, and is kept in the user's cache folder by patient, tier and indenter.
     """
-    patient, radius = Patient(scenario), scenario.robot.indenter_radius_m
-    lesions = patient.phantom.lesions
-    body = patient.with_lesions(lesions)
+    copies, radius = Copies(scenario), scenario.robot.indenter_radius_m
+    lesions = copies.phantom.lesions
+    body = copies.with_lesions(lesions)
     if body is None:
         return None
     model = body.model
     skin = TrueSurface(TrueBody(model.vertices, model.triangles, np.eye(4)))
     places, normals = _places(skin, scenario.exam, lesions)
     arrays = (model.vertices, model.areas, model.stiffness, model.background, model.stiffening, model.tension)
-    words = (patient.phantom, scenario.services.tissue, radius)
+    words = (copies.phantom, scenario.services.tissue, radius)
     key = content_key("pressed", _code(scenario), *arrays, places, *words)
 
     def press(tissue: TissueBackend, where: NDArray[np.bool_], otherwise: Array) -> Array:
@@ -113,15 +103,15 @@ def press_patient(scenario: Scenario) -> Pressed | None:
         force, limited = apparent_stiffness(body.press(places, normals, radius))
         near = _near(places, lesions)
         healthy = force
-        if near.any() and (without := patient.with_lesions(())) is not None:
+        if near.any() and (without := copies.with_lesions(())) is not None:
             healthy = press(without, np.asarray(near.any(axis=0)), force)
         alone = []
         for i, mine in enumerate(near):
             felt = np.where(mine, healthy, force)
             shared = mine & np.delete(near, i, axis=0).any(axis=0)
-            others = patient.with_lesions([*lesions[:i], *lesions[i + 1 :]]) if shared.any() else None
+            others = copies.with_lesions([*lesions[:i], *lesions[i + 1 :]]) if shared.any() else None
             alone.append(felt if others is None else press(others, shared, felt))
-        slack = patient.relaxed()
+        slack = copies.relaxed()
         relaxed = force if slack is None else press(slack, np.ones(len(places), dtype=bool), force)
         return np.stack((force, limited, healthy, relaxed, *alone))
 

@@ -37,8 +37,13 @@ class TrueSurface:
         for k in range(3):
             np.add.at(total, body.triangles[facing, k], normal[facing])
         unit = total[front] / np.linalg.norm(total[front], axis=1, keepdims=True)
+        self._mesh, self._front = mesh, front
         self._height = LinearNDInterpolator(mesh, body.vertices[front, 2])
         self._normal = LinearNDInterpolator(mesh, unit)
+
+    def between(self, values: Array) -> LinearNDInterpolator:
+        """Values at the body's vertices, shape (n,), as a function of xy, shape (p, 2) -> (p,); NaN off the surface."""
+        return LinearNDInterpolator(self._mesh, values[self._front])
 
     def points(self, xy: Array) -> tuple[Array, Array]:
         """Points of the surface [m] and outward unit normals there, each of shape (p, 3); NaN off the surface."""

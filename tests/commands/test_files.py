@@ -12,7 +12,7 @@ from palpate.commands import app_for
 from palpate.report.files import write_text
 from palpate.report.marked import write_part
 
-BEGIN, END = "<!-- palpate swaps: begin -->\n", "<!-- palpate swaps: end -->\n"
+BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 
 
 def test_a_file_is_replaced_and_nothing_is_left_beside_it(tmp_path: Path) -> None:
@@ -35,7 +35,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
 def test_only_what_is_between_the_marks_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "doc.md"
     path.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    write_part(path, "swaps", "new\n")
+    write_part(path, "faults", "new\n")
     assert path.read_text() == f"before\n{BEGIN}new\n{END}after\n"
 
 
@@ -44,15 +44,14 @@ def test_a_document_without_both_marks_is_refused_and_kept(tmp_path: Path, text:
     path = tmp_path / "doc.md"
     path.write_text(text)
     with pytest.raises(typer.BadParameter, match="has no part to replace"):
-        write_part(path, "swaps", "new\n")
+        write_part(path, "faults", "new\n")
     assert path.read_text() == text
 
 
 def test_a_document_is_looked_at_before_anything_is_measured(tmp_path: Path) -> None:
     path = tmp_path / "doc.md"
     path.write_text("no marks\n")
-    for command in ("faults", "swaps", "wallclock"):
-        done = CliRunner().invoke(app_for(command), [command, "--doc", str(path)])
-        assert done.exit_code == 2
-        words = " ".join(done.output.replace("│", " ").split())  # without the box
-        assert "wants the lines" in words
+    done = CliRunner().invoke(app_for("faults"), ["faults", "--doc", str(path)])
+    assert done.exit_code == 2
+    words = " ".join(done.output.replace("│", " ").split())  # without the box
+    assert "wants the lines" in words

@@ -10,8 +10,10 @@ from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
 from palpate.run.processes import ProcessListError, compose_file, how, override_files, read_processes
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers
-from palpate_benchmarks.swaps import read_swaps
+from palpate.study.spec import load_study
 from palpate_models.load import load_scenario
+
+INHERITED = "${PALPATE_SETTINGS:-}"
 
 
 def test_every_role_of_a_run_is_in_the_compose_file() -> None:
@@ -63,20 +65,22 @@ def test_overrides_are_merged_as_docker_compose_merges_them(tmp_path: Path, monk
 
 def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs() -> None:
     root = compose_file().parent
-    swaps = read_swaps(root / "compose")
-    assert {"tissue-fmu", "tissue-elastic", "robot-mujoco", "camera-replay", "planning-raster", "planning-point"} <= swaps.keys()
-    for name, swap in swaps.items():
+    for name in ("tissue-fmu", "tissue-elastic", "robot-mujoco", "camera-replay", "planning-raster", "planning-point"):
         role = name.partition("-")[0]
         file = root / "compose" / f"{name}.yml"
         document = yaml.safe_load(file.read_text(encoding="utf-8"))
-        settings = dict(setting.split("=", 1) for setting in swap.settings)
+        words = document["services"]["prepare"]["environment"]["PALPATE_SETTINGS"].removesuffix(INHERITED).split()
+        settings = dict(setting.split("=", 1) for setting in words)
         chosen = settings.get(f"services.{role}")
+        method = load_study("swaps").methods.get(name)
+        if method is not None:
+            assert settings == {**method.settings, **{f"services.{role}": choice for role, choice in method.services.items()}}
         if role == "planning":
             assert chosen is None
             continue
         assert name == f"{role}-{chosen}"
         service = document["services"][role]
-        assert choice(checked(load_scenario("healthy", swap.settings)), role) == chosen
+        assert choice(checked(load_scenario("healthy", words)), role) == chosen
         processes = read_processes(compose_file(), (role,), (file,))
         assert processes[role].command == ("python", "-m", f"palpate_{role}"), "which goes by the scenario"
         assert service["build"]["args"]["EXTRA"] == name
@@ -105,12 +109,6 @@ def test_real_tissue_waits_for_no_simulated_time(words: list[str], tmp_path: Pat
     assert called.exit_code == EXIT_BAD_INPUT
     assert "--wallclock" in called.output
     assert not (tmp_path / "out").exists()
-
-
-def test_a_swap_without_settings_is_named(tmp_path: Path) -> None:
-    (tmp_path / "robot-x.yml").write_text("x-swap: words\nservices: {robot: {command: [a]}}")
-    with pytest.raises(ProcessListError, match=r"robot-x\.yml.*PALPATE_SETTINGS"):
-        read_swaps(tmp_path)
 
 
 def test_how_a_process_ended_is_said_in_its_own_words(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.truth import pressed
 from palpate.truth.felt import Felt
-from palpate.truth.pressed import Patient, Pressed, press_patient
+from palpate.truth.pressed import Copies, Pressed, press_patient
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.touched import Touched
 from palpate_models.load import load_scenario
@@ -48,7 +48,7 @@ def flat(folder: Path, *lesions: Lesion, k_w: float = 1.7e5) -> Scenario:
 
 def felt(scenario: Scenario) -> tuple[Pressed, Felt]:
     found = press_patient(scenario)
-    tissue = Patient(scenario).with_lesions(())
+    tissue = Copies(scenario).with_lesions(())
     assert found is not None
     assert tissue is not None
     surface = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4)))

@@ -44,9 +44,12 @@ class FtSensor:
     def read(self, wrench: Sequence[float]) -> list[float]:
         """A reading of the true wrench."""
         if not self._errors:
-            errors = self._drift() + self._deviation * self._rng.standard_normal((_BLOCK, 6))
-            self._errors = errors[::-1].tolist()
+            self._errors = self.block()[::-1].tolist()
         return list(map(add, (self._drawn.sensitivity @ wrench).tolist(), self._errors.pop()))
+
+    def block(self) -> Array:
+        """What the next readings have beside sensitivity times wrench, shape (k, 6): all that are made at once."""
+        return np.asarray(self._drift() + self._deviation * self._rng.standard_normal((_BLOCK, 6)))
 
     def _drift(self) -> Array:
         """All errors of the next block but the white noise, shape (_BLOCK, 6)."""

@@ -48,6 +48,11 @@ class TissueBackend(ABC):
     def settle(self) -> None:
         """Brings the body to rest: as if nothing had ever touched it."""
 
+    def in_steps_of(self, dt: float) -> TissueBackend:
+        """The same body at rest, for steps of about `dt` [s] where its physics allows them; else this one, at rest, as it is."""
+        self.settle()
+        return self
+
     def press(self, places: Array, normals: Array, radius: float) -> Array:
         """Standard presses with a sphere of `radius` [m], each into the body at rest: forces along the normals [N], shape (k, n).
 

@@ -8,6 +8,9 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+SPEED_OVER_S = 3600.0
+"""The time left is told from the speed of so long: one run may take minutes."""
+
 
 class CaseDisplay:
     """A bar over many runs on a terminal; a line a run otherwise; nothing when quiet."""
@@ -17,7 +20,12 @@ class CaseDisplay:
         self._lines = not (quiet or console.is_terminal)
         columns = (SpinnerColumn(), TextColumn(word), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn())
         self._bar = Progress(
-            *columns, TextColumn("{task.fields[last]}"), console=console, transient=True, disable=quiet or self._lines
+            *columns,
+            TextColumn("{task.fields[last]}"),
+            console=console,
+            transient=True,
+            disable=quiet or self._lines,
+            speed_estimate_period=SPEED_OVER_S,
         )
         self._task = self._bar.add_task(word, total=None, last="")
 

@@ -1,0 +1,132 @@
+"""One quick case: an examination on a patient, the assessment's own service, and the scores of whole examinations."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, Final
+
+from palpate.quick.errors import Loop, LoopErrors, loop_errors
+from palpate.quick.examination import Examination
+from palpate.quick.messages import collected
+from palpate.report.results import assemble, truth_of_run
+from palpate.report.rows import Report
+from palpate.run.composed import load_services
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.runtime.lockstep import run_hash
+from palpate_bus.service import Service
+from palpate_conductor.collector import Collected
+from palpate_conductor.result import RunResult
+from palpate_models.scenario import Scenario
+
+RUNTIME: Final = "quick"
+_HASHED: Final = ("assessment/samples", "assessment/map", "assessment/findings")
+
+
+@dataclass(frozen=True)
+class QuickCase:
+    """What a quick case gave, and how long each of its parts took [s]."""
+
+    report: Report
+    """The rows of report.json; its run hash is over samples, map and findings."""
+    collected: Collected
+    """The messages that it was made from."""
+    simulate_s: float
+    """The patient made and examined."""
+    assess_s: float
+    score_s: float
+    """The patient pressed for the truth (kept for the next time), and compared."""
+
+
+def run_quick(scenario: Scenario, errors: LoopErrors | None = None) -> QuickCase:
+    """Examines the patient of a scenario without arm and bus, with the errors that whole examinations have.
+
+    `errors`: distributions of its loop; None for those that were studied. Raises UnknownLoopError where none were, NoTissueError
+    for a tissue of which there is no copy, ChoiceError for an assessment that cannot be made.
+    """
+    begin = perf_counter()
+    examination = Examination(scenario, Loop(scenario, errors or loop_errors(scenario)))
+    gathered = collected(examination, examination.run())
+    simulated = perf_counter()
+    (service,) = load_services(scenario, ("assessment",))
+    facts = assess(service, gathered)
+    assessed = perf_counter()
+    digests = {topic: digest for topic in _HASHED if (digest := _digest(topic, gathered))}
+    result = RunResult(
+        runtime=RUNTIME,
+        collected=gathered,
+        run_hash=run_hash(digests),
+        digests=digests,
+        sim_time_s=nanoseconds(gathered.exam_states[-1].header.stamp) / NS,
+        wall_time_s=simulated - begin,
+        start_time_s=0.0,
+        blame={},
+        counters={"assessment": {"facts": facts}},
+        failure=None,
+        lost={},
+    )
+    report = assemble(scenario, result, truth_of_run(scenario, gathered))
+    return QuickCase(report, gathered, simulated - begin, assessed - simulated, perf_counter() - assessed)
+
+
+def assess(service: Service, gathered: Collected) -> dict[str, Any]:
+    """Has an assessment service make samples, map and findings of an examination, into what was gathered of it.
+
+    It steps twice: with the surface, and with all states at once, so that it draws no map before the last. Returns its facts.
+    """
+    states = gathered.exam_states
+    first, last = (nanoseconds(state.header.stamp) for state in (states[0], states[-1]))
+    inputs: tuple[tuple[int, dict[str, list[Message]]], ...] = (
+        (first, {"perception/surface": [gathered.surface]}),
+        (last, {"exam/state": states}),
+    )
+    latest: dict[str, list[Message]] = {}
+    service.start()
+    for t, new in inputs:
+        latest |= new
+        outbox = service.step(t, _Given(new, latest))
+        samples = outbox.get("assessment/samples", [])
+        gathered.samples += samples if isinstance(samples, list) else [samples]
+        gathered.stiffness_map = outbox.get("assessment/map", gathered.stiffness_map)
+        gathered.findings = outbox.get("assessment/findings", gathered.findings)
+    return dict(service.finish())
+
+
+class _Given:
+    """An inbox of messages by topic: those that are new, and those that came so far."""
+
+    def __init__(self, new: dict[str, list[Message]], latest: dict[str, list[Message]]) -> None:
+        self._new, self._latest = new, latest
+
+    def latest(self, topic: str) -> Message | None:
+        return self._latest[topic][-1] if topic in self._latest else None
+
+    def new(self, topic: str) -> Iterable[Message]:
+        return self._new.get(topic, [])
+
+    def stamp(self, topic: str) -> int | None:
+        message = self.latest(topic)
+        return None if message is None else nanoseconds(message.header.stamp)
+
+    def lost(self, _: str) -> bool:
+        return False
+
+
+def _digest(topic: str, gathered: Collected) -> str | None:
+    """SHA-256 over the messages of a topic; None where there is none."""
+    sent = {
+        "assessment/samples": gathered.samples,
+        "assessment/map": [gathered.stiffness_map],
+        "assessment/findings": [gathered.findings],
+    }[topic]
+    digest = hashlib.sha256()
+    for message in sent:
+        if message is None:
+            return None
+        digest.update(codec.encode(message, contract().topics[topic].type))
+    return digest.hexdigest()

@@ -1,0 +1,246 @@
+"""What arm, eye and force sensor get wrong in an examination, as distributions that whole examinations have.
+
+`loop.yaml` holds them, a row for each setting of the errors and kind of breathing that was studied; `palpate.quick.study` makes
+it. With d the depth that the examination measures and d' the true one, against the skin as it breathes,
+
+    d - d' = offset + tilt . xy + field(xy) + wander(t) - (1 - followed) (excursion(t) - its mean)
+
+and d is the set-point plus the error of regulation. Force is read by the force/torque sensor of `palpate_robot`, tared once
+before the first stroke. Where the patient lies is what registration got wrong, and needs no distribution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from importlib import resources
+from math import exp
+from typing import Annotated, Final, Literal
+
+import numpy as np
+import yaml
+from pydantic import Field, TypeAdapter
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import gaussian_filter
+from scipy.signal import lfilter
+
+from palpate.quick.patient import PERIOD_S
+from palpate_bus.contract import contract
+from palpate_bus.messages.stamps import NS
+from palpate_models import lbr
+from palpate_models.errors import Level, draw_errors, levels
+from palpate_models.frames import Array
+from palpate_models.scenario import Exam, Scenario
+from palpate_models.section import NonNegative, Positive, Section
+from palpate_models.seeds import generator
+from palpate_planning.exam_sequence import TARE
+from palpate_robot.ft_sensor import FtSensor
+
+LOOP_SECTIONS: Final = ("camera", "hand_eye", "registration", "arm")
+"""Sections of the errors that reach an examination through its loop; the force sensor's are simulated as they are."""
+_GRID_M: Final = 0.004
+_BEYOND_M: Final = 0.06
+"""The field of surface errors reaches this far beyond the examined region."""
+
+Breath = Literal["none", "quiet", "deep", "held"]
+
+
+class UnknownLoopError(ValueError):
+    """A scenario whose loop nobody has studied. Names what is asked for and what there is."""
+
+
+class Normal(Section):
+    """A normal distribution, over examinations."""
+
+    mean: float = 0.0
+    sd: NonNegative = 0.0
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """One examination's value."""
+        return self.mean + self.sd * float(rng.standard_normal())
+
+
+class LoopErrors(Section):
+    """What examinations with one setting of errors and kind of breathing get wrong."""
+
+    camera: Level
+    hand_eye: Level
+    registration: Level
+    arm: Level
+    breathing: Breath
+    examinations: Annotated[int, Field(ge=1)]
+    """From how many whole examinations these figures are."""
+    begin_s: Positive
+    """Mean time at which the first stroke begins."""
+    aside_m: NonNegative
+    """How far from where it is believed to be the tool is along x, and along y: standard deviation over examinations."""
+    offset_m: Normal
+    """How much too far outward the perceived surface is, as it is used: after every correction."""
+    tilt: Normal
+    """The slope of that along x, and along y."""
+    field_m: NonNegative
+    """What else is wrong with it, smooth over the skin: standard deviation."""
+    field_length_m: Positive
+    """Its correlation length: covariance exp(-r^2 / 2 l^2)."""
+    followed: Normal
+    """Which part of the breathing excursion the examination follows."""
+    wander_m: NonNegative
+    """What else is wrong with the measured depth, smooth in time: standard deviation."""
+    wander_s: Positive
+    """Its correlation time: covariance (1 + t / T) exp(-t / T)."""
+    regulation_m: NonNegative
+    """Measured depth less set-point at depth: standard deviation."""
+    regulation_s: Positive
+    """Its correlation time, as that of the wander."""
+
+
+@cache
+def studied() -> tuple[LoopErrors, ...]:
+    """The rows of loop.yaml."""
+    text = resources.files("palpate.quick").joinpath("loop.yaml").read_text(encoding="utf-8")
+    return tuple(TypeAdapter(list[LoopErrors]).validate_python(yaml.safe_load(text)["loops"]))
+
+
+def setting_of(scenario: Scenario) -> dict[str, str | None]:
+    """The level of each section of a scenario's errors that its loop depends on, None where it is none; and the breathing."""
+    sections: dict[str, str | None] = {}
+    for name in LOOP_SECTIONS:
+        given = getattr(scenario.errors, name)
+        kind = type(given)
+        of_level = {"none": kind(), **{level: kind(**fields.get(name, {})) for level, fields in levels().items()}}
+        sections[name] = next((level for level, section in of_level.items() if section == given), None)
+    return {**sections, "breathing": scenario.phantom.breathing.kind}
+
+
+def loop_errors(scenario: Scenario) -> LoopErrors:
+    """The distributions for a scenario. Raises UnknownLoopError where whole examinations like it were not studied."""
+    wanted = setting_of(scenario)
+    for row in studied():
+        if all(getattr(row, name) == value for name, value in wanted.items()):
+            return row
+    known = "; ".join(", ".join(f"{name} {getattr(row, name)}" for name in wanted) for row in studied())
+    own = [name for name, level in wanted.items() if level is None]
+    words = ", ".join(f"{name} {value or 'of its own'}" for name, value in wanted.items())
+    raise UnknownLoopError(
+        f"{scenario.name}: the loop of examinations with {words} was not studied"
+        + (f" (errors.{own[0]} is of no level)" if own else "")
+        + f"; want one of: {known}; or a whole examination; or study it: python -m palpate.quick.study"
+    )
+
+
+class Loop:
+    """What one examination gets wrong. Equal scenarios have equal loops."""
+
+    def __init__(self, scenario: Scenario, errors: LoopErrors) -> None:
+        """Drawn from the scenario's seed."""
+        rng = generator(scenario.seed, "loop")
+        self.begin_s = errors.begin_s
+        """When the first stroke begins [s]."""
+        self.aside_m: Array = errors.aside_m * rng.standard_normal(2)
+        """Where the tool truly is less where it is believed to be, xy of A [m], shape (2,)."""
+        self._offset = errors.offset_m.draw(rng)
+        self._tilt = np.array((errors.tilt.draw(rng), errors.tilt.draw(rng)))
+        self.followed = errors.followed.draw(rng)
+        """Which part of the breathing excursion is followed."""
+        self._centre = np.array(scenario.exam.centre_m)
+        self._field = _field(scenario.exam, errors.field_m, errors.field_length_m, rng)
+        self._regulation = _Smooth(errors.regulation_m, errors.regulation_s, rng)
+        self._wander = _Smooth(errors.wander_m, errors.wander_s, rng)
+        self._sensor = _TaredSensor(scenario, self.begin_s)
+
+    def wrong(self, xy: Array) -> Array:
+        """How much too far outward the perceived surface is at points [m], shape (p, 2) -> (p,)."""
+        return np.asarray(self._offset + (xy - self._centre) @ self._tilt + self._field.ev(xy[:, 0], xy[:, 1]))
+
+    def regulation(self, k: int) -> float:
+        """Measured depth less set-point in the k-th period [m]."""
+        return self._regulation.at(k)
+
+    def wander(self, k: int) -> float:
+        """What else is wrong with the measured depth in the k-th period [m]."""
+        return self._wander.at(k)
+
+    def gains(self, outward: Array) -> Array:
+        """Rows that take a force to the normal force that is read of it, for outward normals, both of shape (p, 3)."""
+        return self._sensor.gains(outward)
+
+    def tared(self, k: int) -> float:
+        """What the sensor reads in the k-th period without a force, along the outward normal [N]."""
+        return self._sensor.tared(k)
+
+
+def _field(exam: Exam, sd: float, length: float, rng: np.random.Generator) -> RectBivariateSpline:
+    """A smooth random field over the examined region and about it [m]."""
+    axes = []
+    for centre, size in zip(exam.centre_m, exam.region_m, strict=True):
+        half = 0.5 * size + _BEYOND_M
+        axes.append(centre + np.linspace(-half, half, round(2 * half / _GRID_M) + 1))
+    width = length / np.sqrt(2) / _GRID_M  # white noise under a Gaussian of this width has the covariance wanted
+    noise = gaussian_filter(rng.standard_normal((len(axes[0]), len(axes[1]))), width, mode="wrap")
+    peak = np.zeros((len(axes[0]), len(axes[1])))
+    peak[0, 0] = 1.0
+    unit = np.sqrt(np.sum(gaussian_filter(peak, width, mode="wrap") ** 2))
+    return RectBivariateSpline(*axes, sd / unit * noise)
+
+
+class _Smooth:
+    """A process with the covariance (1 + t / T) exp(-t / T): white noise through two equal lags. A value each PERIOD_S."""
+
+    _BLOCK = 4096
+
+    def __init__(self, sd: float, time_s: float, rng: np.random.Generator) -> None:
+        self._rng = np.random.Generator(np.random.PCG64(rng.bit_generator.seed_seq.spawn(1)[0]))  # type: ignore[attr-defined]
+        a = exp(-PERIOD_S / time_s)
+        self._lags = np.array((1.0, -2 * a, a * a))
+        gain = (1 - a * a) ** 3 / (1 + a * a)  # variance of white noise that gives the process variance one
+        self._scale = sd * np.sqrt(gain)
+        self._memory = np.zeros(2)
+        warm = round(20 * time_s / PERIOD_S)
+        self._next(warm)
+        self._values: list[float] = []
+
+    def _next(self, count: int) -> Array:
+        values, self._memory = lfilter((1.0,), self._lags, self._scale * self._rng.standard_normal(count), zi=self._memory)
+        return np.asarray(values)
+
+    def at(self, k: int) -> float:
+        while k >= len(self._values):
+            self._values += self._next(self._BLOCK).tolist()
+        return self._values[k]
+
+
+class _TaredSensor:
+    """The force sensor of a patient's examination, as it reads normal forces after a tare at the first stroke's beginning.
+
+    Its z axis is along the inward normal, x near that of A; readings are means over PERIOD_S, as `robot/status` has them.
+    """
+
+    def __init__(self, scenario: Scenario, begin_s: float) -> None:
+        drawn = draw_errors(scenario.errors, scenario.seed).force
+        per_reading = contract().roles["robot"].period / NS
+        quieter = {name: getattr(drawn.given, name) * np.sqrt(per_reading / PERIOD_S) for name in ("noise_n", "noise_nm")}
+        drawn = replace(drawn, given=drawn.given.model_copy(update=quieter))
+        self._sensor = FtSensor(drawn, generator(scenario.seed, "loop force"), PERIOD_S)
+        self._begin = round(begin_s / PERIOD_S)
+        self._normal: list[float] = []
+        self._read(self._begin)
+        self._tare = float(np.mean(self._normal[self._begin - round(TARE / NS / PERIOD_S) : self._begin]))
+        reads, lever = drawn.sensitivity[2], lbr.FT_TO_INDENTER_M
+        self._row = np.array((reads[0] + lever * reads[4], reads[1] - lever * reads[3], reads[2]))
+        """What z reads of a force at the sphere's centre, in the sensor's axes, shape (3,)."""
+
+    def _read(self, k: int) -> None:
+        """Has the readings up to the k-th since the sensor was switched on."""
+        while k >= len(self._normal):
+            self._normal += (-self._sensor.block()[:, 2]).tolist()
+
+    def gains(self, outward: Array) -> Array:
+        z = -outward
+        x = np.array((1.0, 0.0, 0.0)) - z[:, :1] * z
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        axes = np.stack((x, np.cross(z, x), z), axis=1)
+        return np.asarray(-np.einsum("i,pij->pj", self._row, axes))
+
+    def tared(self, k: int) -> float:
+        self._read(self._begin + k)
+        return self._normal[self._begin + k] - self._tare

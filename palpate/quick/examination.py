@@ -1,0 +1,246 @@
+"""The strokes of an examination, carried out on a patient without an arm.
+
+What is done is planning's: its coverage, its curves and speeds, its regulation of depth against force. What the arm and the eye
+get wrong is drawn as whole examinations have it (`palpate.quick.errors`). What comes out is what planning and tissue would have
+sent: exam/state, perception/surface and truth/indentation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from palpate.quick.errors import Loop
+from palpate.quick.patient import PERIOD_S, Patient
+from palpate.truth.surface import TrueBody, TrueSurface
+from palpate_models.frames import Array, apply, inverse
+from palpate_models.load import exam_input
+from palpate_models.scenario import Mode, Scenario
+from palpate_perception import pattern
+from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
+from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
+from palpate_planning.coverage import strokes, transfer
+from palpate_planning.palpation import (
+    AT_DEPTH,
+    DESCEND_MPS,
+    HOLD_S,
+    HOP_M,
+    LIFT_MPS,
+    SETTLE_MAX_S,
+    SETTLED_M,
+    SETTLED_S,
+    SLOW_M,
+    STEADY_FRACTION,
+    StrokeStage,
+)
+from palpate_planning.path import SurfacePath, lay
+from palpate_planning.segments import Segment
+from palpate_planning.stroke_motion import StrokeMotion
+from palpate_planning.surface import PerceivedSurface
+
+_DENSE_M: Final = 0.0003
+"""Along a stroke, places are known so far apart: what the indenter travels in a period."""
+_DOWN: Final = np.diag((1.0, -1.0, -1.0))
+"""The tool's orientation, with its z axis into the body."""
+_NOWHERE: Final = np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A path on the skin as it is believed to be and as it is: g places, about _DENSE_M apart."""
+
+    segment: Segment
+    per_m: float
+    """Places a metre of the path."""
+    believed_W: Array
+    """Points of the perceived surface [m], shape (g, 3), in world."""
+    outward_W: Array
+    """Its outward unit normals, shape (g, 3)."""
+    place: Array
+    """Points of the true skin at rest [m], shape (g, 3), in that frame."""
+    normal: Array
+    """True outward unit normals there, shape (g, 3)."""
+    breathing: list[float]
+    """Share of the breathing excursion there, g of them."""
+    wrong_m: list[float]
+    """How much too far outward the perceived surface is there [m], g of them."""
+    gains: Array
+    """Rows that take a force in that frame to the normal force that is read of it, shape (g, 3)."""
+
+
+@dataclass
+class Row:
+    """One period of an examination."""
+
+    time: float
+    way: Way
+    at: int
+    """Index of the place in its way."""
+    stage: StrokeStage
+    depth: float
+    """Measured [m]."""
+    setpoint: float
+    """[m]"""
+    force: float
+    """Measured [N]."""
+    true_depth: float
+    """Against the skin as it breathes [m]."""
+    true_force: Array
+    """On the sphere [N], shape (3,), in the frame in which the patient truly lies."""
+    touching: bool
+    steady: bool
+    limited: bool
+    target: int
+
+
+class Examination:
+    """One examination of one patient."""
+
+    def __init__(self, scenario: Scenario, loop: Loop) -> None:
+        """`loop`: what arm, eye and force sensor of this examination get wrong."""
+        self._scenario, self._loop = scenario, loop
+        self._exam = scenario.exam
+        self._X_WA = np.array(exam_input(scenario).X_WA)
+        self.patient = Patient(scenario, loop.begin_s)
+        """Who is examined."""
+        self._R_AtW = self.patient.X_WA[:3, :3].T
+        model = self.patient.tissue.model
+        X_AAt = inverse(self._X_WA) @ self.patient.X_WA
+        lying = TrueBody(apply(X_AAt, model.vertices), model.triangles, self._X_WA)
+        self._X_AtA = inverse(X_AAt)
+        self._skin = TrueSurface(lying)
+        """The true skin at rest, in A as registered."""
+        self._breathing = self._skin.between(model.breathing)
+        self._mean_excursion = self.patient.tissue.breathing.mean_m
+        self._motion = StrokeMotion(self._exam, scenario.limits, self.patient.radius, PERIOD_S)
+        self._force, self._touching = 0.0, False
+        self._depth = -HOP_M
+        self._count = 0
+
+    def run(self) -> list[Row]:
+        """Carries it out: what was measured, and what was true."""
+        perceived = PerceivedSurface.from_mesh(*self.perceived, self._X_WA)
+        x, y = pattern.lattice(self._exam)
+        order = pattern.order(len(x), len(y), self._exam.pattern)
+        xy = pattern.downsample(np.empty((0, 3)), x, y)[0][order]
+        rows: list[Row] = []
+        usable = np.ones(len(xy), dtype=bool)
+        exam = self._exam
+        before: Array | None = None
+        for stroke in strokes(xy, (order // len(y)).astype(np.int64), usable, exam.pattern, exam.mode, exam.spacing_m):
+            if before is not None:
+                rows += self._travel(self._way(perceived, transfer(before, stroke.xy[0]), stroke.targets[:1], contact=False))
+            rows += self._stroke(self._way(perceived, stroke.xy, stroke.targets, stroke.visits))
+            before = stroke.xy[-1]
+        return rows
+
+    # --- where the skin is, truly and as it is believed to be ----------------------------------------------------------
+
+    @cached_property
+    def perceived(self) -> tuple[Array, Array]:
+        """The perceived surface as perception's mesh: points [m] and outward unit normals in world, shape (n, 3)."""
+        (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
+        x = pattern.stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        y = pattern.stations(cy, height + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        p, n = self._skin.points(xy)
+        seen = np.isfinite(p).all(axis=1)
+        p, n = p[seen], n[seen]
+        p = p + n * self._loop.wrong(p[:, :2])[:, None]
+        return apply(self._X_WA, p), n @ self._X_WA[:3, :3].T
+
+    def _way(
+        self, perceived: PerceivedSurface, xy: Array, targets: Array, visits: Array | None = None, *, contact: bool = True
+    ) -> Way:
+        s, p, n, R = lay(perceived, xy, _DOWN)
+        visited = np.zeros(len(targets), dtype=np.int64) if visits is None else visits
+        path = SurfacePath(s, p, n, R, np.zeros((len(s), 7)), targets, visited)
+        count = max(1, round(path.length / _DENSE_M))
+        at = np.linspace(0.0, path.length, count + 1)
+        dense = np.column_stack([np.interp(at, s, xy[:, k]) for k in (0, 1)])
+        believed, outward = perceived.at(dense)
+        place, normal = self._skin.points(dense + self._loop.aside_m)
+        return Way(
+            segment=Segment(path, contact=contact),
+            per_m=count / path.length if path.length else 0.0,
+            believed_W=believed,
+            outward_W=outward,
+            place=apply(self._X_AtA, place),
+            normal=normal @ self._X_AtA[:3, :3].T,
+            breathing=self._breathing(dense + self._loop.aside_m).tolist(),
+            wrong_m=self._loop.wrong(dense).tolist(),
+            gains=self._loop.gains(outward @ self._R_AtW.T),
+        )
+
+    # --- the sequence of a stroke, as `palpate_planning.palpation` has it ------------------------------------------------
+
+    def _stroke(self, way: Way) -> Iterator[Row]:
+        motion, exam = self._motion, self._exam
+        motion.start(way.segment)
+        while motion.depth.position < -SLOW_M:
+            motion.depth.step(exam.depth_m, DESCEND_MPS)
+            yield self._period(way, StrokeStage.DESCEND)
+        there = False
+        while not there:
+            there = motion.deepen() or motion.slowdown(0.7, 1.0, 0.0) < 0.1
+            yield self._period(way, StrokeStage.DESCEND)
+        settled = waited = 0.0
+        while settled < SETTLED_S and waited < SETTLE_MAX_S:
+            motion.deepen()
+            near = abs(motion.regulation.reference - self._depth) < SETTLED_M
+            settled, waited = settled + PERIOD_S if near else 0.0, waited + PERIOD_S
+            yield self._period(way, StrokeStage.SETTLE)
+        if exam.mode is Mode.POINT or not way.segment.path.length:
+            for _ in range(round(HOLD_S / PERIOD_S)):
+                yield self._period(way, StrokeStage.HOLD)
+        else:
+            while not motion.slide():
+                motion.deepen()
+                yield self._period(way, StrokeStage.SLIDE)
+        while not motion.depth.step(-HOP_M, LIFT_MPS):
+            motion.brake()
+            yield self._period(way, StrokeStage.LIFT)
+
+    def _travel(self, way: Way) -> Iterator[Row]:
+        self._motion.start(way.segment)
+        while not self._motion.travel(way.segment.path.length):
+            yield self._period(way, StrokeStage.TRANSFER)
+
+    def _period(self, way: Way, stage: StrokeStage) -> Row:
+        """The indenter follows the motion for a period, with this examination's errors."""
+        motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
+        self._count += 1
+        contact = ContactMeasurement(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE, self._depth, self._force, self._touching)
+        motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT)
+        at = int(motion.along.position * way.per_m + 0.5)
+        self._depth = motion.regulation.reference + loop.regulation(k)
+        share = way.breathing[at]
+        excursion = patient.tissue.excursion(patient.time + PERIOD_S)
+        unseen = (1.0 - loop.followed) * share * (excursion - self._mean_excursion)
+        depth = self._depth - way.wrong_m[at] - loop.wander(k) + unseen
+        height = patient.radius - depth + share * excursion
+        force = patient.move(way.place[at] + height * way.normal[at])
+        self._force = float(way.gains[at] @ force) + loop.tared(k)
+        self._touching = self._force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
+        limited = motion.regulation.limited or (motion.short_of_depth and stage in AT_DEPTH)
+        fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
+        steady = self._touching and (stage is StrokeStage.HOLD or (stage is StrokeStage.SLIDE and fast))
+        return Row(
+            time=patient.time,
+            way=way,
+            at=at,
+            stage=stage,
+            depth=self._depth,
+            setpoint=motion.regulation.reference,
+            force=self._force,
+            true_depth=depth,
+            true_force=force,
+            touching=self._touching,
+            steady=steady,
+            limited=limited,
+            target=motion.target,
+        )

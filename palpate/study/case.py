@@ -1,0 +1,138 @@
+"""A case is examined in a process of its own: `python -m palpate.study.case`, a JSON line in for each case, a line out.
+
+A whole examination has a process of its own; quick ones share one that stays warm. It has one thread of BLAS and OpenMP, and ends
+at once when the process that started it does, however that ended.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import resource
+import socket
+import sys
+import tempfile
+from pathlib import Path
+from threading import Thread
+from time import perf_counter, process_time
+from typing import IO, Final
+
+from pydantic import BaseModel, ConfigDict
+
+from palpate.report.results import assemble, truth_of_run
+from palpate.report.rows import Report
+from palpate.run.composed import run_composed
+from palpate.run.distributed import run_distributed
+from palpate.study.code import code_digest
+from palpate.study.manifest import Case, file_hash
+from palpate_conductor.timing import Timing
+from palpate_models.scenario import Scenario
+
+KIB: Final = 1024
+"""Linux gives `ru_maxrss` in this many bytes."""
+
+
+class CaseError(Exception):
+    """A case that cannot be examined here. Says why."""
+
+
+class Attempt(BaseModel):
+    """What one attempt at a case came to."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    case_id: str
+    report: Report | None
+    why: str | None
+    """Why there is no report that counts; null where there is."""
+    code: str = ""
+    peak_memory_bytes: int = 0
+    wall_time_s: float = 0.0
+    assess_time_s: float | None = None
+    """What of that the assessment took."""
+    core_s: float = 0.0
+    host: str = ""
+
+
+def examine(case: Case) -> Attempt:
+    """Examines a patient in this process. Errors of the code are raised; a run that failed is in the report."""
+    begin, used = perf_counter(), _core_s()
+    for path, known in case.files.items():
+        if file_hash(path) != known:
+            raise CaseError(
+                f"{path} is not the file that the study was made with: its SHA-256 begins with {file_hash(path)[:16]}"
+            )
+    scenario = Scenario.model_validate(case.scenario)
+    report, assess_s = _quick(scenario) if case.tier == "quick" else _whole(scenario, case)
+    return Attempt(
+        case_id=case.case_id,
+        report=report,
+        why=report.failure if case.runtime == "wallclock" else None,  # simulated time would fail again in the same way
+        code=code_digest(),
+        peak_memory_bytes=_peak_memory(),
+        wall_time_s=perf_counter() - begin,
+        assess_time_s=assess_s,
+        core_s=_core_s() - used,
+        host=socket.gethostname(),
+    )
+
+
+def _whole(scenario: Scenario, case: Case) -> tuple[Report, float | None]:
+    """The report, and the real time of the assessment [s] where it is known."""
+    with tempfile.TemporaryDirectory(prefix="palpate-case-") as folder:
+        if case.runtime == "lockstep":
+            result = run_composed(scenario, Path(folder), lambda _: None, observers=())
+        else:
+            result = run_distributed(scenario, Path(folder), lambda _: None, (), Timing(wallclock=True))
+    if result.interrupted:
+        raise CaseError("interrupted")
+    blame = result.blame.get("assessment")
+    report = assemble(scenario, result, truth_of_run(scenario, result.collected))
+    return report, None if blame is None else blame["steps"] * blame["compute"] / 1e6
+
+
+def _quick(scenario: Scenario) -> tuple[Report, float]:
+    from palpate.quick.case import run_quick  # noqa: PLC0415 - whole examinations need nothing of it
+
+    quick = run_quick(scenario)
+    return quick.report, quick.assess_s
+
+
+def _core_s() -> float:
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return process_time() + children.ru_utime + children.ru_stime
+
+
+def _peak_memory() -> int:
+    """Largest memory so far of this process, and of the largest that it started [bytes]."""
+    return KIB * sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+def _attempt(line: str) -> Attempt:
+    case = Case.model_validate_json(line)
+    try:
+        return examine(case)
+    except Exception as error:  # whatever it is, it is this case's, and is told
+        return Attempt(case_id=case.case_id, report=None, why=f"{type(error).__name__}: {error}", code=code_digest())
+
+
+def _listen(lines: queue.Queue[str]) -> None:
+    """Passes on what comes in; at the end of it whoever wanted results is gone."""
+    for line in sys.stdin:
+        lines.put(line)
+    os._exit(0)
+
+
+def serve(answers: IO[str]) -> None:
+    """Examines the cases that come in, one after another, until nothing more can come."""
+    lines: queue.Queue[str] = queue.Queue()
+    Thread(target=_listen, args=(lines,), daemon=True).start()
+    while True:
+        answers.write(_attempt(lines.get()).model_dump_json() + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    own = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints is no answer
+    serve(own)

@@ -1,0 +1,61 @@
+"""A study in parts, without any scheduler: each machine takes every n-th case, and the folders are put together afterwards."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from palpate.study.folder import Manifest, add_session, open_folder, outcomes_of, read_manifest, sessions
+from palpate.study.manifest import Case
+from palpate.study.outcome import write_outcome
+from palpate.study.spec import StudyError
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One part of `of` equal ones."""
+
+    index: int
+    """From 1."""
+    of: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """The part that `2/5` names. Raises StudyError."""
+        words = re.fullmatch(r"(\d+)/(\d+)", text)
+        if words is None or not 1 <= int(words[1]) <= int(words[2]):
+            raise StudyError(f"--shard {text}: want i/n with 1 <= i <= n, such as 2/5")
+        return cls(int(words[1]), int(words[2]))
+
+    def part(self, cases: Sequence[Case]) -> list[Case]:
+        """Its cases: every n-th, so that parts take about as long as each other."""
+        return list(cases[self.index - 1 :: self.of])
+
+
+def merge(parts: Sequence[Path], folder: Path) -> Manifest:
+    """Puts the outcomes of all parts of one study into a folder; returns its manifest.
+
+    Raises StudyError when they are not of one study, or a case has no outcome in any of them.
+    """
+    manifests = {part: read_manifest(part) for part in parts}
+    if empty := [part for part, manifest in manifests.items() if manifest is None]:
+        raise StudyError(f"{empty[0]} is no folder of a study: it has no manifest.json")
+    manifest = manifests[parts[0]]
+    assert manifest is not None
+    if other := [part for part in parts if manifests[part] != manifest]:
+        raise StudyError(f"{other[0]} holds another study, split or number of patients than {parts[0]}")
+    open_folder(folder, manifest)
+    (folder / "cases").mkdir(exist_ok=True)
+    for part in parts:
+        for outcome in outcomes_of(part, manifest):
+            write_outcome(folder, outcome)
+        for session in sessions(part) if part.resolve() != folder.resolve() else ():
+            add_session(folder, session)
+    there = {outcome.case.case_id for outcome in outcomes_of(folder, manifest)}
+    if absent := [row.case_id for row in manifest.cases if row.case_id not in there]:
+        raise StudyError(
+            f"{len(absent)} of {len(manifest.cases)} cases are in no part, {absent[0]} the first: run what is missing"
+        )
+    return manifest

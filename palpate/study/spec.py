@@ -1,0 +1,211 @@
+"""A study: which patients are examined, with what errors of the equipment, and by which methods. YAML, as strict as a scenario.
+
+    name: mine
+    populations:
+      healthy: {scenario: person, number: {test: 20}}
+      lumps:   {scenario: person, number: {test: 20}, lumps: {radius_m: [0.008, 0.020], contrast: {grid: [2, 4, 8]}}}
+    methods: {palpate: {}, mine: {services: {assessment: mine.py}}}
+
+Every patient of every population is examined with every entry of `errors` by every method, so that all comparisons are paired.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from palpate.run.roles import OBSERVERS, WORKERS
+from palpate_models.draw import MOST_LUMPS, Draw, Range
+from palpate_models.errors import Errors, Level, table
+from palpate_models.load import ScenarioError, explain, parse_yaml
+from palpate_models.section import Length, Section
+
+Split = Literal["tune", "test"]
+"""`tune`: patients on whom thresholds may be chosen. `test`: patients whose figures are reported."""
+Tier = Literal["whole", "quick"]
+"""`whole`: the composed run of all services. `quick`: the indenter without an arm (`palpate.quick`)."""
+Runtime = Literal["lockstep", "wallclock"]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
+Settings = dict[str, Any]
+"""Fields of a scenario by their path, such as `exam.depth_m: 0.008`."""
+
+SUFFIX: Final = ".yaml"
+
+
+class StudyError(ValueError):
+    """A study that cannot be used. The message names file, field, value and what is allowed."""
+
+
+class Numbers(Section):
+    """How many patients of each split."""
+
+    tune: Annotated[int, Field(ge=0, le=1000)] = 0
+    test: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+
+
+class Grid(Section):
+    """Values that patients get in turn; with several grids, every combination of their values."""
+
+    grid: Annotated[tuple[float, ...], Field(min_length=1)]
+
+
+class Lumps(Section):
+    """Lumps that are drawn for each patient from his seed. Ranges are (least, most), as in `phantom.draw` of a scenario."""
+
+    count: tuple[Annotated[int, Field(ge=0, le=MOST_LUMPS)], Annotated[int, Field(ge=0, le=MOST_LUMPS)]] = (1, 1)
+    """How many a patient has."""
+    radius_m: Range | Grid = Draw().radius_m
+    elongation: Range | Grid = Draw().elongation
+    depth_m: Range | Grid = Draw().depth_m
+    contrast: Range | Grid = Draw().contrast
+    pairs: Annotated[float, Field(ge=0, le=1)] = 0.0
+    place: Literal["inside", "edge"] = "inside"
+    region_m: tuple[Length, Length] = Draw().region_m
+
+    @model_validator(mode="after")
+    def _drawable(self) -> Self:
+        for draw in self.cells():
+            Draw.model_validate(draw)
+        return self
+
+    def cells(self) -> list[dict[str, Any]]:
+        """`phantom.draw` of each combination of the grids; one if there is no grid."""
+        grids = {name: value.grid for name in type(self).model_fields if isinstance(value := getattr(self, name), Grid)}
+        plain = self.model_dump(mode="json", exclude={"count", *grids})
+        return [
+            {"lumps": self.count, **plain, **{name: [value, value] for name, value in zip(grids, values, strict=True)}}
+            for values in product(*grids.values())
+        ]
+
+
+class Population(Section):
+    """Patients of one kind."""
+
+    scenario: str
+    """Name of a scenario, or a YAML file, beside the study's own file if its path is relative."""
+    number: Numbers = Numbers()
+    settings: Settings = Field(default_factory=dict)
+    lumps: Lumps | None = None
+    """Lumps beside those of the scenario, which must be of `kind: person`."""
+
+
+class Method(Section):
+    """A way to examine: whatever of the scenario is changed for it."""
+
+    settings: Settings = Field(default_factory=dict)
+    services: dict[str, str] = Field(default_factory=dict)
+    """Who plays a role: an installed implementation, or a Python file, beside the study's own file if its path is relative."""
+    runtime: Runtime = "lockstep"
+    """`wallclock`: a process a service, each on its own timer. Its results depend on the machine, so that it has no digest."""
+    periods: dict[str, Annotated[int, Field(ge=1, le=1000)]] = Field(default_factory=dict)
+    """Other periods of roles [ms], such as `control: 5`."""
+
+    @model_validator(mode="after")
+    def _roles(self) -> Self:
+        known = (*WORKERS, *OBSERVERS)
+        for field, roles in (("services", self.services), ("periods", self.periods)):
+            if wrong := [role for role in roles if role not in known]:
+                raise ValueError(f"{field}.{wrong[0]}: want one of {', '.join(known)}")
+        return self
+
+
+class Study(Section):
+    """All of a study."""
+
+    name: Name
+    description: str = ""
+    tier: Tier = "whole"
+    salt: str = ""
+    """Changes every patient of the split `test`."""
+    seeds_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """For a held-out study: SHA-256 of the file of secret seeds, without which its split `test` cannot be made."""
+    populations: Annotated[dict[Name, Population], Field(min_length=1)]
+    errors: dict[Name, Errors] = Field(default_factory=dict)
+    """What is wrong with the equipment, by a name for it; as the scenarios have it where there is none."""
+    each_error: tuple[str, ...] = ()
+    """Besides, each of these alone, a section of the errors such as `camera` or a field such as `force.tare_n` ..."""
+    each_error_at: tuple[Level, ...] = ()
+    """... at each of these levels, with all others as in the first of `errors`."""
+    methods: Annotated[dict[Name, Method], Field(min_length=1)] = Field(default_factory=lambda: {"palpate": Method()})
+    record: Literal["none"] = "none"
+    """Nothing is recorded: a recording of one examination has 255 MB."""
+
+    @model_validator(mode="after")
+    def _each(self) -> Self:
+        if bool(self.each_error) != bool(self.each_error_at) or (self.each_error and not self.errors):
+            raise ValueError(
+                "each_error and each_error_at need each other, and errors: its first entry is what all other errors are"
+            )
+        allowed = [*table(), *(f"{section}.{field}" for section, rows in table().items() for field in rows)]
+        if wrong := [name for name in self.each_error if name not in allowed]:
+            raise ValueError(f"each_error = {wrong[0]!r}: want one of {', '.join(allowed)}")
+        if self.tier == "quick" and any(method.runtime == "wallclock" for method in self.methods.values()):
+            raise ValueError("methods.*.runtime = 'wallclock' needs tier: whole")
+        return self
+
+    def error_levels(self) -> dict[str, Errors | None]:
+        """What is wrong with the equipment, by name: `errors`, and `name=level` for each error of its own.
+
+        None stands for what the scenario says. An error that a level leaves as it is in the first of `errors` is left out.
+        """
+        if not self.errors:
+            return {"": None}
+        found: dict[str, Errors | None] = dict(self.errors)
+        base = next(iter(self.errors.values()))
+        for name, level in product(self.each_error, self.each_error_at):
+            section, _, field = name.partition(".")
+            usual, changed = getattr(Errors(level=level), section), getattr(base, section)
+            changed = changed.model_copy(update={field: getattr(usual, field)}) if field else usual
+            if changed != getattr(base, section):
+                found[f"{name}={level}"] = base.model_copy(update={section: changed})
+        return found
+
+
+def study_names() -> tuple[str, ...]:
+    """Names of the studies that come with the project."""
+    folder = resources.files("palpate.study").joinpath("studies")
+    return tuple(sorted(item.name.removesuffix(SUFFIX) for item in folder.iterdir() if item.name.endswith(SUFFIX)))
+
+
+def load_study(source: str) -> Study:
+    """A study by name or YAML file, with paths of files made absolute. Raises StudyError."""
+    if source in study_names():
+        path = Path(str(resources.files("palpate.study").joinpath("studies", source + SUFFIX)))
+    else:
+        path = Path(source)
+        if not path.is_file():
+            raise StudyError(f"{source}: no such study; known are {', '.join(study_names())}, or give the path of a YAML file")
+    try:
+        raw = parse_yaml(path.read_text(encoding="utf-8"), source)
+    except (ScenarioError, UnicodeDecodeError) as error:
+        raise StudyError(str(error)) from error
+    if not isinstance(raw, Mapping):
+        raise StudyError(f"{source}: want a mapping of fields, not {type(raw).__name__}")
+    return checked_study({"name": path.stem, **raw}, source, path.parent)
+
+
+def checked_study(raw: Mapping[str, Any], name: str, folder: Path) -> Study:
+    """The study of these fields, read from the file `name` in `folder`. Raises StudyError."""
+    try:
+        study = Study.model_validate(raw)
+    except ValidationError as error:
+        raise StudyError(explain(name, error)) from error
+    populations = {
+        key: population.model_copy(update={"scenario": _file(population.scenario, folder, SUFFIX)})
+        for key, population in study.populations.items()
+    }
+    methods = {
+        key: method.model_copy(update={"services": {role: _file(word, folder, ".py") for role, word in method.services.items()}})
+        for key, method in study.methods.items()
+    }
+    return study.model_copy(update={"populations": populations, "methods": methods})
+
+
+def _file(word: str, folder: Path, suffix: str) -> str:
+    """A name as it is, and a file by its absolute path."""
+    return str((folder / word).resolve()) if word.endswith(suffix) else word

@@ -1,0 +1,27 @@
+"""The true tissue of a scenario, whatever plays it, for those who press it without the bus."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from palpate_bus.implementations import create
+from palpate_models.motion import Motion
+from palpate_models.scenario import Scenario
+from palpate_tissue.backend import TissueBackend
+from palpate_tissue.service import TissueService
+
+_OWN_FMU: Final = "winkler"
+"""The tier whose equations our own FMU has."""
+
+
+def true_tissue(scenario: Scenario) -> TissueBackend | None:
+    """The tissue of a scenario at rest, on a body that stays where it lies.
+
+    None where there is no copy of it: of somebody else's FMU, of a service of somebody's own, and of what is real.
+    """
+    chosen = scenario.services.tissue
+    if chosen == "none" or (chosen == "fmu" and scenario.tissue.fmu is not None):
+        return None
+    still = scenario.phantom.model_copy(update={"motion": Motion()})
+    service = create("tissue", _OWN_FMU if chosen == "fmu" else chosen, scenario.model_copy(update={"phantom": still}))
+    return service.backend if isinstance(service, TissueService) else None
