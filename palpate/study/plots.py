@@ -18,7 +18,7 @@ from palpate.report.page_figures import GRID, plain
 from palpate.study import human_line
 from palpate.study.statistics.analysis import Analysis
 from palpate.study.statistics.calibration import Calibration
-from palpate.study.statistics.comparison import Comparison
+from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, Surface
 from palpate.study.statistics.errors import Agreement
 from palpate.study.statistics.estimate import Estimate
@@ -260,25 +260,37 @@ def effort(analyses: Sequence[Analysis]) -> str:
 
 
 def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str | None:
-    """Paired differences of one quantity from the reference, greatest first; None where none is known."""
-    known = [(c, c.quantities[name]) for c in comparisons if c.quantities[name].mean.value is not None]
+    """Paired differences of one quantity from the reference, greatest first; None where none is known.
+
+    Levels of one error, `error=level`, share a row.
+    """
+    known: dict[str, list[tuple[str, Difference]]] = {}
+    for comparison in comparisons:
+        source, _, level = comparison.other.rpartition("=")
+        difference = comparison.quantities[name]
+        if difference.mean.value is not None:
+            known.setdefault(source or level, []).append((level if source else "difference", difference))
     if not known:
         return None
-    known = sorted(known, key=lambda row: -abs(row[1].mean.value or 0))[:rows][::-1]
-    scale, unit = (1e3, " [mm]") if known[0][1].unit == "m" else (1.0, f" [{known[0][1].unit}]" if known[0][1].unit else "")
-    figure = _figure(8.5, 1.3 + 0.32 * len(known))
+    shown = sorted(known.items(), key=lambda row: -max(abs(d.mean.value or 0) for _, d in row[1]))[:rows][::-1]
+    words, unit, margin = QUANTITIES[name]
+    scale, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
+    levels = list(dict.fromkeys(level for _, row in shown for level, _ in row))
+    figure = _figure(9.0, 1.6 + 0.34 * len(shown))
     (axes,) = _axes(figure)
-    for y, (_, difference) in enumerate(known):
-        mean = difference.mean
-        value = scale * float(mean.value or 0)
-        axes.barh(y, value, height=0.62, color=COLOURS[1] if value > 0 else COLOURS[0], alpha=0.55)
-        if mean.low is not None and mean.high is not None:
-            axes.plot([scale * mean.low, scale * mean.high], [y, y], color=INK, lw=1.4)
-    margin = scale * known[0][1].margin
-    axes.axvspan(-margin, margin, color=QUIET, alpha=0.12, lw=0, label="margin of equivalence")
+    height = 0.7 / len(levels)
+    for i, level in enumerate(levels):
+        bars = [(y + (i - (len(levels) - 1) / 2) * height, d.mean) for y, (_, row) in enumerate(shown) for own, d in row if own == level]
+        at, means = [y for y, _ in bars], [mean for _, mean in bars]
+        color = COLOURS[i % MOST]
+        axes.barh(at, [scale * (mean.value or 0) for mean in means], height=height, color=color, alpha=0.55, label=level)
+        for y, mean in bars:
+            if mean.low is not None and mean.high is not None:
+                axes.plot([scale * mean.low, scale * mean.high], [y, y], color=INK, lw=1.3)
+    axes.axvspan(-scale * margin, scale * margin, color=QUIET, alpha=0.12, lw=0, label="margin of equivalence")
     axes.axvline(0, color=QUIET, lw=0.8)
-    plain(axes, "", f"{known[0][1].words}, difference from {known[0][0].reference}{unit}")
-    axes.set_yticks(range(len(known)), [f"{c.other} (n = {d.mean.n})" for c, d in known])
+    plain(axes, "", f"{words}, difference from {comparisons[0].reference}{f' [{unit}]' if unit else ''}")
+    axes.set_yticks(range(len(shown)), [f"{source} (n = {min(d.mean.n for _, d in row)})" for source, row in shown])
     _legend(axes, "lower right")
     return _svg(figure)
 
