@@ -39,10 +39,11 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: install  ## docs/topics.md from the contract, settings.md and errors.md from their tables
+docs: install  ## docs/topics.md from the contract, settings.md and errors.md from their tables, leaderboard.md from the studies
 	$(BIN)/python -m palpate_bus.contract.doc
 	$(BIN)/python -m palpate_bus.settings --doc
 	$(BIN)/python -m palpate_models.errors_page
+	$(BIN)/python -m palpate.study.leaderboard
 
 install: $(VENV)/.installed
 

@@ -280,7 +280,12 @@ def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str
     (axes,) = _axes(figure)
     height = 0.7 / len(levels)
     for i, level in enumerate(levels):
-        bars = [(y + (i - (len(levels) - 1) / 2) * height, d.mean) for y, (_, row) in enumerate(shown) for own, d in row if own == level]
+        bars = [
+            (y + (i - (len(levels) - 1) / 2) * height, d.mean)
+            for y, (_, row) in enumerate(shown)
+            for own, d in row
+            if own == level
+        ]
         at, means = [y for y, _ in bars], [mean for _, mean in bars]
         color = COLOURS[i % MOST]
         axes.barh(at, [scale * (mean.value or 0) for mean in means], height=height, color=color, alpha=0.55, label=level)
