@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -60,6 +61,8 @@ def cluster(count: int, scheduler: str | None) -> Iterator[Workers]:
     from distributed import Client, KilledWorker, LocalCluster  # noqa: PLC0415 - shards do without
 
     with ExitStack() as stack:
+        stack.enter_context(warnings.catch_warnings())
+        warnings.filterwarnings("ignore", "Port .* is already in use")  # another study's: the address is told all the same
         try:
             if scheduler is None:
                 local = stack.enter_context(
@@ -77,5 +80,5 @@ def cluster(count: int, scheduler: str | None) -> Iterator[Workers]:
                 client = stack.enter_context(Client(scheduler, timeout=CONNECT_S))
         except (OSError, ValueError, TimeoutError) as error:
             raise WorkersError(f"--scheduler {scheduler}: {error}" if scheduler else f"--workers {count}: {error}") from error
-        known = sum(client.nthreads().values()) or count
+        known = sum(client.nthreads().values()) or 1
         yield Workers(client.get_executor(pure=False), known, client.dashboard_link, (KilledWorker,))

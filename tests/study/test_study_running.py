@@ -1,0 +1,217 @@
+"""The same study in every way to run it: workers come and go, runs are stopped, and the digest is the same.
+
+Cases are examined for real, by the quick tier.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pandas as pd
+import psutil
+import pytest
+import yaml
+from toy_study import TOY, study
+
+from palpate.study.digest import digest
+from palpate.study.folder import manifest_of, open_folder, outcomes_of
+from palpate.study.manifest import Case, cases_of
+from palpate.study.outcome import ATTEMPTS, case_file, read_outcome
+from palpate.study.runner import StudyStopped, failures, missing, of_other_code, run_cases
+from palpate.study.shards import Shard, merge
+from palpate.study.spec import StudyError
+from palpate.study.tables import write_tables
+from palpate.study.workers import cluster, threads
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+CASES = cases_of(study())
+
+
+def examined(folder: Path, cases: list[Case], count: int = 1) -> Path:
+    """The folder of the toy with these cases done, by threads."""
+    open_folder(folder, manifest_of("toy", CASES))
+    with threads(count) as workers:
+        run_cases(folder, cases, workers, lambda _: None)
+    return folder
+
+
+def digest_of(folder: Path) -> str:
+    """The digest of a folder that holds all cases."""
+    outcomes = outcomes_of(folder, manifest_of("toy", CASES))
+    assert [outcome.case.case_id for outcome in outcomes] == [case.case_id for case in CASES]
+    assert all(outcome.completed and outcome.attempts == 1 for outcome in outcomes)
+    return digest(outcomes)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy done by one worker."""
+    return examined(tmp_path_factory.mktemp("toy"), CASES)
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A scheduler of its own with a worker, as on a cluster."""
+    address = "tcp://127.0.0.1:18786"
+    head = subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "18786", "--no-dashboard"]
+    )
+    hand = subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"])
+    yield address, head
+    for process in (hand, head):
+        process.terminate()
+        process.wait(30)
+
+
+def test_the_digest_is_that_of_two_workers_in_another_order(folder: Path, tmp_path: Path) -> None:
+    assert digest_of(examined(tmp_path, CASES[::-1], count=2)) == digest_of(folder)
+
+
+def test_the_digest_is_that_of_its_parts_put_together(folder: Path, tmp_path: Path) -> None:
+    parts = [tmp_path / "one", tmp_path / "two"]
+    for index, part in enumerate(parts, 1):
+        own = Shard(index, 2).part(CASES)
+        for case in own:  # what another machine has done
+            open_folder(part, manifest_of("toy", CASES))
+            case_file(part, case.case_id).parent.mkdir(exist_ok=True)
+            case_file(part, case.case_id).write_bytes(case_file(folder, case.case_id).read_bytes())
+    assert merge(parts, tmp_path / "whole") == manifest_of("toy", CASES)
+    assert digest_of(tmp_path / "whole") == digest_of(folder)
+    with pytest.raises(StudyError, match="1 of 3 cases are in no part"):
+        merge(parts[:1], tmp_path / "half")
+
+
+def test_parts_of_different_studies_are_not_put_together(folder: Path, tmp_path: Path) -> None:
+    open_folder(tmp_path / "other", manifest_of("toy", CASES[:2]))
+    with pytest.raises(StudyError, match="holds another study"):
+        merge([folder, tmp_path / "other"], tmp_path / "whole")
+    with pytest.raises(StudyError, match=r"no manifest\.json"):
+        merge([folder, tmp_path], tmp_path / "whole")
+
+
+def test_a_killed_worker_costs_no_case(folder: Path, tmp_path: Path) -> None:
+    """Dask starts it anew, and gives its cases to whoever is free."""
+    open_folder(tmp_path, manifest_of("toy", CASES))
+    with cluster(2, None) as workers:
+        killed = _strike(_case_process, lambda process: os.kill(process.ppid(), signal.SIGKILL))
+        run_cases(tmp_path, CASES, workers, lambda _: None)
+    assert killed.is_set()
+    assert digest_of(tmp_path) == digest_of(folder)
+
+
+def test_a_study_goes_on_after_its_scheduler_was_killed(
+    folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
+) -> None:
+    address, head = scheduler
+    open_folder(tmp_path, manifest_of("toy", CASES))
+    with pytest.raises(StudyStopped), cluster(1, address) as workers:
+        _strike(_case_process, lambda _: head.kill())
+        run_cases(tmp_path, CASES, workers, lambda _: None)
+    assert missing(tmp_path, CASES)
+    assert digest_of(examined(tmp_path, CASES)) == digest_of(folder)
+
+
+def test_a_study_goes_on_after_its_command_was_killed(folder: Path, tmp_path: Path) -> None:
+    """Killed when the first case is done, then called again; what is done is not done again."""
+    (tmp_path / "toy.yaml").write_text(yaml.safe_dump(TOY))
+    out = tmp_path / "out"
+    command = [
+        sys.executable,
+        "-m",
+        "palpate",
+        "study",
+        str(tmp_path / "toy.yaml"),
+        "-o",
+        str(out),
+        "--shard",
+        "1/1",
+        "--workers",
+        "1",
+    ]
+    first = subprocess.Popen(command)
+    while not list((out / "cases").glob("*.json")):
+        assert first.poll() is None
+        time.sleep(0.1)
+    first.kill()
+    first.wait()
+    done = {path.name: path.stat().st_mtime_ns for path in (out / "cases").glob("*.json")}
+    subprocess.run(command, check=True)
+    assert done.items() <= {path.name: path.stat().st_mtime_ns for path in (out / "cases").glob("*.json")}.items()
+    assert digest_of(out) == digest_of(folder) == json.loads((out / "run.json").read_text())["digest"]
+    assert (out / "study.html").is_file()
+
+
+def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.py"
+    bad.write_text("def create(scenario):\n    raise RuntimeError('no idea')\n")
+    mine = study(methods={"bad": {"services": {"assessment": str(bad)}}})
+    cases = cases_of(mine)[:1]
+    open_folder(tmp_path, manifest_of("toy", cases))
+    with threads(1) as workers:
+        run_cases(tmp_path, cases, workers, lambda _: None)
+    outcome = read_outcome(tmp_path, cases[0].case_id)
+    assert outcome is not None
+    assert (outcome.status, outcome.attempts, outcome.completed) == ("failed", ATTEMPTS, False)
+    assert failures(tmp_path, cases[0]) == ["RuntimeError: no idea"] * ATTEMPTS
+    write_tables(tmp_path, "toy", [outcome])
+    (row,) = pd.read_parquet(tmp_path / "cases.parquet").to_dict("records")
+    assert (row["status"], row["attempts"], row["completed"]) == ("failed", ATTEMPTS, False)
+    assert row["why"] == "RuntimeError: no idea"
+    lumps = pd.read_parquet(tmp_path / "lumps.parquet")
+    assert len(lumps) == 1, "the lump of clean, which nobody found"
+    assert not lumps["found"].any()
+
+
+def test_a_service_that_is_changed_in_mid_study_is_not_examined_with(tmp_path: Path) -> None:
+    own = tmp_path / "own.py"
+    own.write_text("from palpate_assessment.service import create\n")
+    cases = cases_of(study(methods={"own": {"services": {"assessment": str(own)}}}))[:1]
+    own.write_text("from palpate_assessment.service import create  # changed\n")
+    open_folder(tmp_path, manifest_of("toy", cases))
+    with threads(1) as workers:
+        run_cases(tmp_path, cases, workers, lambda _: None)
+    assert all("own.py is not the file that the study was made with" in why for why in failures(tmp_path, cases[0]))
+
+
+def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
+    open_folder(tmp_path, manifest_of("toy", CASES))
+    path = case_file(tmp_path, CASES[0].case_id)
+    path.parent.mkdir()
+    outcome = read_outcome(folder, CASES[0].case_id)
+    assert outcome is not None
+    assert of_other_code(folder, CASES) == []
+    path.write_text(outcome.model_copy(update={"code": "0" * 64}).model_dump_json())
+    assert of_other_code(tmp_path, CASES) == [CASES[0]]
+
+
+def _case_process() -> psutil.Process | None:
+    """A process that examines a case, of those that this test has started or their workers."""
+    for process in psutil.process_iter(["cmdline"]):
+        words = process.info["cmdline"] or []
+        if "palpate.study.case" in words and psutil.Process() in process.parents():
+            return process
+    return None
+
+
+def _strike(find: Callable[[], psutil.Process | None], strike: Callable[[psutil.Process], None]) -> threading.Event:
+    """As soon as `find` finds a process that has worked for a moment, `strike` hits; says when it has."""
+    struck = threading.Event()
+
+    def watch() -> None:
+        while not struck.is_set():
+            process = find()
+            if process is not None and sum(process.cpu_times()[:2]) > 2.0:
+                strike(process)
+                struck.set()
+            time.sleep(0.2)
+
+    threading.Thread(target=watch, daemon=True).start()
+    return struck
