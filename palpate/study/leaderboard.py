@@ -1,4 +1,4 @@
-"""docs/leaderboard.md from the study.json files of the studies that come with the project: `python -m palpate.study.leaderboard`."""
+"""docs/leaderboard.md from the study.json files in docs/studies: `python -m palpate.study.leaderboard`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ STUDIES: Final = DOCS / "studies"
 HEAD: Final = """\
 # Leaderboard
 
-Made by `python -m palpate.study.leaderboard` from `docs/studies/*/study.json`: do not edit. In brackets 95 % intervals and sample sizes;
-[statistics.md](statistics.md) defines the columns. Failed and not completed cases count against the method.
+Made by `python -m palpate.study.leaderboard` from `docs/studies/*/study.json`: do not edit. In brackets are 95 %
+intervals and sample sizes; [statistics.md](statistics.md) defines the columns. Failed and not completed cases count against
+the method.
 
-A submission is a Python file with a service and a study file in YAML that names it; the command of a row runs it again. For studies
-with secret seeds the study file holds the SHA-256 of the file of seeds, and `--seeds-file` gives it.
+A submission is a Python file with a service and a study file in YAML that names it; the command of a row runs it again. A study
+with secret seeds holds the SHA-256 of the file of seeds, which `--seeds-file` gives.
 """
 COLUMNS: Final = (
     "method", "version", "AUC", "mean sensitivity, 1/8 to 8 false findings", "sensitivity at no false finding", "lumps found",

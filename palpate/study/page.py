@@ -29,6 +29,7 @@ def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons
     return environment.get_template("study.html.j2").render(
         s=summary,
         shown=[a.name for a in shown],
+        methods=[summary["methods"][a.name] for a in shown],
         human=human_line,
         quantities=QUANTITIES,
         roc=_safe(plots.roc(analyses)),

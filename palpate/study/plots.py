@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from matplotlib import rc_context
@@ -18,7 +18,7 @@ from palpate.report.page_figures import GRID, plain
 from palpate.study import human_line
 from palpate.study.statistics.analysis import Analysis
 from palpate.study.statistics.calibration import Calibration
-from palpate.study.statistics.comparison import Comparison
+from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, Surface
 from palpate.study.statistics.errors import Agreement
 from palpate.study.statistics.estimate import Estimate
@@ -72,8 +72,8 @@ def _svg(figure: Figure) -> str:
     return text
 
 
-def _legend(axes: Axes, place: str = "best") -> None:
-    axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc=place)
+def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "best", below: bool = False) -> None:
+    axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc=place, bbox_to_anchor=(0, -0.17) if below else None)
 
 
 def _human(axes: Axes) -> None:
@@ -126,11 +126,10 @@ def froc(analyses: Sequence[Analysis]) -> str | None:
     (axes,) = _axes(figure)
     least = RATES[0] / 2
     for color, (name, curve) in zip(COLOURS, shown, strict=False):
-        x = np.append(np.maximum(curve.false_findings, least), RATES[-1])
-        values, low, high = (np.append(y, y[-1]) for y in (curve.sensitivity, curve.low, curve.high))
-        axes.plot(x, values, color=color, lw=1.8, label=f"{name}: mean {curve.mean.value:.3f}")
-        axes.fill_between(x, low, high, color=color, alpha=0.13, lw=0)
-        axes.plot(RATES, [e.value for e in curve.at.values()], "o", ms=4, color=color)
+        x = np.maximum(curve.false_findings, least)
+        axes.plot(x, curve.sensitivity, color=color, lw=1.8, label=f"{name}: mean {curve.mean.value:.3f}")
+        axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.13, lw=0)
+        axes.plot(RATES, [e.value or 0.0 for e in curve.at.values()], "o", ms=4, color=color)
     _human(axes)
     plain(axes, "lumps found", "false findings an examination")
     axes.set_xscale("log", base=2)
@@ -144,14 +143,14 @@ def froc(analyses: Sequence[Analysis]) -> str | None:
 
 
 def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
-    """Probability of detection against each covariate: found parts in bins, and the surface at quartiles of what else matters most.
+    """Probability of detection against each covariate: what was found, in bins, and the surface at quartiles of another one.
 
     None where no lump is known.
     """
     if not any(analysis.observed[name] for name in names):
         return None
     surface = analysis.felt if tuple(names) == FELT else analysis.made
-    figure = _figure(14.5, 4.6)
+    figure = _figure(14.5, 5.6)
     for axes, name in zip(_axes(figure, len(names)), names, strict=True):
         words, scale = COVARIATES[name]
         if surface is not None and name in surface.names:
@@ -161,7 +160,9 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
         _human(axes)
         if name == "radius_m":
             sizes = [point.size_m / 2 * scale for point in human_line.BY_SIZE]
-            axes.plot(sizes, [point.found for point in human_line.BY_SIZE], "D", color=HUMAN, ms=6, label="physicians, by size of lump")
+            axes.plot(
+                sizes, [point.found for point in human_line.BY_SIZE], "D", color=HUMAN, ms=6, label="physicians, by size of lump"
+            )
         plain(axes, "probability of detection" if name == names[0] else "", words)
         if name in LOGARITHMIC:
             axes.set_xscale("log")
@@ -170,7 +171,7 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
             axes.tick_params(which="minor", labelsize=7.5, colors=QUIET)
         _percent(axes)
         axes.set_ylim(-0.02, 1.02)
-        _legend(axes)
+        _legend(axes, "upper left", below=True)
     return _svg(figure)
 
 
@@ -259,25 +260,42 @@ def effort(analyses: Sequence[Analysis]) -> str:
 
 
 def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str | None:
-    """Paired differences of one quantity from the reference, greatest first; None where none is known."""
-    known = [(c, c.quantities[name]) for c in comparisons if c.quantities[name].mean.value is not None]
+    """Paired differences of one quantity from the reference, greatest first; None where none is known.
+
+    Levels of one error, `error=level`, share a row.
+    """
+    known: dict[str, list[tuple[str, Difference]]] = {}
+    for comparison in comparisons:
+        source, _, level = comparison.other.rpartition("=")
+        difference = comparison.quantities[name]
+        if difference.mean.value is not None:
+            known.setdefault(source or level, []).append((level if source else "difference", difference))
     if not known:
         return None
-    known = sorted(known, key=lambda row: -abs(row[1].mean.value or 0))[:rows][::-1]
-    scale, unit = (1e3, " [mm]") if known[0][1].unit == "m" else (1.0, f" [{known[0][1].unit}]" if known[0][1].unit else "")
-    figure = _figure(8.5, 1.3 + 0.32 * len(known))
+    shown = sorted(known.items(), key=lambda row: -max(abs(d.mean.value or 0) for _, d in row[1]))[:rows][::-1]
+    words, unit, margin = QUANTITIES[name]
+    scale, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
+    levels = list(dict.fromkeys(level for _, row in shown for level, _ in row))
+    figure = _figure(9.0, 1.6 + 0.34 * len(shown))
     (axes,) = _axes(figure)
-    for y, (_, difference) in enumerate(known):
-        mean = difference.mean
-        value = scale * float(mean.value or 0)
-        axes.barh(y, value, height=0.62, color=COLOURS[1] if value > 0 else COLOURS[0], alpha=0.55)
-        if mean.low is not None and mean.high is not None:
-            axes.plot([scale * mean.low, scale * mean.high], [y, y], color=INK, lw=1.4)
-    margin = scale * known[0][1].margin
-    axes.axvspan(-margin, margin, color=QUIET, alpha=0.12, lw=0, label="margin of equivalence")
+    height = 0.7 / len(levels)
+    for i, level in enumerate(levels):
+        bars = [
+            (y + (i - (len(levels) - 1) / 2) * height, d.mean)
+            for y, (_, row) in enumerate(shown)
+            for own, d in row
+            if own == level
+        ]
+        at, means = [y for y, _ in bars], [mean for _, mean in bars]
+        color = COLOURS[i % MOST]
+        axes.barh(at, [scale * (mean.value or 0) for mean in means], height=height, color=color, alpha=0.55, label=level)
+        for y, mean in bars:
+            if mean.low is not None and mean.high is not None:
+                axes.plot([scale * mean.low, scale * mean.high], [y, y], color=INK, lw=1.3)
+    axes.axvspan(-scale * margin, scale * margin, color=QUIET, alpha=0.12, lw=0, label="margin of equivalence")
     axes.axvline(0, color=QUIET, lw=0.8)
-    plain(axes, "", f"{known[0][1].words}, difference from {known[0][0].reference}{unit}")
-    axes.set_yticks(range(len(known)), [f"{c.other} (n = {d.mean.n})" for c, d in known])
+    plain(axes, "", f"{words}, difference from {comparisons[0].reference}{f' [{unit}]' if unit else ''}")
+    axes.set_yticks(range(len(shown)), [f"{source} (n = {min(d.mean.n for _, d in row)})" for source, row in shown])
     _legend(axes, "lower right")
     return _svg(figure)
 
@@ -286,5 +304,3 @@ def _percent(axes: Axes, both: bool = False) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if both:
         axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-
-

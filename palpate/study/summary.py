@@ -139,12 +139,12 @@ class Analysed:
     analyses: tuple[Analysis, ...]
 
 
-def summarise(folder: Path) -> None:
+def summarise(folder: Path, folds: int = FOLDS) -> None:
     """Reads cases.parquet, findings.parquet and lumps.parquet of `folder`; writes study.json and study.html beside them.
 
-    Raises TablesError.
+    Intervals are of `folds` resamplings. Raises TablesError.
     """
-    analysed = analysed_tables(read_tables(folder))
+    analysed = analysed_tables(read_tables(folder, folds))
     write_text(folder / JSON, analysed.summary.model_dump_json(indent=1) + "\n")
     write_text(folder / PAGE, render(analysed.summary.model_dump(), analysed.analyses, analysed.summary.comparisons))
 
@@ -174,7 +174,7 @@ def analysed_tables(tables: Tables) -> Analysed:
         methods={analysis.name: _method(analysis) for analysis in analyses},
         comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
         level=LEVEL,
-        bootstrap_folds=FOLDS,
+        bootstrap_folds=tables.folds,
         human=human_line.as_json(),
     )
     return Analysed(summary, analyses)
@@ -185,10 +185,10 @@ def _method(a: Analysis) -> MethodRow:
     return MethodRow(
         rates=a.rates,
         populations=a.populations,
-        auc=a.roc and a.roc.auc,
-        froc_mean=a.froc and a.froc.mean,
+        auc=None if a.roc is None else a.roc.auc,
+        froc_mean=None if a.froc is None else a.froc.mean,
         froc={} if a.froc is None else {f"{rate:g}": value for rate, value in a.froc.at.items()},
-        sensitivity_at_zero=a.froc and a.froc.at_zero,
+        sensitivity_at_zero=None if a.froc is None else a.froc.at_zero,
         felt=None if a.felt is None else _surface(a.felt, "felt_contrast", "felt_radius_m"),
         made=None if a.made is None else _surface(a.made, "contrast", "radius_m"),
         errors=ErrorsRow(
@@ -201,8 +201,9 @@ def _method(a: Analysis) -> MethodRow:
             log_ratio=_agreement(e.log_ratio),
             ratio_held=e.ratio_held,
         ),
-        calibration=c
-        and CalibrationRow(
+        calibration=None
+        if c is None
+        else CalibrationRow(
             slope=c.slope,
             in_the_large=c.in_the_large,
             expected_error=c.expected_error,

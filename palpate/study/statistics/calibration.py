@@ -1,4 +1,4 @@
-"""Calibration: of the areas with confidence p, does a part p hit a lump?"""
+"""Calibration: whether of the areas with confidence p a part p hits a lump."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Calibration:
     """Of findings and candidates together, or of the reported findings where a method publishes no candidates."""
 
     slope: Estimate
-    """Of the log odds of a hit against the log odds of the confidence: 1 is ideal, less is too sure (Cox, Biometrika 1958;45:562)."""
+    """Of the log odds of a hit against those of the confidence: 1 is ideal, less is too sure (Cox, Biometrika 1958;45:562)."""
     in_the_large: Estimate
     """Part of hits less mean confidence: 0 is ideal."""
     expected_error: Estimate
@@ -75,24 +75,22 @@ def _bins(p: Array) -> NDArray[np.intp]:
 
 
 def _bin(p: Array, hit: NDArray[np.bool_], patient: NDArray[np.intp], bootstrap: Bootstrap) -> tuple[float, Estimate]:
-    total = bootstrap.counts.shape[1]
-    hits = np.bincount(patient, weights=hit, minlength=total)
-    seen = np.bincount(patient, minlength=total).astype(np.float64)
+    hits, seen = (bootstrap.sums(values, patient) for values in (hit, np.ones(len(p))))
     return float(p.mean()), bounded(float(hit.mean()), bootstrap.ratio(hits, seen), len(p), "areas", int((seen > 0).sum()))
 
 
 def _expected_error(p: Array, hit: NDArray[np.bool_], label: NDArray[np.intp], drawn: Array) -> Array:
-    """sum over bins of |sum(hit - p)| / all, shape (folds,)."""
-    gaps = sum((np.abs(drawn[:, label == i] @ (hit - p)[label == i]) for i in np.unique(label)), start=np.zeros(len(drawn)))
+    """Sums over the bins of |sum(hit - p)|, over the number of all areas, shape (folds,); areas are in order of their bins."""
+    _, first = np.unique(label, return_index=True)
+    gaps = np.abs(np.add.reduceat(drawn * (hit - p), first, axis=1)).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(gaps / drawn.sum(axis=1), dtype=np.float64)
 
 
 def _by_chance(p: Array, label: NDArray[np.intp]) -> float:
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([0, crc32(b"hits by their confidence")])))
-    once = np.ones((1, len(p)))
-    drawn = [_expected_error(p, rng.random(len(p)) < p, label, once)[0] for _ in range(FOLDS)]
-    return float(np.quantile(drawn, LEVEL))
+    hit = rng.random((FOLDS, len(p))) < p
+    return float(np.quantile(_expected_error(p, hit, label, np.ones((1, len(p)))), LEVEL))
 
 
 def _slope(p: Array, hit: NDArray[np.bool_], drawn: Array) -> tuple[float, Array]:

@@ -69,7 +69,8 @@ class Difference(BaseModel):
     """90 % interval of the mean: within the margins where the methods are equivalent."""
     high_90: float | None
     p_equivalence: float | None
-    """Greater one of the two one-sided tests' (Schuirmann, J Pharmacokinet Biopharm 1987;15:657); None where all differences are one."""
+    """Greater one of the two one-sided t-tests' (Schuirmann, J Pharmacokinet Biopharm 1987;15:657); None where all
+    differences are equal."""
     equivalent: bool | None
     """Whether the 90 % interval is within the margins; None where it is not known."""
 
@@ -122,7 +123,7 @@ def _curves(a: Variant, b: Variant, bootstrap: Bootstrap) -> dict[str, Estimate 
 
 
 def _less(b: Estimate, a: Estimate, replicates: Array) -> Estimate:
-    """b - a; where both are at the end of their range, with what both intervals allow."""
+    """The difference b - a; where both are at the end of their range, with what both intervals allow."""
     if None in (a.value, a.low, a.high, b.value, b.low, b.high):
         return Estimate(value=None, n=a.n, of=a.of)
 
@@ -140,15 +141,15 @@ def _mcnemar(a: pd.Series, b: pd.Series, patient: pd.Series, bootstrap: Bootstra
     if n == 0:
         nothing = Estimate(value=None, n=0, of="patients")
         return McNemar(only_reference=0, only_other=0, n=0, difference=nothing, p=1.0)
-    total = bootstrap.counts.shape[1]
-    gain = np.bincount(patient, weights=b.astype(float) - a.astype(float), minlength=total)
+    gain, seen = (bootstrap.sums(values, patient) for values in (b.astype(float) - a.astype(float), np.ones(n)))
 
     def alike() -> Estimate:
         most = wilson(only_a + only_b, n, "patients").high
         low, high = (-1.0 if most is None else -most), most
-        return Estimate(value=(only_b - only_a) / n, low=low, high=high, n=n, of="patients", interval="Wilson, of patients who differ")
+        return Estimate(
+            value=(only_b - only_a) / n, low=low, high=high, n=n, of="patients", interval="Wilson, of patients who differ"
+        )
 
-    seen = np.bincount(patient, minlength=total).astype(np.float64)
     difference = estimate((only_b - only_a) / n, bootstrap.ratio(gain, seen), n, "patients", alike)
     p = float(mcnemar([[0, only_a], [only_b, 0]], exact=True).pvalue) if only_a + only_b else 1.0
     return McNemar(only_reference=only_a, only_other=only_b, n=n, difference=difference, p=p)
@@ -174,9 +175,7 @@ def _difference(name: str, a: pd.Series, b: pd.Series, bootstrap: Bootstrap) -> 
     x, y = pairs.to_numpy().T
     patient: NDArray[np.intp] = pairs.index.to_numpy(dtype=np.intp)
     n, gain = len(pairs), y - x
-    total = bootstrap.counts.shape[1]
-    sums, seen = (np.bincount(patient, weights=weights, minlength=total) for weights in (gain, np.ones(n)))
-    replicates = bootstrap.ratio(sums, seen)
+    replicates = bootstrap.ratio(*(bootstrap.sums(values, patient) for values in (gain, np.ones(n))))
     varies = n > 2 and float(gain.std()) > 1e-12
     ends = percentiles(replicates, 2 * LEVEL - 1) if n > 2 else None
     mean = estimate(float(gain.mean()) if n else np.nan, replicates, n, "patients")

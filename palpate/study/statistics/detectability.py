@@ -121,7 +121,9 @@ def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Sur
         centre=centre,
         scale=scale,
         range={name: (float(v.min()), float(v.max())) for name, v in values.items()},
-        quartiles={name: (float(q[0]), float(q[1]), float(q[2])) for name, v in values.items() for q in [np.quantile(v, QUARTILES)]},
+        quartiles={
+            name: (float(q[0]), float(q[1]), float(q[2])) for name, v in values.items() for q in [np.quantile(v, QUARTILES)]
+        },
         weights=best[:-1],
         lapse=float(best[-1]),
         replicates=replicates,
@@ -142,7 +144,7 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
         return GREATEST_LAPSE * float(expit(free)) if with_lapse else 0.0
 
     def cost(parameters: Array) -> tuple[float, Array]:
-        b, lapse = parameters[:k], lapse_of(parameters[k]) if with_lapse else 0.0
+        b, lapse = parameters[:k], lapse_of(float(parameters[k])) if with_lapse else 0.0
         s = expit(z @ b)
         hit = (1 - lapse) * s
         p = np.clip(np.where(found, hit, 1 - hit), 1e-12, None)
@@ -160,7 +162,7 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
         share = 0.1 if start is None else np.clip(start[k] / GREATEST_LAPSE, 0.02, 0.98)
         begin = np.append(begin, logit(share))
     done = minimize(cost, begin, jac=True, method="L-BFGS-B")
-    lapse = lapse_of(done.x[k]) if with_lapse else 0.0
+    lapse = lapse_of(float(done.x[k])) if with_lapse else 0.0
     return np.append(done.x[:k], lapse), 2 * float(done.fun)
 
 
@@ -172,9 +174,7 @@ def observed(variant: Variant, name: str, bootstrap: Bootstrap, bins: int = 6) -
     edges = pd.qcut(lumps[name].astype(float), bins, labels=False, duplicates="drop")
     rows = []
     for _, part in lumps.groupby(edges):
-        total = bootstrap.counts.shape[1]
-        found = np.bincount(part["patient"], weights=part["found"].astype(float), minlength=total)
-        seen = np.bincount(part["patient"], minlength=total).astype(float)
+        found, seen = (bootstrap.sums(values, part["patient"]) for values in (part["found"], np.ones(len(part))))
         value = float(found.sum() / seen.sum())
         patients = int((seen > 0).sum())
         rows.append((float(part[name].mean()), bounded(value, bootstrap.ratio(found, seen), len(part), "lumps", patients)))

@@ -30,9 +30,7 @@ class Sample:
 
     def mean_replicates(self, bootstrap: Bootstrap) -> Array:
         """Replicates of the mean, shape (folds,)."""
-        total = bootstrap.counts.shape[1]
-        sums = np.bincount(self.patient, weights=self.values, minlength=total)
-        return bootstrap.ratio(sums, np.bincount(self.patient, minlength=total).astype(np.float64))
+        return bootstrap.ratio(*(bootstrap.sums(each, self.patient) for each in (self.values, np.ones(len(self.values)))))
 
     def quantile(self, q: float, bootstrap: Bootstrap) -> Estimate:
         """Their quantile `q`: the least value below or at which that part of them lies."""
@@ -95,7 +93,9 @@ def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
     with np.errstate(divide="ignore", invalid="ignore"):
         size, stiffness = area / area_true - 1, ratio / ratio_true - 1
         logs = np.log(ratio), np.log(ratio_true)
-    inside = np.where(np.isfinite(ratio_true), (column("ratio_lower") <= ratio_true) & (ratio_true <= column("ratio_upper")), np.nan)
+    inside = np.where(
+        np.isfinite(ratio_true), (column("ratio_lower") <= ratio_true) & (ratio_true <= column("ratio_upper")), np.nan
+    )
     held, place = sample(inside), sample(column("place_error_m"))
     patients = len(np.unique(held.patient))
     share = float(held.values.mean()) if len(held.values) else np.nan
@@ -122,7 +122,5 @@ def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstra
     spread = float(difference.std(ddof=1)) if n > 1 else np.nan
     spreads = np.sqrt(np.maximum(second - first**2, 0) * n / max(n - 1, 1))
     middle = float(difference.mean()) if n else np.nan
-    lower, upper = (
-        estimate(middle + side * NORMAL * spread, first + side * NORMAL * spreads, n, "findings") for side in (-1, 1)
-    )
+    lower, upper = (estimate(middle + side * NORMAL * spread, first + side * NORMAL * spreads, n, "findings") for side in (-1, 1))
     return Agreement(mean, difference, bias.mean(bootstrap), lower, upper)

@@ -47,9 +47,10 @@ def wilson(successes: float, n: int, of: str) -> Estimate:
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Resamplings of patients with replacement, within each population; the same ones for every method, so that methods are paired.
+    """Resamplings of patients with replacement, within each population.
 
-    A replicate of a statistic is the statistic with every patient counted as often as he was drawn.
+    All methods share them, and so are paired. A replicate of a statistic is the statistic with every patient counted as often
+    as he was drawn.
     """
 
     counts: NDArray[np.int32]
@@ -65,6 +66,12 @@ class Bootstrap:
             member = np.flatnonzero(names == name)
             counts[:, member] = rng.multinomial(len(member), np.full(len(member), 1 / len(member)), size=folds)
         return Bootstrap(counts)
+
+    def sums(self, values: ArrayLike, patient: ArrayLike) -> Array:
+        """Sums of values, each of a patient's index, shapes (m,), by patient, shape (patients,)."""
+        weights = np.asarray(values, dtype=np.float64)
+        indices = np.asarray(patient, dtype=np.intp)
+        return np.bincount(indices, weights=weights, minlength=self.counts.shape[1]).astype(np.float64)
 
     def ratio(self, above: Array, below: Array) -> Array:
         """Replicates of sum(above) / sum(below), each of shape (patients,); NaN where nothing was drawn. Shape (folds,)."""
@@ -88,9 +95,7 @@ def percentiles(replicates: Array, level: float = LEVEL) -> tuple[float, float] 
     return float(low), float(high)
 
 
-def estimate(
-    value: float, replicates: Array, n: int, of: str, degenerate: Callable[[], Estimate] | None = None
-) -> Estimate:
+def estimate(value: float, replicates: Array, n: int, of: str, degenerate: Callable[[], Estimate] | None = None) -> Estimate:
     """A figure with its bootstrap interval.
 
     Where all replicates are one number, as when every lump was found, resampling says nothing of what was not seen;

@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.study.statistics.estimate import Array, Bootstrap, Estimate, bounded, percentiles
-from palpate.study.statistics.reading import WORST_HEALTHY, Variant, per_patient
+from palpate.study.statistics.reading import WORST_HEALTHY, Variant
 
 RATES: Final = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """False findings an examination at which LUNA16 takes the mean sensitivity (Setio et al., Med Image Anal 2017;42:1)."""
+SHOWN: Final = 200
+"""Points of the curve that are kept for its plot."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,9 @@ class Froc:
 class _Marks:
     """Areas by falling confidence, shape (m,): hits of lumps, one a lump, and false ones."""
 
-    patient: Array
-    hit: Array
-    last: Array
+    patient: NDArray[np.intp]
+    hit: NDArray[np.bool_]
+    last: NDArray[np.bool_]
     """Whether the next has a lower confidence."""
 
 
@@ -51,20 +54,19 @@ def froc(variant: Variant, bootstrap: Bootstrap) -> Froc | None:
     examination of a healthy person is a false finding that no threshold removes. Between the thresholds that occur the
     curve is linear, beyond the last it is level, as in LUNA16's script.
     """
-    total = bootstrap.counts.shape[1]
-    examined, lumps = np.zeros(total), per_patient(variant.cases["lumps"], variant.cases["patient"].to_numpy(), total)
-    examined[variant.cases["patient"]] = 1
+    cases = variant.cases
+    examined, lumps = (bootstrap.sums(values, cases["patient"]) for values in (np.ones(len(cases)), cases["lumps"]))
     n = int(lumps.sum())
     if n == 0:
         return None
     marks = _marks(variant)
-    unit = Bootstrap(np.ones((1, total), dtype=np.int32))
+    unit = Bootstrap(np.ones((1, len(examined)), dtype=np.int32))
     false, sensitivity = (curve[0] for curve in _curves(marks, unit, examined, lumps))
     all_false, all_sensitivity = _curves(marks, bootstrap, examined, lumps)
     at = np.array([np.interp(RATES, x, y) for x, y in zip(all_false, all_sensitivity, strict=True)])
     zero = np.max(np.where(all_false == 0, all_sensitivity, 0), axis=1)
-    shown = np.unique(np.linspace(0, len(false) - 1, 200).astype(int))
-    pointwise = np.array([np.interp(false[shown], x, y) for x, y in zip(all_false, all_sensitivity, strict=True)])
+    shown = np.union1d(false[np.linspace(0, len(false) - 1, SHOWN).astype(int)], RATES)
+    pointwise = np.array([np.interp(shown, x, y) for x, y in zip(all_false, all_sensitivity, strict=True)])
     band = np.array([percentiles(column) or (np.nan, np.nan) for column in pointwise.T])
     here = np.interp(RATES, false, sensitivity)
     patients = int((lumps > 0).sum())
@@ -78,8 +80,8 @@ def froc(variant: Variant, bootstrap: Bootstrap) -> Froc | None:
         at={rate: of_lumps(float(here[i]), at[:, i]) for i, rate in enumerate(RATES)},
         at_zero=of_lumps(float(sensitivity[false == 0].max()), zero),
         zero_replicates=zero,
-        false_findings=false[shown],
-        sensitivity=sensitivity[shown],
+        false_findings=shown,
+        sensitivity=np.interp(shown, false, sensitivity),
         low=band[:, 0],
         high=band[:, 1],
     )
@@ -102,7 +104,7 @@ def _curves(marks: _Marks, bootstrap: Bootstrap, examined: Array, lumps: Array) 
     drawn = bootstrap.counts[:, marks.patient]
     none = np.zeros((len(drawn), 1))
 
-    def upto(kind: Array, out_of: Array) -> Array:
+    def upto(kind: NDArray[np.bool_], out_of: Array) -> Array:
         sums = np.cumsum(drawn * kind, axis=1)[:, marks.last]
         return np.concatenate((none, sums / np.maximum(bootstrap.counts @ out_of, 1)[:, None]), axis=1)
 

@@ -7,8 +7,8 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict
 from statsmodels.stats.rates import confint_poisson
 
-from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, bounded, estimate, wilson
-from palpate.study.statistics.reading import Variant, per_patient
+from palpate.study.statistics.estimate import LEVEL, Bootstrap, Estimate, bounded, estimate, wilson
+from palpate.study.statistics.reading import Variant
 
 
 class Rates(BaseModel):
@@ -61,12 +61,8 @@ def by_population(variant: Variant, bootstrap: Bootstrap) -> dict[str, Rates]:
     return {name: rates(part, bootstrap) for name, part in parts}
 
 
-def _sums(cases: pd.DataFrame, column: str, bootstrap: Bootstrap) -> Array:
-    return per_patient(cases[column], cases["patient"].to_numpy(), bootstrap.counts.shape[1])
-
-
 def _of_lumps(cases: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
-    found, lumps = (_sums(cases, column, bootstrap) for column in ("found", "lumps"))
+    found, lumps = (bootstrap.sums(cases[column], cases["patient"]) for column in ("found", "lumps"))
     n = int(lumps.sum())
     value = found.sum() / n if n else np.nan
     return bounded(float(value), bootstrap.ratio(found, lumps), n, "lumps", int((lumps > 0).sum()))
@@ -77,8 +73,7 @@ def _each(cases: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
     n = len(cases)
     if n == 0:
         return Estimate(value=None, n=0, of="examinations")
-    sums = _sums(cases, "false_alarms", bootstrap)
-    examined = _sums(cases.assign(one=1), "one", bootstrap)
+    sums, examined = (bootstrap.sums(values, cases["patient"]) for values in (cases["false_alarms"], np.ones(n)))
 
     def poisson() -> Estimate:
         count = float(sums.sum())

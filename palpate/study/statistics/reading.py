@@ -10,16 +10,16 @@ from typing import Final
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pyarrow import parquet
 
-from palpate.study.statistics.estimate import Array, Bootstrap
+from palpate.study.statistics.estimate import FOLDS, Bootstrap
 
 COLUMNS: Final = {
-    "cases": (
-        "case_id study population method split number seed tier errors status why run_hash completed palpable not_palpable false_findings"
-        " score coverage_area coverage_lumps coverage_ratio depth_rms_m peak_force_n exam_time_s"
-    ).split(),
-    "findings": "case_id reported area_m2 ratio ratio_lower ratio_upper confidence lump place_error_m area_true_m2 ratio_true".split(),
-    "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence".split(),
+    "cases": """case_id study population method split number tier errors status completed palpable not_palpable false_findings
+        score coverage_area coverage_lumps coverage_ratio depth_rms_m peak_force_n exam_time_s""",
+    "findings": """case_id reported area_m2 ratio ratio_lower ratio_upper confidence lump place_error_m area_true_m2
+        ratio_true""",
+    "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence",
 }
 """What the statistics read of each table."""
 PATIENT: Final = ["study", "population", "split", "number"]
@@ -63,33 +63,35 @@ class Tables:
     patients: pd.DataFrame
     """One row a patient, its index the patient's number in `Variant`."""
     variants: tuple[Variant, ...]
+    folds: int
+    """Resamplings of a bootstrap."""
 
     @cached_property
     def bootstrap(self) -> Bootstrap:
         """Resamplings of the patients, which all statistics share."""
-        return Bootstrap.draw(self.patients["population"].to_numpy(dtype=str))
+        return Bootstrap.draw(self.patients["population"].to_numpy(dtype=str), self.folds)
 
 
-def read_tables(folder: Path) -> Tables:
+def read_tables(folder: Path, folds: int = FOLDS) -> Tables:
     """The tables in `folder`. Raises TablesError."""
     read = {}
     for name, columns in COLUMNS.items():
         path = folder / f"{name}.parquet"
         try:
-            table = pd.read_parquet(path)
+            table = parquet.read_table(path).to_pandas()
         except FileNotFoundError as error:
             raise TablesError(f"{path} is not there: give the folder of a study that has run") from error
         except (OSError, ValueError) as error:
             raise TablesError(f"{path} cannot be read: {error}") from error
-        if missing := [column for column in columns if column not in table.columns]:
+        if missing := [column for column in columns.split() if column not in table.columns]:
             raise TablesError(f"{path} has no column {', '.join(missing)}; it is of another version of Palpate")
         read[name] = table
     if read["cases"].empty:
         raise TablesError(f"{folder / 'cases.parquet'} has no case: run the study first")
-    return tables_of(read["cases"], read["findings"], read["lumps"])
+    return tables_of(read["cases"], read["findings"], read["lumps"], folds)
 
 
-def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame) -> Tables:
+def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, folds: int = FOLDS) -> Tables:
     """Tables from their frames. Raises TablesError for two cases of one patient in one variant."""
     cases = cases.copy()
     patients = cases[PATIENT].drop_duplicates().sort_values(PATIENT).reset_index(drop=True)
@@ -101,11 +103,13 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame) 
         row = doubled.iloc[0]
         where = f"{row['population']}, {row['split']}, number {row['number']}"
         raise TablesError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): one a patient is allowed")
-    facts = cases.set_index("case_id")[["patient", "failed"]]
-    findings, lumps = findings.join(facts, on="case_id", how="inner"), lumps.join(facts, on="case_id", how="inner")
+    facts = cases[["case_id", "patient", "failed"]]
+    findings, lumps = findings.merge(facts, on="case_id"), lumps.merge(facts, on="case_id")
     findings = findings[~findings["failed"]]
     lumps = lumps.assign(
-        found=lumps["found"].astype(bool) & ~lumps["failed"], confidence=lumps["confidence"].where(~lumps["failed"], 0.0)
+        palpable=lumps["palpable"].eq(True),
+        found=lumps["found"].eq(True) & ~lumps["failed"],
+        confidence=lumps["confidence"].where(~lumps["failed"], 0.0),
     )
     hit = lumps[lumps["found"] & lumps["palpable"]].groupby("case_id").size()
     cases["found"] = cases["case_id"].map(hit).fillna(0).astype(int)
@@ -115,26 +119,21 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame) 
         ids = own["case_id"]
         variants.append(Variant(name, own, findings[findings["case_id"].isin(ids)], lumps[lumps["case_id"].isin(ids)]))
     study = " + ".join(sorted(cases["study"].unique()))
-    return Tables(study, tuple(sorted(cases["split"].unique())), patients, tuple(variants))
-
-
-def per_patient(values: pd.Series, patients: NDArray[np.intp], total: int) -> Array:
-    """Sums of `values` by the patient's index, shape (total,)."""
-    return np.bincount(patients, weights=values.to_numpy(dtype=np.float64), minlength=total)
+    return Tables(study, tuple(sorted(cases["split"].unique())), patients, tuple(variants), folds)
 
 
 def _against_the_method(cases: pd.DataFrame, lumps: pd.DataFrame) -> pd.DataFrame:
     """Failed and not completed cases have the worst score, and a false alarm where there is no lump.
 
-    What is not known of a failed case's patient is taken from other cases of him, else from the median of his population.
+    What could be felt of the patient of a case without a result is taken from other cases of him; where there is none, all of
+    his lumps count.
     """
-    failed = (cases["status"] != "done") | ~cases["completed"].fillna(False).astype(bool)
+    failed = (cases["status"] != "done") | ~cases["completed"].eq(True)
+    made = cases["case_id"].map(lumps.groupby("case_id").size()).fillna(0).astype(float)
     known = {}
-    for column in ("palpable", "not_palpable"):
-        values = pd.to_numeric(cases[column]).astype(float).where(cases["status"] == "done")
-        for group in (["patient"], PATIENT[:2]):
-            values = values.fillna(values.groupby([cases[key] for key in group]).transform("median"))
-        known[column] = values.fillna(lumps.groupby("case_id").size().reindex(cases["case_id"]).set_axis(cases.index)).fillna(0)
+    for column, otherwise in (("palpable", made), ("not_palpable", 0.0)):
+        values = pd.to_numeric(cases[column]).astype(float)
+        known[column] = values.fillna(values.groupby(cases["patient"]).transform("median")).fillna(otherwise)
     ill = known["palpable"] > 0
     healthy = ~ill & (known["not_palpable"] == 0)
     reported = pd.to_numeric(cases["false_findings"]).astype(float).fillna(0)

@@ -1,4 +1,4 @@
-"""ROC per patient: does the examination's greatest confidence tell patients with a lump that can be felt from those without a lump?"""
+"""ROC per patient: how well the greatest confidence tells patients with a lump that can be felt from persons without a lump."""
 
 from __future__ import annotations
 

@@ -1,0 +1,98 @@
+"""Errors and calibration of findings whose errors are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import synthetic
+
+from palpate.study.statistics.calibration import calibration
+from palpate.study.statistics.errors import finding_errors
+from palpate.study.statistics.estimate import Bootstrap
+from palpate.study.statistics.reading import Tables
+
+
+def _matched(n: int, seed: int = 0) -> Tables:
+    """Radius too great by 1 mm with 0.5 mm of noise; ratio 5 % too small with 3 %; bands that hold it in 80 %."""
+    rng = np.random.default_rng(seed)
+    cases = [synthetic.case(i, "lumps", palpable=1) for i in range(n)]
+    findings = []
+    for i, case in enumerate(cases):
+        radius, ratio = rng.uniform(0.01, 0.02), rng.uniform(1.2, 2.0)
+        felt = radius + rng.normal(0.001, 0.0005)
+        findings.append(
+            synthetic.finding(
+                case["case_id"], 0.9, 0, place_error_m=rng.rayleigh(0.003), area_true_m2=np.pi * radius**2,
+                area_m2=np.pi * felt**2, ratio_true=ratio, ratio=ratio * np.exp(rng.normal(np.log(0.95), 0.03)),
+                ratio_lower=ratio * (1.1 if i % 5 == 0 else 0.8), ratio_upper=ratio * 1.2,
+            )
+        )  # fmt: skip
+    return synthetic.tables(cases, findings, [])
+
+
+def test_bias_and_limits_of_agreement() -> None:
+    tables = _matched(400)
+    errors = finding_errors(tables.variants[0], tables.bootstrap)
+    for line, true in ((errors.radius.bias, 1e-3), (errors.radius.lower, 1e-3 - 0.98e-3), (errors.radius.upper, 1.98e-3)):
+        assert line.value == pytest.approx(true, abs=1e-4)
+        assert line.low is not None
+        assert line.high is not None
+        assert line.low <= true <= line.high
+        assert line.high - line.low < 3e-4
+    assert errors.log_ratio.bias.value == pytest.approx(np.log(0.95), abs=0.005)
+    assert errors.ratio_held.value == pytest.approx(0.8)
+    assert errors.place_mean.value == pytest.approx(0.003 * np.sqrt(np.pi / 2), rel=0.1)
+
+
+def test_candidates_and_false_findings_are_no_matched_findings() -> None:
+    tables = _matched(30)
+    findings = tables.variants[0].findings.copy()
+    findings.loc[findings.index[:10], "reported"] = False
+    findings.loc[findings.index[10:15], "lump"] = -1
+    errors = finding_errors(replace(tables.variants[0], findings=findings), tables.bootstrap)
+    assert errors.place_mean.n == 15
+
+
+def _areas(n: int, power: float, seed: int = 0) -> Tables:
+    """Areas that hit with probability p and say the confidence whose log odds are `power` times those of p."""
+    rng = np.random.default_rng(seed)
+    cases, findings = [], []
+    for i in range(n):
+        case = synthetic.case(i, "lumps", palpable=1)
+        odds = rng.normal(0, 1.5, 2)
+        hit = rng.random(2) < 1 / (1 + np.exp(-odds))
+        said = 1 / (1 + np.exp(-power * odds))
+        findings += [synthetic.finding(case["case_id"], float(p), int(h) - 1) for p, h in zip(said, hit, strict=True)]
+        cases.append(case)
+    return synthetic.tables(cases, findings, [])
+
+
+def test_confidences_that_are_right() -> None:
+    held, less = 0, 0
+    for seed in range(20):
+        found = calibration(_areas(200, 1.0, seed).variants[0], Bootstrap.draw(["lumps"] * 200, 80, seed))
+        assert found is not None
+        assert found.slope.low is not None
+        assert found.slope.high is not None
+        held += found.slope.low <= 1.0 <= found.slope.high
+        less += (found.expected_error.value or 0) < found.by_chance
+        assert sum(part.n for _, part in found.bins) == 400
+    assert held >= 16
+    assert less >= 16
+
+
+def test_confidences_that_are_too_sure() -> None:
+    tables = _areas(600, 2.0)
+    found = calibration(tables.variants[0], tables.bootstrap)
+    assert found is not None
+    assert found.slope.value == pytest.approx(0.5, abs=0.08)
+    assert found.slope.high is not None
+    assert found.slope.high < 0.8
+    assert (found.expected_error.value or 0) > 2 * found.by_chance
+
+
+def test_no_area_no_calibration() -> None:
+    tables = synthetic.tables([synthetic.case(0, "healthy")], [], [])
+    assert calibration(tables.variants[0], tables.bootstrap) is None
