@@ -35,7 +35,7 @@ QUANTITIES: Final = {
     "peak_force_n": Quantity("greatest force", "N", 1.0),
     "exam_time_s": Quantity("time of the examination", "s", 10.0),
 }
-"""The margins were set before any study was run: what would change nothing for a clinician."""
+"""Margins, chosen before any study whose figures are reported: what would change nothing for a clinician."""
 
 COUNTED: Final = ("lumps_found", "false_findings")
 """Quantities of which equal values in every patient say no more than how rare unequal ones are."""
