@@ -171,16 +171,19 @@ class Loop:
 
 def _field(exam: Exam, sd: float, length: float, rng: np.random.Generator) -> RectBivariateSpline:
     """A smooth random field over the examined region and about it [m]."""
-    axes = []
-    for centre, size in zip(exam.centre_m, exam.region_m, strict=True):
-        half = 0.5 * size + _BEYOND_M
-        axes.append(centre + np.linspace(-half, half, round(2 * half / _GRID_M) + 1))
+    x, y = (_axis(centre, size) for centre, size in zip(exam.centre_m, exam.region_m, strict=True))
     width = length / np.sqrt(2) / _GRID_M  # white noise under a Gaussian of this width has the covariance wanted
-    noise = gaussian_filter(rng.standard_normal((len(axes[0]), len(axes[1]))), width, mode="wrap")
-    peak = np.zeros((len(axes[0]), len(axes[1])))
+    noise = gaussian_filter(rng.standard_normal((len(x), len(y))), width, mode="wrap")
+    peak = np.zeros((len(x), len(y)))
     peak[0, 0] = 1.0
     unit = np.sqrt(np.sum(gaussian_filter(peak, width, mode="wrap") ** 2))
-    return RectBivariateSpline(*axes, sd / unit * noise)
+    return RectBivariateSpline(x, y, sd / unit * noise)
+
+
+def _axis(centre: float, size: float) -> Array:
+    """Coordinates of the field's grid along one axis [m]."""
+    half = 0.5 * size + _BEYOND_M
+    return centre + np.linspace(-half, half, round(2 * half / _GRID_M) + 1)
 
 
 class _Smooth:

@@ -37,7 +37,7 @@ from palpate_planning.palpation import (
     STEADY_FRACTION,
     StrokeStage,
 )
-from palpate_planning.path import SurfacePath, lay
+from palpate_planning.path import Ints, SurfacePath, lay
 from palpate_planning.segments import Segment
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.surface import PerceivedSurface
@@ -154,10 +154,10 @@ class Examination:
         return apply(self._X_WA, p), n @ self._X_WA[:3, :3].T
 
     def _way(
-        self, perceived: PerceivedSurface, xy: Array, targets: Array, visits: Array | None = None, *, contact: bool = True
+        self, perceived: PerceivedSurface, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True
     ) -> Way:
         s, p, n, R = lay(perceived, xy, _DOWN)
-        visited = np.zeros(len(targets), dtype=np.int64) if visits is None else visits
+        visited: Ints = np.zeros(len(targets), dtype=np.int64) if visits is None else visits
         path = SurfacePath(s, p, n, R, np.zeros((len(s), 7)), targets, visited)
         count = max(1, round(path.length / _DENSE_M))
         at = np.linspace(0.0, path.length, count + 1)

@@ -28,16 +28,16 @@ def collected(examination: Examination, rows: list[Row]) -> Collected:
     places = apply(X_WA, np.array([row.way.place[row.at] for row in rows])).tolist()
     stiffness = examination.patient.stiffness(np.array([row.way.place[row.at, :2] for row in rows])).tolist()
     true = [_indentation(row, p, k) for row, p, k in zip(rows, places, stiffness, strict=True)]
-    skin = (a.astype(np.float32).ravel() for a in (model.vertices, model.normals))
-    rest = SurfaceMesh(header(0, "abdomen"), *skin, model.triangles.astype(np.uint32).ravel())
+    vertices, normals = (a.astype(np.float32).ravel() for a in (model.vertices, model.normals))
+    rest = SurfaceMesh(header(0, "abdomen"), vertices, normals, model.triangles.astype(np.uint32).ravel())
     pose = pose_message(X_WA[:3, :3], X_WA[:3, 3])
-    seen = (a.astype(np.float32).ravel() for a in examination.perceived)
+    seen_vertices, seen_normals = (a.astype(np.float32).ravel() for a in examination.perceived)
     return Collected(
         exam_states=states,
         indentation=true,
         exam_time=round(rows[-1].time * NS),
         phantom=PhantomTruth(rest, model.stiffness, model.background, model.lesion, pose),
-        surface=SurfaceMesh(header(0, "world"), *seen, _NO_TRIANGLES),
+        surface=SurfaceMesh(header(0, "world"), seen_vertices, seen_normals, _NO_TRIANGLES),
     )
 
 
