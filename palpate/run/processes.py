@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
-from typing import IO, Any
+from typing import IO, Any, Final
 
 import yaml
 
@@ -40,6 +40,10 @@ BARRIER = frozenset(("robot", "control", "tissue"))
 
 class ProcessListError(ValueError):
     """The compose file cannot be used. Names file, service and field."""
+
+
+_OF_A_CONTAINER: Final = ("PALPATE_VIEWER",)
+"""What the compose file sets because a container has ports of its own: on one machine, two runs would want the same ports."""
 
 
 @dataclass(frozen=True)
@@ -197,9 +201,10 @@ class LocalProcesses:
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """What a service is given beyond the environment of this process."""
-        settings = Settings.read({**os.environ, **process.environment})
+        own = {name: value for name, value in process.environment.items() if name not in _OF_A_CONTAINER}
+        settings = Settings.read({**os.environ, **own})
         return {
-            **process.environment,
+            **own,
             **FIXED,
             **settings.replaced(
                 scenario=self._scenario_files[process.role],

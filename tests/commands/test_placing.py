@@ -98,6 +98,22 @@ def test_each_service_of_a_process_keeps_the_scenario_of_its_view(tmp_path: Path
     assert seen == {"robot": "plant.yaml", "tissue": "scenario.yaml", "control": "exam.yaml"}
 
 
+def test_two_runs_on_one_machine_want_no_port_unless_their_user_names_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PALPATE_VIEWER", raising=False)
+    dashboard = read_processes(compose_file(), ("dashboard",))["dashboard"]
+    assert dashboard.environment["PALPATE_VIEWER"] == "serve:9876"  # of its container
+    files = write_scenario_files(load_scenario("clean"), tmp_path)
+    local = LocalProcesses(placement(ROLES, (), None), tmp_path, files, Timing())
+    try:
+        assert not local.environment(dashboard).get("PALPATE_VIEWER")
+        monkeypatch.setenv("PALPATE_VIEWER", "serve:9900")
+        assert local.environment(dashboard)["PALPATE_VIEWER"] == "serve:9900"
+    finally:
+        local.stop()
+
+
 def test_what_is_given_for_a_while_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     import os
 
