@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, get_args, get_origin
 
-from pydantic_core import PydanticUndefined
-
 from palpate_models.scenario import Scenario
 from palpate_models.section import Section
 
@@ -64,14 +62,12 @@ def _section(path: str, model: type[Section], given: Section | None) -> Iterator
             if isinstance(item, type) and issubclass(item, Section)
         ]
         allowed = _allowed(schema["properties"][name], schema.get("$defs", {}))
-        yield f"| `{name}` | {_default(default)} | {allowed} | {meaning} |\n"
+        yield f"| `{name}` | {'has to be given' if given is None and field.is_required() else _default(default)} | {allowed} | {meaning} |\n"
     for place, section, instance in inner:
         yield from _section(place, section, instance)
 
 
 def _default(value: Any) -> str:
-    if value is PydanticUndefined:
-        return "has to be given"
     if value is None:
         return ""
     if isinstance(value, float):
