@@ -61,8 +61,9 @@ def _section(path: str, model: type[Section], given: Section | None) -> Iterator
             for item in get_args(kind)
             if isinstance(item, type) and issubclass(item, Section)
         ]
+        shown = "has to be given" if given is None and field.is_required() else _default(default)
         allowed = _allowed(schema["properties"][name], schema.get("$defs", {}))
-        yield f"| `{name}` | {'has to be given' if given is None and field.is_required() else _default(default)} | {allowed} | {meaning} |\n"
+        yield f"| `{name}` | {shown} | {allowed} | {meaning} |\n"
     for place, section, instance in inner:
         yield from _section(place, section, instance)
 
