@@ -46,7 +46,7 @@ class QuickCase:
 def run_quick(scenario: Scenario, errors: LoopErrors | None = None) -> QuickCase:
     """Examines the patient of a scenario without arm and bus, with the errors that whole examinations have.
 
-    `errors`: distributions of its loop; None for those that were studied. Raises UnknownLoopError where none were, NoTissueError
+    `errors`: distributions of its loop; None for those of loop.yaml. Raises UnknownLoopError where it has none, NoTissueError
     for a tissue of which there is no copy, ChoiceError for an assessment that cannot be made.
     """
     begin = perf_counter()

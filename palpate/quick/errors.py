@@ -1,7 +1,8 @@
 """What arm, eye and force sensor get wrong in an examination, as distributions that whole examinations have.
 
-`loop.yaml` holds them, a row for each setting of the errors and kind of breathing that was studied; `palpate.quick.study` makes
-it. With d the depth that the examination measures and d' the true one, against the skin as it breathes,
+`loop.yaml` holds them, a row for each setting of the errors and kind of breathing. A row that was fitted to no examination is
+assumed: studies on it say so. With d the depth that the examination measures and d' the true one, against the skin as it
+breathes,
 
     d - d' = offset + tilt . xy + field(xy) + wander(t) - (1 - followed) (excursion(t) - its mean)
 
@@ -46,7 +47,7 @@ Breath = Literal["none", "quiet", "deep", "held"]
 
 
 class UnknownLoopError(ValueError):
-    """A scenario whose loop nobody has studied. Names what is asked for and what there is."""
+    """A scenario for which there is no loop. Names what is asked for and what there is."""
 
 
 class Normal(Section):
@@ -68,8 +69,8 @@ class LoopErrors(Section):
     registration: Level
     arm: Level
     breathing: Breath
-    examinations: Annotated[int, Field(ge=1)]
-    """From how many whole examinations these figures are."""
+    examinations: Annotated[int, Field(ge=0)]
+    """From how many whole examinations these figures are; 0: they are assumed."""
     begin_s: Positive
     """Mean time at which the first stroke begins."""
     aside_m: NonNegative
@@ -95,10 +96,15 @@ class LoopErrors(Section):
 
 
 @cache
-def studied() -> tuple[LoopErrors, ...]:
+def known_loops() -> tuple[LoopErrors, ...]:
     """The rows of loop.yaml."""
     text = resources.files("palpate.quick").joinpath("loop.yaml").read_text(encoding="utf-8")
     return tuple(TypeAdapter(list[LoopErrors]).validate_python(yaml.safe_load(text)["loops"]))
+
+
+def any_assumed() -> bool:
+    """Whether a loop stands for examinations that nobody has carried out."""
+    return not all(row.examinations for row in known_loops())
 
 
 def setting_of(scenario: Scenario) -> dict[str, str | None]:
@@ -113,18 +119,18 @@ def setting_of(scenario: Scenario) -> dict[str, str | None]:
 
 
 def loop_errors(scenario: Scenario) -> LoopErrors:
-    """The distributions for a scenario. Raises UnknownLoopError where whole examinations like it were not studied."""
+    """The distributions for a scenario. Raises UnknownLoopError where loop.yaml has no row for it."""
     wanted = setting_of(scenario)
-    for row in studied():
+    for row in known_loops():
         if all(getattr(row, name) == value for name, value in wanted.items()):
             return row
-    known = "; ".join(", ".join(f"{name} {getattr(row, name)}" for name in wanted) for row in studied())
+    known = "; ".join(", ".join(f"{name} {getattr(row, name)}" for name in wanted) for row in known_loops())
     own = [name for name, level in wanted.items() if level is None]
     words = ", ".join(f"{name} {value or 'of its own'}" for name, value in wanted.items())
     raise UnknownLoopError(
-        f"{scenario.name}: the loop of examinations with {words} was not studied"
+        f"{scenario.name}: there is no loop for examinations with {words}"
         + (f" (errors.{own[0]} is of no level)" if own else "")
-        + f"; want one of: {known}; or a whole examination; or study it: python -m palpate.quick.study"
+        + f"; want one of: {known}; or tier: whole"
     )
 
 

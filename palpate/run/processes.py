@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
-from typing import IO, Any, Final
+from typing import IO, Any
 
 import yaml
 
@@ -40,10 +40,6 @@ BARRIER = frozenset(("robot", "control", "tissue"))
 
 class ProcessListError(ValueError):
     """The compose file cannot be used. Names file, service and field."""
-
-
-_OF_A_CONTAINER: Final = ("PALPATE_VIEWER",)
-"""What the compose file sets because a container has ports of its own: on one machine, two runs would want the same ports."""
 
 
 @dataclass(frozen=True)
@@ -201,10 +197,9 @@ class LocalProcesses:
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """What a service is given beyond the environment of this process."""
-        own = {name: value for name, value in process.environment.items() if name not in _OF_A_CONTAINER}
-        settings = Settings.read({**os.environ, **own})
+        settings = Settings.read({**os.environ, **process.environment})
         return {
-            **own,
+            **process.environment,
             **FIXED,
             **settings.replaced(
                 scenario=self._scenario_files[process.role],

@@ -36,7 +36,11 @@ COLUMNS: Final = (
 
 def write_leaderboard(studies: Iterable[Path], page: Path) -> None:
     """Writes the page from study.json files. Raises TablesError."""
-    sections = [_section(read_summary(path)) for path in sorted(studies)]
+    summaries = {path: read_summary(path) for path in sorted(studies)}
+    for path, summary in summaries.items():
+        if summary.assumed:
+            raise TablesError(f"{path}: its cases are of the quick tier on an assumed loop; want tier: whole")
+    sections = [_section(summary) for summary in summaries.values()]
     people = f"**People**, where it was measured: {human_line.FOUND:.0%} of lumps. {human_line.SOURCE}. {human_line.CAVEAT}"
     body = "\n\n".join(sections) if sections else "No study has been run yet."
     write_text(page, f"{HEAD}\n{body}\n\n{people}\n")

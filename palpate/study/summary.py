@@ -9,6 +9,7 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from palpate.quick.errors import any_assumed
 from palpate.report.files import write_text
 from palpate.study import human_line
 from palpate.study.page import render
@@ -124,6 +125,8 @@ class StudySummary(_Row):
     """The method that others are compared with."""
     methods: dict[str, MethodRow]
     comparisons: tuple[Comparison, ...]
+    assumed: bool
+    """Whether cases are of the quick tier on a loop that is assumed, not measured: then no figure may be quoted."""
     level: float
     """Of the intervals."""
     bootstrap_folds: int
@@ -173,6 +176,7 @@ def analysed_tables(tables: Tables) -> Analysed:
         reference=reference.name,
         methods={analysis.name: _method(analysis) for analysis in analyses},
         comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
+        assumed=any_assumed() and any((variant.cases["tier"] == "quick").any() for variant in tables.variants),
         level=LEVEL,
         bootstrap_folds=tables.folds,
         human=human_line.as_json(),

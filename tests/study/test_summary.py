@@ -138,6 +138,16 @@ def test_a_study_of_healthy_people_alone_has_a_page(tmp_path: Path) -> None:
     assert row.rates.specificity.value == 1.0
 
 
+def test_what_comes_of_an_assumed_loop_says_so_and_is_not_on_the_leaderboard(tmp_path: Path) -> None:
+    frames = synthetic.frames([synthetic.case(i, "healthy") | {"tier": "quick"} for i in range(3)], [], [])
+    for name, frame in zip(("cases", "findings", "lumps"), frames, strict=True):
+        frame.to_parquet(tmp_path / f"{name}.parquet")
+    summarise(tmp_path)
+    assert "Not to be quoted" in (tmp_path / "study.html").read_text(encoding="utf-8")
+    with pytest.raises(TablesError, match=r"study\.json: .*assumed loop; want tier: whole"):
+        write_leaderboard([tmp_path / "study.json"], tmp_path / "leaderboard.md")
+
+
 def test_a_json_of_another_kind_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "study.json"
     path.write_text("{}", encoding="utf-8")
