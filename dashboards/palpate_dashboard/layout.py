@@ -52,12 +52,13 @@ def _map(layer: str, name: str, region_m: tuple[float, float], centre_m: tuple[f
     )
 
 
-def _plot(name: str, origin: str, low: float, high: float) -> Any:
+def _plot(name: str, origin: str, low: float, high: float, hidden: str | None = None) -> Any:
     return rrb.TimeSeriesView(
         name=name,
         origin=origin,
         axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        overrides={} if hidden is None else {hidden: _HIDDEN},
     )
 
 
@@ -105,8 +106,8 @@ def blueprint(
             rrb.TextDocumentView(name="TRUTH", origin="/text/truth"),
         ),
         rrb.StateTimelineView(name="Phase and driver", origin="/state"),
-        _plot("Normal force [N]", "/plots/force", -1.0, 1.1 * force_limit_n),
-        _plot("Depth [mm]", "/plots/depth", -5.0, 1.8e3 * depth_m),
+        _plot("Normal force [N]", "/plots/force", -1.0, 1.1 * force_limit_n, "/plots/force/true"),
+        _plot("Depth [mm]", "/plots/depth", -5.0, 1.8e3 * depth_m, "/plots/depth/true"),
         rrb.Tabs(
             _plot("Joint torque [% of limit]", "/plots/torque", -60.0, 60.0),
             _plot("Real-time factor [1]", "/plots/pace", 0.0, 4.0),

@@ -261,6 +261,7 @@ class DashboardService(Service):
                 self._scene.clear_cloud(t)
         self._in_contact = bool(message.in_contact)
         self._plots.say(t, "log/exam", message.message, "ERROR" if phase == "aborted" else "INFO")
+        self._pressed_n = message.normal_force if message.depth > words.FREE_M else 0.0
         self._plots.force(t, message.normal_force)
         self._force_depth.add(t, message.depth, message.normal_force, self._in_contact)
         self._plots.depth(t, message.depth, message.depth_setpoint)
@@ -271,7 +272,6 @@ class DashboardService(Service):
         self._plots.document(t, "text/status", words.status(self._name, phase, message, self._robot, self._pace))
 
     def _indentation(self, t: int, message: Message) -> None:
-        self._pressed_n = message.normal_force
         self._plots.true_contact(t, message.depth, message.normal_force)
 
     def _robot_status(self, t: int, message: Message) -> None:

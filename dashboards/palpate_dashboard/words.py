@@ -15,13 +15,16 @@ SEVERITY = {"ok": 0, "stale": 1, "warning": 2, "ERROR": 3}
 CONTACT_FLAGS = ("in_contact", "steady", "force_limited", "view_blocked")
 """Fields of ExamState that are listed where they hold."""
 
+FREE_M = -0.02
+"""At this depth or less the tool is away from the skin, and what the force sensor reads is no contact but its bias."""
+
 LEGEND = """
 | in the scene | |
 |---|---|
 | abdomen | skin where not scanned; then pale as the background, blue softer, red stiffer |
 | blue line | planned path of the indenter |
 | green, brown line | travelled path, free and in contact |
-| red arrow beside the tool | true normal force, 5 N are 15 cm |
+| red arrow beside the tool | measured normal force, 5 N are 15 cm |
 | violet outline | true lesion at half contrast, on the patient's true pose: hidden until the eye of `world/truth` is clicked |
 | white points | palpation targets; light blue: perceived points |
 | pyramid | view of the depth camera, on its tripod |
@@ -45,7 +48,7 @@ def status(scenario: str, phase: str, exam: ExamState, robot: str, real_time_fac
     flags = [name.replace("_", " ") for name in CONTACT_FLAGS if getattr(exam, name)]
     depth_mm = 1e3 * exam.depth
     pace = [] if real_time_factor is None else [f"| pace | {real_time_factor:.1f} x real time |"]
-    depth = f"{depth_mm:.1f} mm" if depth_mm > -20 else "not in contact"
+    depth = f"{depth_mm:.1f} mm" if exam.depth > FREE_M else "not in contact"
     return "\n".join((
         f"**{scenario}: {phase}.** {exam.message}",
         "",

@@ -237,7 +237,9 @@ def test_the_truth_about_the_patient_is_not_shown_at_first() -> None:
         assert holder.contents[0] is not view  # the first tab is in front
     (scene,) = [part for part in parts if getattr(part, "origin", "") == "/world"]
     (mean,) = [part for part in parts if getattr(part, "origin", "") == "/map/mean"]
-    drawn = {"/world/truth/lesions": scene, "/world/truth/axes": scene, "/map/mean/truth": mean}
+    curves = {f"{part.origin}/true": part for part in parts if getattr(part, "origin", "") in ("/plots/force", "/plots/depth")}
+    assert len(curves) == 2
+    drawn = {"/world/truth/lesions": scene, "/world/truth/axes": scene, "/map/mean/truth": mean, **curves}
     for path, view in drawn.items():
         assert view.visualizer_overrides[path].visible.as_arrow_array().to_pylist() == [False]
 

@@ -44,6 +44,8 @@ _PHASE_TINTS: Final = {
 }
 _FREE_MM: Final = -20.0
 """Depth is not drawn where the tool is farther than this from the surface."""
+_SHOWN_MM: Final = -5.0
+"""Figures of the contact begin at this depth."""
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -130,7 +132,7 @@ def record(evidence: Evidence, limit_n: float) -> bytes | None:
     depth.plot(evidence.time, wanted, color=QUIET, lw=1.4, label="set-point")
     depth.plot(evidence.time, measured, color=MEASURED, lw=0.7, label="measured depth")
     plain(depth, "depth [mm]", "simulated time [s]")
-    depth.set_ylim(-5, None)
+    depth.set_ylim(_SHOWN_MM, None)
     for axes in (force, depth):
         axes.legend(fontsize=8.5, ncols=9, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     force.set_xlim(evidence.time[0], evidence.time[-1])
@@ -139,7 +141,7 @@ def record(evidence: Evidence, limit_n: float) -> bytes | None:
 
 def force_depth(evidence: Evidence) -> bytes | None:
     """Force against depth in contact, coloured by time; None without contact."""
-    held = evidence.in_contact
+    held = evidence.in_contact & (evidence.depth * 1e3 > _SHOWN_MM)  # a sensor that is not tared yet feels contact in the air
     if not held.any():
         return None
     figure = _figure(5.6, 4.4)
