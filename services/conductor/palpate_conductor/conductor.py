@@ -158,6 +158,7 @@ class Conductor:
         ready: dict[str, list[str]] = {}
         begin = met = monotonic()
         ours = set(self._roles) - set(self._patience.absent)
+        told = False
         while len(ready) < len(self._roles) or any(ready.values()):
             self._say(RunControl.HELLO)
             sleep(0.05)
@@ -175,6 +176,10 @@ class Conductor:
                 raise RunFailed(f"{who} died at start: {how}")
             if not ours <= ready.keys():
                 met = monotonic()
+                if not told and met - begin > self._patience.quiet_start:
+                    late = ", ".join(sorted(ours - ready.keys()))
+                    self._tell(f"still starting: {late}; a first run compiles, which takes a minute or more")
+                    told = True
             waits_for_others = bool(self._patience.absent) and ours <= ready.keys()
             since, patience = (met, self._patience.join) if waits_for_others else (begin, self._patience.start)
             if monotonic() - since > patience:

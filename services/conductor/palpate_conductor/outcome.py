@@ -13,8 +13,10 @@ from palpate_bus.runtime.lockstep import NEVER, run_hash
 class Patience:
     """How long the conductor waits [s], by wall clock."""
 
-    start: float = 90.0
-    """For every service to answer on every edge."""
+    start: float = 300.0
+    """For every service to answer on every edge. The first run after an installation compiles; who dies is named at once."""
+    quiet_start: float = 15.0
+    """Before it says, once, who has not answered yet."""
     soft: float = 5.0
     """Without a finished tick before it says who blocks."""
     hard: float = 120.0
