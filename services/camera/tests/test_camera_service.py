@@ -27,7 +27,9 @@ def plate(height: float = 0.9, half: float = 0.15, frame: str = "world") -> Any:
     """A horizontal square at the patient's place."""
     corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     vertices = np.column_stack((corners[:, 0] + 0.56, corners[:, 1], np.full(4, height))).astype(np.float32)
-    return SurfaceMesh(header(0, frame), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]))
+    return SurfaceMesh(
+        header(0, frame), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]), np.empty(0, np.float32)
+    )
 
 
 def trigger(frames: int, t: int = 0) -> Any:
