@@ -12,8 +12,8 @@ from palpate_bus.messages import CameraTrigger, SurfaceMesh
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.bias import DepthBias, field
-from palpate_camera.backends.kinect.pinhole import Pinhole
 from palpate_camera.backends.kinect.service import CameraService
+from palpate_camera.pinhole import Pinhole
 from palpate_models.errors import CameraErrors, DrawnCamera, Errors, draw_errors
 from palpate_models.load import plant_input
 from palpate_models.scenario import Camera, Scenario
