@@ -14,32 +14,17 @@ from palpate_models.table import TABLE_TOP_M
 from palpate_perception import cloud, pattern, surface, visibility
 from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
+from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
 
 MARGIN_M: Final = 0.03
 """The cloud is cropped this much wider than the region, so that the surface at its edge has data on both sides."""
 MESH_MARGIN_M: Final = 0.025
 """The surface mesh reaches this much further than the region."""
 MESH_STEP_M: Final = 0.005
-HEIGHT_M: Final = (-0.16, 0.06)
-"""Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""
-TABLE_CLEARANCE_M: Final = 0.02
-"""Points this near to the table's top are the table."""
 MOTION_M: Final = 5e-4
 """A standard deviation over the frames above this is worth a remark: noise alone gives less than a tenth of it."""
 MIN_COVERAGE: Final = 0.95
 """With less of the region in view there are no targets."""
-
-
-@dataclass(frozen=True, slots=True)
-class Intrinsics:
-    """What camera_info and tf_static say."""
-
-    K: Array
-    """Shape (3, 3), in pixels."""
-    X_WC: Array
-    """Calibrated pose of the optical frame in world, shape (4, 4)."""
-    shape: tuple[int, int]
-    """Height and width of the full image."""
 
 
 @dataclass(frozen=True, slots=True)
