@@ -1,9 +1,11 @@
 """Where the wall will be in a moment: a Kalman filter of quasi-periodic motion.
 
-The displacement is a level and two stochastic oscillators, one at the breaths' rate w and one at twice that (Solin and Sarkka 2014,
-"Explicit link between periodic covariance functions and state space models"). Over h, with the rotation R by an angle,
+The displacement is a level and two stochastic oscillators, one at the breaths' rate w and one at twice that (Solin and Sarkka
+2014, "Explicit link between periodic covariance functions and state space models"). Over h, with the rotation R by an angle,
 
-    level(t + h) = exp(-h / T_0) level(t) + noise,   x_j(t + h) = exp(-h / T) R(j w h) x_j(t) + noise,   d = level + x_1[0] + x_2[0]
+    level(t + h) = exp(-h / T_0) level(t) + noise
+    x_j(t + h)   = exp(-h / T) R(j w h) x_j(t) + noise
+    d            = mean + level + x_1[0] + x_2[0]
 
 each of them with a constant variance. These, and the rate, are renewed from the last half minute: amplitude and period wander.
 """
@@ -120,7 +122,7 @@ def strongest_rate(t_s: Array, d: Array) -> float:
     """Breaths a minute of the strongest sine in `d` at times `t_s` [s], shape (n,) each, under a Hann window."""
     length = max(float(t_s[-1] - t_s[0]), 1e-3)
     window = 1 - np.cos(2 * np.pi * (t_s - t_s[0]) / length)
-    rates = _GRID_PER_MIN[_GRID_PER_MIN > 60 / length]
+    rates = _GRID_PER_MIN[60 / length < _GRID_PER_MIN]
     if not len(rates):
         return float(RATES_PER_MIN[0])
     waves: NDArray[np.complex128] = np.exp(-2j * np.pi / 60 * np.outer(rates, t_s))

@@ -1,7 +1,7 @@
 """Follows the wall from one small depth image to the next.
 
-Of each image the outward displacements of the wall's pixels, y = (z - z_ref) / g, are explained by the breath and by what somebody
-does who lies on a table, who shifts along it by s_x, s_y and turns about the long axis by theta:
+Of each image the outward displacements of the wall's pixels, y = (z - z_ref) / g, are explained by the breath and by how a body
+moves that lies on a table, shifts along it by s_x, s_y and turns about its long axis by theta:
 
     y_i = m_i d + n_i . (s_x, s_y, 0) + theta n_i . (e_y x p_i) + noise
 
@@ -81,7 +81,7 @@ class Tracker:
     """Follows one wall."""
 
     def __init__(self, wall: Wall, t_s: Array, d: Array, corners: Array) -> None:
-        """A wall that was displaced by `d` [m] at times `t_s` [s], shape (n,) each; `corners` of the region in A, shape (m, 3)."""
+        """A wall displaced by `d` [m] at times `t_s` [s], shape (n,) each; `corners` of the region in A, shape (m, 3)."""
         self.wall = wall
         self._filter = BreathFilter(t_s, d)
         middle = corners.mean(axis=0)
@@ -99,7 +99,7 @@ class Tracker:
         self._moved = False
 
     def follow(self, t_s: float, depth: Array, hidden: Array) -> Followed:
-        """Takes the wall's pixels of an image exposed at `t_s` [s]: depth [m] and whether the arm may hide it, shape (n,) each."""
+        """Takes the wall's pixels of an image exposed at `t_s` [s]: depth [m], and whether the arm may hide it, (n,) each."""
         expected, spread = self._filter.forward(t_s)
         y = (depth - self.wall.depth) / self.wall.gain
         use = np.isfinite(depth) & ~hidden & (np.abs(y - self.wall.lifts * expected) < REACH_M)

@@ -4,9 +4,9 @@ A small depth image z(t) of the wall is, at pixel i with viewing ray r_i (unit z
 
     z_i(t) = z_i + g_i m_i d(t) + noise,   g_i = 1 / (n_i . r_i)
 
-with the displacement d and the mode m. The outward displacements (z_i(t) - mean z_i) / g_i are fitted by polynomials in x and y of A,
-frame by frame; the singular value decomposition of their coefficients, whitened by their covariance, gives d(t) and m. Errors that
-are fixed to the image cancel, since only changes of a pixel count.
+with the displacement d and the mode m. The outward displacements (z_i(t) - mean z_i) / g_i are fitted by polynomials in x and y
+of A, frame by frame; the singular value decomposition of their coefficients, whitened by their covariance, gives d(t) and m.
+Errors that are fixed to the image cancel, since only changes of a pixel count.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ from typing import Final
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from scipy.interpolate import griddata
 
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.scenario import Exam
 from palpate_models.table import TABLE_TOP_M
 from palpate_perception import cloud, surface
 from palpate_perception.cloud import RegionBox
-from palpate_perception.fusion import Image, frame_sigma
+from palpate_perception.fusion import Image
 from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
 
 MARGIN_M: Final = 0.12
 """The wall is followed this much wider than the region: what lies there tells a shift from a breath."""
+CUTOFF_M: Final = 0.06
+"""Shorter waves of the wall are not seen by pixels 14 mm apart."""
 DEGREE: Final = 4
 """Total degree of the mode's polynomial."""
 VALID: Final = 0.7
@@ -82,6 +85,23 @@ class Wall:
     mode: Mode
     lifts: Array
     """The mode at the pixels, shape (n,)."""
+    r_W: Array
+    """Viewing rays of unit z in the camera's frame, shape (n, 3)."""
+    camera: Intrinsics
+    """Of the small image."""
+
+    def depth_per_metre(self, camera: Intrinsics, window: tuple[slice, slice]) -> Image:
+        """By how much depth changes for a displacement of 1 m, g m, in a window (rows, columns) of another of its images."""
+        rows, columns = (np.arange(part.start, part.stop) for part in window)
+        v, u = np.meshgrid(*(to_small(x, i, camera.K, self.camera.K) for x, i in ((rows, 1), (columns, 0))), indexing="ij")
+        places, values = np.column_stack(np.divmod(self.pixel, self.camera.shape[1])), self.gain * self.lifts
+        inside = griddata(places, values, (v, u), method="linear")
+        return np.where(np.isnan(inside), griddata(places, values, (v, u), method="nearest"), inside).astype(np.float32)
+
+
+def to_small(x: Array, axis: int, K: Array, K_small: Array) -> Array:
+    """Coordinates in the small image [px] of those in another of the same camera, along x (axis 0) or y (1)."""
+    return np.asarray((x - K[axis, 2]) / K[axis, axis] * K_small[axis, axis] + K_small[axis, 2])
 
 
 def basis(p_A: Array, low: Array, high: Array) -> Array:
@@ -106,7 +126,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     keep[keep] &= sigma[keep] < EDGE * np.median(sigma[keep]) if keep.any() else False
     if np.count_nonzero(keep) < LEAST_PIXELS:
         raise UnseenWallError(f"{np.count_nonzero(keep)} pixels of the small image show the wall, want {LEAST_PIXELS}")
-    field = surface.fit(p_A[keep], frame_sigma(mean[keep].astype(np.float32)).astype(float), box.low[:2], box.high[:2])
+    field = surface.fit(p_A[keep], sigma[keep], box.low[:2], box.high[:2], CUTOFF_M)
     n_A = field.normal(p_A[:, 0], p_A[:, 1])
     slope = np.einsum("ij,ij->i", n_A, r_C @ X_AC[:3, :3].T)
     keep &= -slope > STEEP * np.linalg.norm(r_C, axis=1)
@@ -121,7 +141,8 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     d = outward @ weight / (weight @ lifts)
     expired = float(np.quantile(np.convolve(d, np.full(3, 1 / 3), "valid"), EXPIRED)) if len(d) > 2 else float(d.min())
     depth = mean + gain * lifts * expired
-    return Wall(pixel, depth, gain, sigma, p_A, n_A, mode, lifts), d - expired
+    r_W = r_C[keep] @ camera.X_WC[:3, :3].T
+    return Wall(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
 
 
 def _steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
