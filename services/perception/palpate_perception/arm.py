@@ -32,9 +32,8 @@ class ArmMask:
         """
         starts, ends, radii = self._segments(q)
         towards = z[:, np.newaxis] * r_W  # from the camera to the wall
-        hidden = np.zeros(len(z), np.bool_)
-        for start, end, radius in zip(starts - p_WC, ends - p_WC, radii, strict=True):
-            hidden |= segment_distance(towards, start, end) < radius + MARGIN_M
+        distance = segment_distance(towards, starts - p_WC, ends - p_WC)
+        hidden = np.any(distance < radii[:, np.newaxis] + MARGIN_M, axis=0)
         dented: NDArray[np.bool_] = np.linalg.norm(p_WC + towards - ends[-1], axis=1) < DENT_M
         return hidden | dented
 
@@ -53,14 +52,16 @@ class ArmMask:
 
 
 def segment_distance(a: Array, p: Array, q: Array) -> Array:
-    """Least distance [m] of the segments from the origin to each of `a`, shape (n, 3), from that between `p` and `q`, shape (n,).
+    """Least distance [m] of the segments from the origin to `a`, shape (n, 3), from those from `p` to `q`, (m, 3): shape (m, n).
 
     Ericson, Real-Time Collision Detection, section 5.1.9: the nearest points s a and p + t (q - p), with s and t in [0, 1].
     """
     d = q - p
-    aa, dd, ad = np.sum(a * a, axis=1), max(float(d @ d), 1e-12), a @ d
-    ap, dp = a @ p, float(d @ p)
+    aa, pp = np.sum(a * a, axis=1), np.sum(p * p, axis=1)[:, np.newaxis]
+    dd, dp = np.maximum(np.sum(d * d, axis=1), 1e-12)[:, np.newaxis], np.sum(d * p, axis=1)[:, np.newaxis]
+    ad, ap = d @ a.T, p @ a.T
     s = np.clip((ap * dd - dp * ad) / np.maximum(aa * dd - ad * ad, 1e-12), 0.0, 1.0)
     t = np.clip((s * ad - dp) / dd, 0.0, 1.0)
     s = np.clip((ap + t * ad) / aa, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(s[:, np.newaxis] * a - p - t[:, np.newaxis] * d, axis=1))
+    squared = s * s * aa + pp + t * t * dd - 2 * s * ap - 2 * s * t * ad + 2 * t * dp  # |s a - p - t d|^2
+    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
