@@ -357,15 +357,13 @@ def test_depth_in_metres_and_in_millimetres_with_padding_and_either_byte_order()
     metres = np.zeros((2, 4), "<f4")
     metres[:, :3] = truth
     metres[1, 2] = 0.0
-    np.testing.assert_array_equal(
-        depth_in_metres("camera/depth/image_raw", image("32FC1", metres, 3, 16)), truth.astype(np.float32)
-    )
+    np.testing.assert_array_equal(depth_in_metres("camera", image("32FC1", metres, 3, 16)), truth.astype(np.float32))
     millimetres = np.nan_to_num(1000 * truth).astype(">u2")
-    np.testing.assert_allclose(depth_in_metres("camera/depth/image_raw", image("16UC1", millimetres, 3, 6, 1)), truth, rtol=1e-6)
+    np.testing.assert_allclose(depth_in_metres("camera", image("16UC1", millimetres, 3, 6, 1)), truth, rtol=1e-6)
 
 
 def test_a_strange_image_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="encoding = 'rgb8', want one of"):
-        depth_in_metres("camera/depth/image_raw", image("rgb8", np.zeros(18, np.uint8), 3, 9))
+        depth_in_metres("camera", image("rgb8", np.zeros(18, np.uint8), 3, 9))
     with pytest.raises(ValueError, match="18 bytes for 2 rows of 16, 3 pixels each"):
-        depth_in_metres("camera/depth/image_raw", image("32FC1", np.zeros(18, np.uint8), 3, 16))
+        depth_in_metres("camera", image("32FC1", np.zeros(18, np.uint8), 3, 16))
