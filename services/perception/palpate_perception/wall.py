@@ -140,6 +140,8 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     lifts = mode(p_A)
     weight = lifts * (gain / sigma) ** 2
     d = outward @ weight / (weight @ lifts)
+    if not mode.coefficients[1:].any():  # still: what d shows is noise
+        d = np.zeros(len(d))
     expired = float(np.quantile(np.convolve(d, np.full(3, 1 / 3), "valid"), EXPIRED)) if len(d) > 2 else float(d.min())
     depth = mean + gain * lifts * expired
     r_W = r_C[keep] @ camera.X_WC[:3, :3].T
