@@ -41,7 +41,8 @@ class BreathFilter:
     def __init__(self, t_s: Array, d: Array) -> None:
         """What was seen before: displacements `d` [m] at times `t_s` [s], shape (n,) each, evenly spaced."""
         self._times, self._seen = t_s.tolist(), d.tolist()
-        self._x, self._P = np.zeros(5), np.zeros((5, 5))
+        self._x, self._mean = np.zeros(5), float(d.mean())
+        self._stationary: Array = np.eye(5)
         self._H = np.array((1.0, 1.0, 0.0, 1.0, 0.0))
         self._t_s = self._renewed_s = float(t_s[0])
         self._learn()
@@ -97,8 +98,7 @@ class BreathFilter:
     def _learn(self) -> None:
         d, t = np.array(self._seen), np.array(self._times)
         mean = float(d.mean())
-        if hasattr(self, "_mean"):
-            self._x[0] += self._mean - mean
+        self._x[0] += self._mean - mean
         self._mean = mean
         self._depth = max(float(2 * np.sqrt(2) * d.std()), LEAST_M)
         self._rate = 2 * np.pi / 60 * strongest_rate(t, d - mean)

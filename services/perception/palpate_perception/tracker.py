@@ -15,13 +15,14 @@ from enum import IntEnum
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate_bus.messages import SurfaceMotion
 from palpate_models.frames import Array
 from palpate_perception.breath_filter import BreathFilter
 from palpate_perception.wall import Wall
 
-FORECAST_S: Final = np.arange(SurfaceMotion.FORECASTS) * SurfaceMotion.FORECAST_STEP_MS * 1e-3
+FORECAST_S: Final[Array] = 1e-3 * SurfaceMotion.FORECAST_STEP_MS * np.arange(SurfaceMotion.FORECASTS, dtype=np.float64)
 SHARED_M: Final = 1.5e-4
 """What an image's displacement errs by besides its pixels' own noise: errors that neighbours and successive images share."""
 REACH_M: Final = 0.06
@@ -98,7 +99,7 @@ class Tracker:
         self._votes = 0
         self._moved = False
 
-    def follow(self, t_s: float, depth: Array, hidden: Array) -> Followed:
+    def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> Followed:
         """Takes the wall's pixels of an image exposed at `t_s` [s]: depth [m], and whether the arm may hide it, (n,) each."""
         expected, spread = self._filter.forward(t_s)
         y = (depth - self.wall.depth) / self.wall.gain
@@ -120,7 +121,7 @@ class Tracker:
         self._filter.remember(d)
         if self._moved:
             return self._told(State.MOVED, d)
-        return self._told(State.SPOILED if t_s < self._calm_s else State.QUIET, self._filter.forecast(np.zeros(1))[0])
+        return self._told(State.SPOILED if t_s < self._calm_s else State.QUIET, float(self._filter.forecast(np.zeros(1))[0]))
 
     def _told(self, state: State, d: float) -> Followed:
         shift = np.append(self._motion[1:3], 0.0) if state is State.MOVED else np.zeros(3)

@@ -41,8 +41,8 @@ EDGE: Final = 2.5
 """A pixel with so many times the usual noise lies at an edge, and is left out."""
 STILL_M: Final = 3e-4
 """A wall that moves by a smaller standard deviation is still: then every part of it is expected to move alike."""
-EXPIRED: Final = 0.1
-"""Share of the time in which the wall is lower than at the end of expiration, for the noise of a frame's displacement."""
+EXPIRED: Final = 0.05
+"""Share of the time in which the wall seems lower than at the end of expiration, for the noise of an image's displacement."""
 LEAST_PIXELS: Final = 60
 
 
@@ -133,7 +133,8 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     keep &= -slope > STEEP * np.linalg.norm(r_C, axis=1)
     if np.count_nonzero(keep) < LEAST_PIXELS:
         raise UnseenWallError(f"{np.count_nonzero(keep)} pixels of the small image see the wall well, want {LEAST_PIXELS}")
-    pixel, mean, sigma, p_A, n_A, gain = (a[keep] for a in (pixel, mean, sigma, p_A, n_A, 1 / slope))
+    pixel, gain = pixel[keep], 1 / slope[keep]
+    mean, sigma, p_A, n_A = mean[keep], sigma[keep], p_A[keep], n_A[keep]
 
     outward = np.nan_to_num((frames.reshape(len(frames), -1)[:, pixel] - mean) / gain)
     mode = _mode(outward, np.abs(gain) / sigma, p_A, exam)
