@@ -44,7 +44,7 @@ PRIOR: Final = (0.010, 0.015, 0.015, 0.05)
 KEPT: Final = 0.7
 """Part of what was left over that counts on at the next image. Over the six images that count so, white noise falls to what
 neighbours and successive images share, which does not fall: their mean is about as certain as one image's white noise says."""
-MOVED_M: Final = 0.0035
+MOVED_M: Final = 0.0045
 """A region that moved by more than this, root mean square over its corners, a rise of them all apart, has been moved ..."""
 MOVED_IMAGES: Final = 3
 """... if so many images in a row say so."""

@@ -28,7 +28,9 @@ from palpate_perception.fusion import Image
 from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
 
 MARGIN_M: Final = 0.12
-"""The wall is followed this much wider than the region: what lies there tells a shift from a breath."""
+"""The wall is followed at least this much wider than the region: what lies there tells a shift from a breath ..."""
+HALF_M: Final = 0.22
+"""... and at least so far to each side of its middle."""
 CUTOFF_M: Final = 0.06
 """Shorter waves of the wall are not seen by pixels 14 mm apart."""
 DEGREE: Final = 4
@@ -105,6 +107,11 @@ def to_small(x: Array, axis: int, K: Array, K_small: Array) -> Array:
     return np.asarray((x - K[axis, 2]) / K[axis, axis] * K_small[axis, axis] + K_small[axis, 2])
 
 
+def watched(exam: Exam) -> RegionBox:
+    """Where the wall is followed, in A."""
+    return RegionBox.of(exam, max(MARGIN_M, HALF_M - min(exam.region_m) / 2), HEIGHT_M)
+
+
 def basis(p_A: Array, low: Array, high: Array) -> Array:
     """Products of Legendre polynomials of total degree up to DEGREE over a rectangle, at places, shape (n, 2 or 3)."""
     x, y = (2 * (np.clip(p_A[:, :2], low, high) - low) / (high - low) - 1).T
@@ -122,7 +129,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     X_AC = inverse(X_WA) @ camera.X_WC
     r_C = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel]
     p_A = apply(X_AC, mean[:, np.newaxis] * r_C)
-    box = RegionBox.of(exam, MARGIN_M, HEIGHT_M)
+    box = watched(exam)
     keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE_TOP_M + TABLE_CLEARANCE_M)
     keep[keep] &= sigma[keep] < EDGE * np.median(sigma[keep]) if keep.any() else False
     if np.count_nonzero(keep) < LEAST_PIXELS:

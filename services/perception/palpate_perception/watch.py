@@ -12,7 +12,7 @@ from palpate_perception import cloud, wall
 from palpate_perception.arm import ArmMask
 from palpate_perception.cloud import RegionBox
 from palpate_perception.fusion import Image
-from palpate_perception.views import HEIGHT_M, Intrinsics
+from palpate_perception.views import Intrinsics
 from palpate_perception.wall import Wall
 
 LONGEST_S: Final = 10.0
@@ -32,7 +32,7 @@ class Watch:
         """Of the small image."""
         self._X_WA, self._exam = X_WA, exam
         X_CA = inverse(camera.X_WC) @ X_WA
-        self.window = cloud.window(RegionBox.of(exam, wall.MARGIN_M, HEIGHT_M), X_CA, camera.K, camera.shape)
+        self.window = cloud.window(wall.watched(exam), X_CA, camera.K, camera.shape)
         """Rows and columns of the image that may show the wall."""
         self._middle = cloud.window(RegionBox.of(exam, 0.0, (-0.05, 0.03)), X_CA, camera.K, camera.shape)
         self._r_W = (cloud.deproject(np.ones(camera.shape), camera.K) @ camera.X_WC[:3, :3].T)[self.window].reshape(-1, 3)
