@@ -44,8 +44,12 @@ PRIOR: Final = (0.010, 0.015, 0.015, 0.05)
 KEPT: Final = 0.7
 """Part of what was left over that counts on at the next image. Over the six images that count so, white noise falls to what
 neighbours and successive images share, which does not fall: their mean is about as certain as one image's white noise says."""
-MOVED_M: Final = 0.0045
+MOVED_M: Final = 0.002
 """A region that moved by more than this, root mean square over its corners, a rise of them all apart, has been moved ..."""
+MOVED_SQUARED: Final = 25.0
+"""... if its motion's Mahalanobis distance from none is five or more: quiet breathing in 10 minutes stays below three ..."""
+DRIFT_S: Final = 8.0
+"""What comes more slowly than this is no motion of the patient, but the camera's drift: bodies shift at once."""
 MOVED_IMAGES: Final = 3
 """... if so many images in a row say so."""
 
@@ -96,6 +100,8 @@ class Tracker:
         self._pull = np.zeros(4)
         self._prior = np.diag(np.array(PRIOR) ** -2.0)
         self._calm_s = float(t_s[-1])
+        self._drift = np.zeros(4)
+        self._last_s = float(t_s[-1])
         self._votes = 0
         self._moved = False
 
@@ -110,7 +116,8 @@ class Tracker:
             return self._told(State.MOVED if self._moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
         noise = float(np.hypot(1 / np.sqrt(weight @ self.wall.lifts**2), SHARED_M))
-        self._weigh_motion(y - self.wall.lifts * d, weight)
+        self._weigh_motion(t_s - self._last_s, y - self.wall.lifts * d, weight)
+        self._last_s = t_s
         surprise = abs(d - expected)
         if surprise > max(SURPRISE * np.hypot(spread, noise), SURPRISE_M) or d > DEEP * self._filter.depth + SURPRISE_M:
             self._calm_s = t_s + CALM_S
@@ -124,7 +131,7 @@ class Tracker:
         return self._told(State.SPOILED if t_s < self._calm_s else State.QUIET, float(self._filter.forecast(np.zeros(1))[0]))
 
     def _told(self, state: State, d: float) -> Followed:
-        shift = np.append(self._motion[1:3], 0.0) if state is State.MOVED else np.zeros(3)
+        shift = np.append((self._motion - self._drift)[1:3], 0.0) if state is State.MOVED else np.zeros(3)
         return Followed(state, float(d), self._filter.forecast(FORECAST_S), self._filter.sigma, shift)
 
     def _displacement(self, y: Array, weight: Array, expected: float) -> tuple[float, Array]:
@@ -139,12 +146,15 @@ class Tracker:
             d = float(robust @ (lifts * y)) / max(float(robust @ lifts**2), 1e-9)
         return d, robust
 
-    def _weigh_motion(self, left: Array, weight: Array) -> None:
-        """Counts what an image leaves over [m], shape (n,), for the rigid motion."""
+    def _weigh_motion(self, elapsed_s: float, left: Array, weight: Array) -> None:
+        """Counts what an image, `elapsed_s` [s] after the last, leaves over [m], shape (n,), for the rigid motion."""
         weighted = weight[:, np.newaxis] * self._reasons
         self._precision = KEPT * self._precision + (1 - KEPT) * self._reasons.T @ weighted
         self._pull = KEPT * self._pull + (1 - KEPT) * weighted.T @ left
-        self._votes = self._votes + 1 if self.moved_by > MOVED_M else 0
+        moving = self.moved_by > MOVED_M and self.evidence > MOVED_SQUARED
+        self._votes = self._votes + 1 if moving else 0
+        if not self._votes and not self._moved:
+            self._drift += (1 - np.exp(-elapsed_s / DRIFT_S)) * (self._motion - self._drift)
         self._moved = self._moved or self._votes >= MOVED_IMAGES
 
     @property
@@ -153,9 +163,16 @@ class Tracker:
         return np.asarray(np.linalg.solve(self._precision + self._prior, self._pull))
 
     @property
+    def evidence(self) -> float:
+        """Squared Mahalanobis distance of the body's motion from none, by its posterior covariance."""
+        covariance = np.linalg.inv(self._precision + self._prior)[1:, 1:]
+        motion = (self._motion - self._drift)[1:]
+        return float(motion @ np.linalg.solve(covariance, motion))
+
+    @property
     def moved_by(self) -> float:
         """How far the region has moved [m], root mean square over its corners, without a rise that they share."""
-        _, s_x, s_y, theta = self._motion
+        _, s_x, s_y, theta = self._motion - self._drift
         moved = np.array((s_x, s_y, 0.0)) + np.cross((0.0, theta, 0.0), self._corners)
         moved[:, 2] -= moved[:, 2].mean()
         return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))

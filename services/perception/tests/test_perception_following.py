@@ -44,7 +44,7 @@ def test_rises_are_counted_once_for_each_breath() -> None:
 
 
 def test_a_ray_past_a_capsule_is_hidden_by_it_and_one_before_it_is_not() -> None:
-    ends = np.array([(0.0, 0.0, 2.0), (0.0, 0.0, 0.9), (0.6, 0.0, 2.0)])
+    ends = np.array([(0.0, 0.0, 2.0), (0.0, 0.0, 0.9), (0.8, 0.0, 2.0)])
     start, end = np.array([(-0.2, 0.0, 1.0)]), np.array([(0.2, 0.0, 1.0)])
     assert passes(ends, start, end, np.array((0.05,))).tolist() == [True, False, False]
     assert passes(ends, start, end, np.array((0.11,))).tolist() == [True, True, False]

@@ -113,7 +113,9 @@ def surface_mesh(message: Message) -> Mesh:
     if message.header.frame_id != "world":
         raise ValueError(f"sim/surface: header.frame_id = {message.header.frame_id!r}, want 'world'")
     vertices = np.asarray(message.vertices, np.float64).reshape(-1, 3)
-    return Mesh(vertices, np.asarray(message.triangles, np.uint32).reshape(-1, 3))
+    return Mesh(
+        vertices, np.array(message.triangles, np.uint32).reshape(-1, 3)
+    )  # a copy: numba compiles anew for read-only arrays
 
 
 def link_poses(message: Message) -> dict[str, Array]:
