@@ -113,6 +113,7 @@ def blueprint(
             _plot("Real-time factor [1]", "/plots/pace", 0.0, 4.0),
             _plot("Blame [%]", "/plots/blame", 0.0, 100.0),
             _plot("Progress [%]", "/plots/progress", 0.0, 100.0),
+            _plot("Wall [mm]", "/plots/wall", -2.0, 30.0),
             _plot("TRUTH: patient [mm]", "/plots/truth", -2.0, 30.0),
         ),
         row_shares=[1.6, 0.85, 1.2, 1.2, 1.2],

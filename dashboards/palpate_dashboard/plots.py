@@ -74,6 +74,8 @@ class Plots:
         self._series("plots/depth/true", [("true [mm]", (150, 110, 240))])
         self._series("plots/truth/breath", [("true breath [mm]", (150, 110, 240))])
         self._series("plots/truth/moved", [("true motion of the umbilicus [mm]", (240, 200, 60))])
+        self._series("plots/wall/displacement", [("followed [mm]", (255, 170, 40))])
+        self._series("plots/wall/forecast", [("forecast 0.2 s before [mm]", (230, 230, 230))], width=1.0)
         names = [f"A{i + 1} [% of limit]" for i in range(7)]
         self._series("plots/torque/joints", list(zip(names, JOINT_COLORS, strict=True)))
         self._series("plots/pace/real_time_factor", [("real-time factor [1]", (70, 180, 200))])
@@ -107,6 +109,11 @@ class Plots:
         """How far the breath has lifted the wall, and how far the umbilicus is from where the patient lay first."""
         self._add("plots/truth/breath", t, 1e3 * excursion_m)
         self._add("plots/truth/moved", t, 1e3 * moved_m)
+
+    def wall(self, t: int, displacement_m: float, forecast_m: float, ahead: int) -> None:
+        """How far breathing lifts the wall by the camera, and how far it is forecast to be lifted `ahead` [ns] later."""
+        self._add("plots/wall/displacement", t, 1e3 * displacement_m)
+        self._add("plots/wall/forecast", t + ahead, 1e3 * forecast_m)
 
     def depth(self, t: int, measured_m: float, setpoint_m: float) -> None:
         """Measured depth and its set-point, along the inward normal from the perceived surface."""

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import RobotStatus
+from palpate_bus.messages import RobotStatus, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_matrix, transform_matrix
+from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, patient, plots, truth, words
@@ -43,6 +44,8 @@ PLOT_PERIOD: Final = 50 * MS
 TEXT_PERIOD: Final = 500 * MS
 IMAGE_PERIOD: Final = 500 * MS
 MAP_PERIOD: Final = 1000 * MS
+AHEAD: Final = 4
+"""Which forecast of the wall is drawn: that of 0.2 s ahead, about what planning needs."""
 SEND_PERIOD: Final = 1000 * MS
 """Simulated time that is collected into one chunk of the file."""
 SEND_PERIOD_LIVE: Final = 200 * MS
@@ -124,6 +127,7 @@ class DashboardService(Service):
             ("perception/points", IMAGE_PERIOD, self._points),
             ("perception/surface", IMAGE_PERIOD, self._perceived),
             ("perception/targets", 0, self._targets),
+            ("perception/motion", PLOT_PERIOD, self._wall),
             ("planning/path", 0, self._path_planned),
             ("exam/state", PLOT_PERIOD, self._exam),
             ("truth/indentation", PLOT_PERIOD, self._indentation),
@@ -249,6 +253,12 @@ class DashboardService(Service):
         self._scene.targets(t, arrays.points(message.positions), arrays.points(message.normals))
         count, frames = len(message.positions), message.frames_fused
         self._plots.say(t, "log/perception", message.message or f"{count} targets from {frames} frames")
+
+    def _wall(self, _t: int, message: Message) -> None:
+        if message.state != SurfaceMotion.LOST:
+            exposed = nanoseconds(message.header.stamp)
+            ahead = AHEAD * SurfaceMotion.FORECAST_STEP_MS * MS
+            self._plots.wall(exposed, message.displacement, float(message.forecast[AHEAD]), ahead)
 
     def _path_planned(self, t: int, message: Message) -> None:
         self._scene.planned(t, arrays.points(pose.pose.position for pose in message.poses))

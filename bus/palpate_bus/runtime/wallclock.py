@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
 
-from palpate_bus.contract import MS, Edge
+from palpate_bus.contract import MS, Edge, Topic, Visibility
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.runtime.conductor_link import RunAborted
@@ -31,6 +31,11 @@ CATCH_UP = 200 * MS
 HANDSHAKE_POLL_S = 0.02
 READ_NS = 100_000
 """Two clocks read within this time [ns] were read at once."""
+
+
+def _awaited(edge: Edge, topic: Topic) -> bool:
+    """Whether the first step needs a message of a topic."""
+    return edge is Edge.LATCHED or (edge is Edge.SAME_TICK and topic.periodic and topic.visibility is Visibility.PUBLIC)
 
 
 def _on_monotonic_clock(wall: int, now: Callable[[], int]) -> int:
@@ -134,8 +139,11 @@ class WallClockNode(Node):
             t += period
 
     def _await_inputs(self, epoch: int) -> int:
-        """Waits until every input that the first step needs has come once; returns the tick [ns] at which it may step."""
-        needed = [b for b in self._stepper.buffers.values() if b.edge in (Edge.SAME_TICK, Edge.LATCHED)]
+        """Waits until every input that the first step needs has come once; returns the tick [ns] at which it may step.
+
+        Not for events, which may never come, nor for what only a simulation sends, which hardware in this role never hears.
+        """
+        needed = [b for b in self._stepper.buffers.values() if _awaited(b.edge, b.topic)]
         while True:
             self._receive(0)
             if all(b.holds_any for b in needed):

@@ -1,0 +1,75 @@
+"""Which pixels may show the arm instead of the wall: its nominal kinematics with a margin for what those err by."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models import lbr
+from palpate_models.compiled import compiled
+from palpate_models.frames import Array, apply
+from palpate_models.lbr_kinematics import link_transforms
+from palpate_models.scenario import Robot
+
+MARGIN_M: Final = 0.02
+"""Hand-eye calibration, arm and camera agree to about so much, each its own way (docs/errors.md)."""
+DENT_M: Final = 0.06
+"""So far about the indenter the wall may be dented: it is not looked at."""
+
+
+class ArmMask:
+    """Hides the rays of a camera that pass the arm."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._capsules = lbr.capsules(robot)
+
+    def hides(self, q: Array, p_WC: Array, r_W: Array, z: Array) -> NDArray[np.bool_]:
+        """Which of the wall's points p_WC + z r_W may be hidden, or dented, at joint positions `q` [rad], shape (n,).
+
+        `r_W`: viewing directions, shape (n, 3); `z` [m]: where the wall is along them, shape (n,).
+        """
+        starts, ends, radii = self._segments(q)
+        towards = z[:, np.newaxis] * r_W  # from the camera to the wall
+        hidden = passes(towards, starts - p_WC, ends - p_WC, radii + MARGIN_M)
+        dented: NDArray[np.bool_] = np.linalg.norm(p_WC + towards - ends[-1], axis=1) < DENT_M
+        return hidden | dented
+
+    def _segments(self, q: Array) -> tuple[Array, Array, Array]:
+        """Ends of the capsules' axes in world [m], shape (m, 3) each, and radii [m], shape (m,); the indenter is the last."""
+        X_WL = np.eye(4)
+        starts, ends, radii = [], [], []
+        for _, link, X_PL in link_transforms(q, self._robot):
+            X_WL = X_WL @ X_PL
+            for capsule in self._capsules.get(link, ()):
+                start, end = apply(X_WL, np.array((capsule.start, capsule.end)))
+                starts.append(start)
+                ends.append(end)
+                radii.append(capsule.radius)
+        return np.array(starts), np.array(ends), np.array(radii)
+
+
+@compiled
+def passes(a: Array, p: Array, q: Array, reach: Array) -> NDArray[np.bool_]:
+    """Which segments from the origin to `a`, shape (n, 3), pass nearer than `reach`, (m,), to those from `p` to `q`, (m, 3).
+
+    Ericson, Real-Time Collision Detection, section 5.1.9: the nearest points s a and p + t (q - p), with s and t in [0, 1].
+    """
+    found = np.zeros(len(a), np.bool_)
+    for j in range(len(p)):
+        d = q[j] - p[j]
+        dd, dp, pp = max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, 1e-12), (d * p[j]).sum(), (p[j] ** 2).sum()
+        for i in range(len(a)):
+            if found[i]:
+                continue
+            x, y, z = a[i]
+            aa = x * x + y * y + z * z
+            ad, ap = x * d[0] + y * d[1] + z * d[2], x * p[j, 0] + y * p[j, 1] + z * p[j, 2]
+            s = min(max((ap * dd - dp * ad) / max(aa * dd - ad * ad, 1e-12), 0.0), 1.0)
+            t = min(max((s * ad - dp) / dd, 0.0), 1.0)
+            s = min(max((ap + t * ad) / aa, 0.0), 1.0)
+            squared = s * s * aa + pp + t * t * dd - 2 * s * ap - 2 * s * t * ad + 2 * t * dp
+            found[i] = squared < reach[j] ** 2
+    return found
