@@ -22,8 +22,12 @@ from palpate_models.section import Force, Length, NonNegative, Pose, Positive, S
 class Pattern(StrEnum):
     """Coverage pattern."""
 
-    SNAKE = "snake"
+    LINES = "lines"
+    """There and back, lifted at each line's end."""
     RASTER = "raster"
+    """All lines one way, lifted at their ends."""
+    SNAKE = "snake"
+    """There and back, line ends joined in contact."""
 
 
 class Mode(StrEnum):
@@ -40,7 +44,7 @@ class Exam(Section):
     """Of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
-    pattern: Pattern = Pattern.SNAKE
+    pattern: Pattern = Pattern.LINES
     mode: Mode = Mode.CONTINUOUS
     depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
     """Indentation along the inward normal from the perceived rest surface."""

@@ -22,7 +22,7 @@ from palpate_planning.background import WORKER
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
-from palpate_planning.messages import path_message, state_message
+from palpate_planning.messages import path_message, state_message, touch_message
 from palpate_planning.periods import Periods
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 from palpate_planning.surface import PerceivedSurface
@@ -80,6 +80,8 @@ class PlanningService(Service):
         }
         if step.trigger:
             outbox["planning/camera_trigger"] = CameraTrigger(header(t), self._known.camera.frames)
+        if step.touched is not None:
+            outbox["exam/touches"] = touch_message(t, step.touched)
         if step.path is not None:
             outbox["planning/path"] = path_message(t, step.path)
         return outbox
@@ -94,7 +96,6 @@ class PlanningService(Service):
             "skipped_targets": {str(i): why for i, why in sorted(self._exam.skipped.items())},
             "peak_force_N": self._peak_force,
             "unreadable_statuses": self._unreadable,
-            "surface_offset_m": self._exam.surface_offset,
         }
 
     def _read(self, status: Message) -> None:
@@ -133,7 +134,6 @@ class PlanningService(Service):
             vertices=vertices,
             triangles=np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3),
             surface=surface,
-            noise=float(targets.surface_noise),
         )
 
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from palpate_models.frames import Array
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.palpation import StrokeStage
+from palpate_planning.wall import TouchedSkin
 
 
 class Phase(IntEnum):
@@ -31,6 +32,7 @@ class Phase(IntEnum):
 
 
 PHASE_OF: Final = {
+    StrokeStage.REST: Phase.INDENT,
     StrokeStage.DESCEND: Phase.INDENT,
     StrokeStage.SETTLE: Phase.INDENT,
     StrokeStage.SLIDE: Phase.SCAN,
@@ -90,6 +92,10 @@ class ExamStatus:
     """[m]"""
     end_tick: int = -1
     """When the run is to end [ns]; -1 until that is known."""
+    stroke: int = 0
+    """Number of the latest descent, 0 before the first."""
+    patient_moved: bool = False
+    """Whether the patient has moved since the surface was perceived."""
 
 
 @dataclass(slots=True)
@@ -103,3 +109,5 @@ class ExamStep:
     """Ask the camera for a burst now."""
     path: Array | None = None
     """Planned poses of the indenter at depth, shape (n, 4, 4), once."""
+    touched: TouchedSkin | None = None
+    """The touch of this step, if there was one."""
