@@ -45,7 +45,9 @@ def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mesh(vertices: np.ndarray, triangles: np.ndarray, frame: str) -> Any:
-    return SurfaceMesh(header(0, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
+    return SurfaceMesh(
+        header(0, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel(), np.empty(0, np.float32)
+    )
 
 
 def phantom() -> Any:

@@ -109,7 +109,9 @@ def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 def surface(t: int, vertices: NDArray[np.float32], triangles: NDArray[np.uint32], frame: str) -> Any:
-    return SurfaceMesh(header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
+    return SurfaceMesh(
+        header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel(), np.empty(0, np.float32)
+    )
 
 
 def pose(position: Array, rotation: Rotation | None = None) -> Any:

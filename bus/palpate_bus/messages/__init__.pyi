@@ -396,6 +396,23 @@ class SurfaceMesh:
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
     triangles: NDArray[np.uint32]
+    breathing: NDArray[np.float32]
+
+@dataclass
+class SurfaceMotion:
+    __msgtype__: ClassVar[str]
+    QUIET: ClassVar[int]
+    SPOILED: ClassVar[int]
+    MOVED: ClassVar[int]
+    LOST: ClassVar[int]
+    FORECASTS: ClassVar[int]
+    FORECAST_STEP_MS: ClassVar[int]
+    header: Header
+    state: int
+    displacement: float
+    forecast: NDArray[np.float64]
+    uncertainty: float
+    shift: Vector3
 
 @dataclass
 class ToolState:

@@ -69,7 +69,10 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.section("before contact")
     vertices, normals, triangles = shapes.mesh(0.12, 0.006)
     flat = (apply(X_WA, vertices).astype(np.float32).ravel(), (normals @ X_WA[:3, :3].T).astype(np.float32).ravel())
-    rig.send("perception/surface", SurfaceMesh(header(rig.t, "world"), *flat, triangles.astype(np.uint32).ravel()))
+    rig.send(
+        "perception/surface",
+        SurfaceMesh(header(rig.t, "world"), *flat, triangles.astype(np.uint32).ravel(), np.empty(0, np.float32)),
+    )
     rig.run(0.2, {})
     quiet = len(rig.log[SAMPLES]) + len(rig.log[FINDINGS])
     report.expect("finds nothing before contact", quiet == 0, "no samples, no findings", quiet)

@@ -122,7 +122,11 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
     p, n = shape(xy)
     perceived = p + n * wrong(p)[:, None]
     surface = SurfaceMesh(
-        header(0, "world"), apply(X_WA, perceived).astype(np.float32).ravel(), np.empty(0, np.float32), np.empty(0, np.uint32)
+        header(0, "world"),
+        apply(X_WA, perceived).astype(np.float32).ravel(),
+        np.empty(0, np.float32),
+        np.empty(0, np.uint32),
+        np.empty(0, np.float32),
     )
     states: list[Any] = []
     zero = np.zeros(3)
