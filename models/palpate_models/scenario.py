@@ -37,6 +37,17 @@ class Mode(StrEnum):
     POINT = "point"
 
 
+class Following(StrEnum):
+    """What is done about the wall's breathing."""
+
+    FOLLOW = "follow"
+    """The indenter follows the wall."""
+    GATE = "gate"
+    """It follows, and samples are taken at the end of expiration alone."""
+    IGNORE = "ignore"
+    """It does not follow, as if the patient did not breathe."""
+
+
 class Exam(Section):
     """What is examined, and how."""
 
@@ -46,8 +57,9 @@ class Exam(Section):
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Pattern = Pattern.LINES
     mode: Mode = Mode.CONTINUOUS
+    breathing: Following = Following.FOLLOW
     depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
-    """Indentation along the inward normal from the perceived rest surface."""
+    """Indentation along the inward normal from where the skin is touched."""
     spacing_m: Annotated[float, Field(ge=0.004, le=0.05)] = 0.0125
     """Distance of scan lines, and of points on a line."""
     speed_mps: Annotated[float, Field(ge=0.005, le=0.1)] = 0.03

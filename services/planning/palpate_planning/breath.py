@@ -7,6 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages import SurfaceMotion
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import nanoseconds
 from palpate_models.frames import Array
 from palpate_planning.periods import MS, SECOND
 
@@ -14,6 +17,8 @@ FORECAST_STEP = 50 * MS
 """Spacing of the forecast's values [ns]; the first is that of the exposure."""
 STALE = 500 * MS
 """A motion older than this is no longer followed [ns]: the forecast reaches no further."""
+HIDDEN_M = 0.002
+"""A wall that is hidden is followed by forecast up to this uncertainty."""
 JOIN_S = 0.1
 """Time constant with which the step from one forecast to the next fades [s]."""
 
@@ -31,6 +36,14 @@ class Motion(NamedTuple):
     """Whether the wall does what the forecast expects: neither cough nor deep breath, and it is seen."""
     moved: bool = False
     """Whether the patient lies elsewhere than when the surface was perceived."""
+
+
+def motion_of(message: Message) -> Motion:
+    """The motion in a `palpation_msgs/SurfaceMotion`. While the wall is hidden the forecast goes on, as long as it is good."""
+    hidden = message.state == SurfaceMotion.LOST and message.uncertainty < HIDDEN_M
+    calm = message.state == SurfaceMotion.QUIET or hidden
+    moved = bool(message.state == SurfaceMotion.MOVED)
+    return Motion(nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved)
 
 
 class Breath:

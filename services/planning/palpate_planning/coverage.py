@@ -1,7 +1,8 @@
 """Coverage: from targets to strokes, each a smooth curve in the abdomen's xy plane.
 
-Lines: a stroke a line, there and back, retracted in between, so that each has a touch and a tare of its own. Raster: the same, all
-of them one way. Snake: lines joined by arcs, one stroke in contact. Mode point: a stroke a target. A skipped target ends a stroke: the arm must not slide over what it cannot reach. So does a break: the way between two
+Lines: a stroke a line, there and back, retracted in between, so that each has a touch and a tare of its own. Raster: the same,
+all of them one way. Snake: lines joined by arcs, one stroke in contact. Mode point: a stroke a target. A skipped target ends a
+stroke: the arm must not slide over what it cannot reach. So does a break: the way between two
 targets that are in reach may itself be out of reach.
 """
 

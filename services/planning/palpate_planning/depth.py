@@ -70,7 +70,7 @@ class DepthRegulator:
     """Regulates one stroke; `reset` before the next. One call a planning period."""
 
     def __init__(self, period: float, stiffness: float, force_working: float, depth_max: float) -> None:
-        """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N], `depth_max` [m], which only a target may exceed."""
+        """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N], `depth_max` [m]: deeper only if asked to."""
         self._dt, self._stiffness, self._depth_max = period, stiffness, depth_max
         self.force_max = FORCE_FRACTION * force_working
         self.reset(0.0)

@@ -12,16 +12,16 @@ from palpate_planning.touch import FELT_N, Onset
 from palpate_planning.wall import TouchedSkin
 
 DESCEND_MPS = 0.08
-PROBE_MPS = 0.012
+PROBE_MPS = 0.014
 """Speed at which the skin is sought: force rises by about 3 N/s."""
 SIGMAS = 3.0
 """Within so many standard deviations of where the skin is believed to be it is sought,"""
 ALLOWANCE_M = 0.003
 """from this above: the onset is fitted to force before it, too."""
-REST_S = 0.2
+REST_S = 0.15
 """Time at rest before taring: the arm's oscillations fade."""
-TARE_S = 0.3
-"""Time of taring: 30 means over 10 ms of 0.1 N noise leave 6 mN."""
+TARE_S = 0.25
+"""Time of taring: 25 means over 10 ms of 0.1 N noise leave 6 mN."""
 
 
 class Descent:

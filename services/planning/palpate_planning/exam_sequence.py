@@ -31,8 +31,8 @@ from palpate_planning.wall import TouchedSkin, Wall, plane
 LOOKS_MAX = 3
 REST = 200 * MS
 """Time at rest before looking [ns]: the arm's oscillations fade."""
-LOOK_PATIENCE = 3 * SECOND
-"""Time that perception may take beyond the burst [ns]."""
+LOOK_PATIENCE = 12 * SECOND
+"""Time that perception may take beyond the burst [ns]: it watches about two breaths."""
 PLANNING_TIME = 2 * SECOND
 """Simulated time that planning the examination takes [ns]."""
 ASSESS_PATIENCE = 30 * SECOND
@@ -109,6 +109,8 @@ class ExamSequence:
             course.enter(Phase.HOME, now.t, "going home")
         status.steady = status.force_limited = False
         self._trigger, self._path, self._touched = False, None, None
+        if now.motion is not None:
+            self._sense.wall.breath.hear(now.motion, now.t)
         course.contact = self._sense.sense(now.reading, now.t)
         status.depth_setpoint = course.contact.depth
         self._stops.watch(now)
@@ -215,10 +217,11 @@ class ExamSequence:
         status = self.status
         self._skipped |= palpation.skipped
         self._touched, status.stroke = step.touched, palpation.stroke
+        status.patient_moved = self._sense.wall.breath.moved
         status.steady, status.force_limited = step.steady, step.limited
         status.depth_setpoint, status.target_index = step.depth_setpoint, step.target
         status.targets_skipped = len(self._skipped)
-        phase, message = PHASE_OF[step.stage], palpation.failed or step.stage.value
+        phase, message = PHASE_OF[step.stage], palpation.failed or palpation.left or step.stage.value
         if phase is not status.phase or message != status.message:
             self._course.enter(phase, t, message)
 

@@ -16,11 +16,10 @@ from palpate_planning.recovery import MOVED_M, Recovery
 from palpate_planning.segments import HOVER_M, Segment
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.wall import TouchedSkin, Wall
+from palpate_planning.wall_watch import WallWatch
 
 HOP_M = 0.010
-"""Height of short ways between strokes ..."""
-HOP_LENGTH_M = 0.05
-"""... shorter than this; on longer ones and on free motions it is `HOVER_M`, and where the surface is not known well."""
+"""Least height of the ways between strokes; it is `HOVER_M` on free motions, and where the surface is not known well."""
 LIFT_MPS = 0.12
 SETTLED_M = 0.0005
 """Depth error at which an indentation counts as settled ..."""
@@ -34,6 +33,8 @@ STEADY_FRACTION = 0.5
 """Samples count from this part of the path's speed on."""
 STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
+REPEAT_M = 0.010
+"""So much of the stroke before the interruption is repeated: it is noticed after about 0.2 s."""
 
 
 class StrokeStage(Enum):
@@ -87,6 +88,9 @@ class Palpation:
     ) -> None:
         """`radius` of the sphere [m]; `wall`: what is pressed, and learns from every touch."""
         self._segments, self._exam, self._limits, self._period_s = segments, exam, limits, period_s
+        self._watch = WallWatch(wall.breath, exam.breathing, period_s)
+        self.left = ""
+        """Why the strokes end early, in good order; empty if they do not."""
         self._motion = StrokeMotion(exam, limits, radius, period_s, wall)
         self._recovery = Recovery(exam, limits, period_s)
         self._descent = Descent(self._motion, exam.depth_m, period_s)
@@ -122,6 +126,18 @@ class Palpation:
         """Lifts off and ends."""
         self._recovery.give_up(why)
         if self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
+            self._enter(StrokeStage.LIFT)
+
+    def leave(self, why: str) -> None:
+        """Lifts off and ends, in good order: what is left of the plan counts as skipped."""
+        if self.left or self.stage is StrokeStage.DONE:
+            return
+        self.left = why
+        ahead = [i for segment in self._segments[self._number + 1 :] for i in segment.path.targets if segment.contact]
+        path = self._motion.segment.path
+        ahead += list(path.targets[path.visits > self._motion.along.position]) if self._motion.segment.contact else []
+        self._recovery.skipped |= {int(i): why for i in ahead}
+        if self.stage is not StrokeStage.LIFT:
             self._enter(StrokeStage.LIFT)
 
     def pause(self) -> None:
@@ -161,10 +177,11 @@ class Palpation:
         if contact.force > self._limits.force_soft_stop_n and self.stage in PRESSING:
             self._recovery.soft_stop(contact.force, self._motion.segment.path, self._motion.along.position)
             self._enter(StrokeStage.LIFT)
+        self._heed_the_wall(t, contact)
         if self.stage is StrokeStage.SLIDE:
             self._slide()
         elif self.stage is StrokeStage.LIFT:
-            self._lift()
+            self._lift(t)
         elif self.stage is StrokeStage.TRANSFER:
             self._transfer(rate)
         elif self.stage is StrokeStage.REST:
@@ -173,15 +190,24 @@ class Palpation:
             self._descend(t, contact)
         elif self.stage is StrokeStage.SETTLE:
             self._settle(contact)
-        elif self.stage is StrokeStage.HOLD and self._time >= HOLD_S:
-            self._enter(StrokeStage.LIFT)
+        elif self.stage is StrokeStage.HOLD:
+            self._hold()
         self._motion.regulate(contact, in_contact=contact.touching and self.stage is not StrokeStage.LIFT)
         return self._report(t, contact, rate)
 
+    def _heed_the_wall(self, t: int, contact: ContactMeasurement) -> None:
+        """Lifts off where the wall does what was not expected; that piece of the stroke is repeated."""
+        sliding = self.stage is StrokeStage.SLIDE
+        self._watch.step(t, adrift=sliding and not contact.touching)
+        if self._watch.ended:
+            self.leave(self._watch.ended)
+        elif self._watch.spoiled and self.stage in PRESSING:
+            self._recovery.resume_at = max(self._motion.along.position - (REPEAT_M if sliding else 0.0), 0.0)
+            self._enter(StrokeStage.LIFT)
+
     def _enter(self, stage: StrokeStage) -> None:
         self.stage = stage
-        self._time = 0.0
-        self._settled = 0.0
+        self._time = self._settled = self._held = 0.0
         if stage is StrokeStage.REST:
             self._descent.start()
 
@@ -200,7 +226,9 @@ class Palpation:
         if not self._joined:
             self._motion.restart(contact)
             self._joined = True
-        height = min(max(HOP_M, SIGMAS * contact.uncertainty + ALLOWANCE_M), HOVER_M)
+        height = _clearance(contact.uncertainty)
+        if not self._watch.calm:
+            self._descent.start()
         if not self._recovery.paused and self._descent.rest(height, LIFT_MPS):
             self._enter(StrokeStage.DESCEND)
 
@@ -208,7 +236,8 @@ class Palpation:
         """Down to the skin, and once it is touched down to depth, or as deep as the force allows."""
         if not self._descent.probe(contact, t):
             if self._descent.missed:
-                self.abandon(self._descent.missed)
+                end = self.abandon if self.stroke == 1 else self.leave
+                end(self._descent.missed)
         elif self._motion.segment.touch:
             self._enter(StrokeStage.LIFT)
         else:
@@ -227,30 +256,37 @@ class Palpation:
 
     def _slide(self) -> None:
         self._motion.deepen()
-        if self._motion.slide():
+        if not self._watch.open:
+            self._motion.brake()
+        elif self._motion.slide():
             self._enter(StrokeStage.LIFT)
 
-    def _lift(self) -> None:
+    def _hold(self) -> None:
+        self._held += self._period_s if self._watch.open else 0.0
+        if self._held >= HOLD_S:
+            self._enter(StrokeStage.LIFT)
+
+    def _lift(self, t: int) -> None:
         self._motion.brake()
-        if not self._motion.depth.step(-self._height, LIFT_MPS) or self._recovery.paused:
+        if not self._motion.depth.step(-self._height(t), LIFT_MPS) or self._recovery.paused:
             return
-        if self.failed:
+        if self.failed or self.left:
             self._enter(StrokeStage.DONE)
-        elif self._recovery.displacement is not None:
+        elif not self._watch.calm or self._recovery.displacement is not None:
             return
         elif self._recovery.resume_at is not None:
             self._enter(StrokeStage.TRANSFER)
         else:
             self._next_segment()
 
-    @property
-    def _height(self) -> float:
-        """How high to lift [m]: low before a short way, or to hop on within the stroke."""
-        if self.failed or self._number == len(self._segments) - 1:
+    def _height(self, t: int) -> float:
+        """How high to lift at `t` [ns]; in metres."""
+        if self.failed or self.left or not self._watch.calm or self._number == len(self._segments) - 1:
             return HOVER_M
-        way = self._segments[self._number + 1]
-        short = way.free is None and way.path.length < HOP_LENGTH_M
-        return HOP_M if self._recovery.resume_at is not None or short else HOVER_M
+        if self._recovery.resume_at is not None:
+            return HOP_M
+        way, wall = self._segments[self._number + 1], self._motion.wall
+        return HOVER_M if way.free is not None else _clearance(wall.sigma(wall.perceived.xy(way.path.p[-1]), t))
 
     def _transfer(self, rate: float) -> None:
         motion, recovery = self._motion, self._recovery
@@ -277,8 +313,17 @@ class Palpation:
             setpoint = self._recovery.displacement.move(setpoint)
         limited = motion.regulation.limited or (motion.short_of_depth and self.stage in AT_DEPTH)
         fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
-        steady = contact.touching and (self.stage is StrokeStage.HOLD or (self.stage is StrokeStage.SLIDE and fast))
+        steady = (
+            contact.touching
+            and self._watch.open
+            and (self.stage is StrokeStage.HOLD or (self.stage is StrokeStage.SLIDE and fast))
+        )
         descent = self._descent
         return PalpationStep(
             setpoint, self.stage, motion.regulation.reference, steady, limited, motion.target, descent.taring, descent.touched
         )
+
+
+def _clearance(sigma: float) -> float:
+    """Height [m] at which the skin, known within `sigma` [m], is surely not touched, and from which it is sought."""
+    return min(max(HOP_M, SIGMAS * sigma + ALLOWANCE_M), HOVER_M)

@@ -17,8 +17,9 @@ from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.scenario import ExamInput, Following, Scenario
 from palpate_planning.background import WORKER
+from palpate_planning.breath import Motion, motion_of
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
@@ -65,6 +66,7 @@ class PlanningService(Service):
                 t=t,
                 reading=self._reading,
                 perceived=self._perceived(inbox),
+                motion=self._motion(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
                 stop=stop,
                 soft=soft,
@@ -125,7 +127,7 @@ class PlanningService(Service):
         vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
         normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
         try:
-            surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA)
+            surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA, np.asarray(mesh.breathing))
         except ValueError as error:
             return PerceptionFailure(f"perception/surface: {error}")
         return PerceivedAbdomen(
@@ -135,6 +137,11 @@ class PlanningService(Service):
             triangles=np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3),
             surface=surface,
         )
+
+    def _motion(self, inbox: Inbox) -> Motion | None:
+        """The wall's newest motion, if there is one and it is to be followed."""
+        heard = [motion_of(message) for message in inbox.new("perception/motion")]
+        return heard[-1] if heard and self._known.exam.breathing is not Following.IGNORE else None
 
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
         """Roles that are needed and gone. A supervisor silent for longer than a set-point is valid is gone, too."""

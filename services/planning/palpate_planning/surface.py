@@ -65,9 +65,7 @@ class PerceivedSurface:
         self._field, self._mode = field, mode
 
     @staticmethod
-    def from_mesh(
-        vertices_W: Array, normals_W: Array | None, X_WA: Array, breathing: Array | None = None
-    ) -> PerceivedSurface:
+    def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array, breathing: Array | None = None) -> PerceivedSurface:
         """Fits the field to a mesh: vertices [m] shape (n, 3), outward unit normals of the same shape or None, and at each
         vertex how far breathing moves it, shape (n,), or None where nothing is known to move.
 
@@ -92,15 +90,17 @@ class PerceivedSurface:
             n_A = np.asarray(normals_W, dtype=float) @ X_WA[:3, :3]
             up = np.maximum(n_A[:, 2], 1.0 / STEEPEST)
             columns += [-n_A[:, 0] / up, -n_A[:, 1] / up]
-        moves = breathing is not None and len(breathing)
-        given = np.stack([*columns, breathing] if moves else columns, axis=1)
+        heights = len(columns)
+        if breathing is not None and len(breathing):
+            columns.append(breathing)
+        given = np.stack(columns, axis=1)
         values = np.asarray(LinearNDInterpolator(xy, given)(grid))
         outside = np.isnan(values[..., 0])
         if outside.any():
             values[outside] = NearestNDInterpolator(xy, given)(grid[outside])
-        mode = BicubicField(*axes, values[..., -1:]) if moves else None
-        values = values[..., : len(columns)]
-        if len(columns) == 1:
+        mode = BicubicField(axes[0], axes[1], values[..., heights:]) if heights < len(columns) else None
+        values = values[..., :heights]
+        if heights == 1:
             slopes = np.gradient(values[..., 0], *axes)
             values = np.stack((values[..., 0], *slopes), axis=-1)
         return PerceivedSurface(X_WA, BicubicField(axes[0], axes[1], values), mode)

@@ -1,7 +1,7 @@
 """How wrong the perceived surface is, learned from touches: a Gaussian process over the abdomen's xy plane.
 
-The surface lies c(x) outward of where the camera saw it. Camera and arm agree to centimetres, yet what is wrong is smooth: an offset,
-a tilt, and a field that varies over a few centimetres,
+The surface lies c(x) outward of where the camera saw it. Camera and arm agree to centimetres, yet what is wrong is smooth: an
+offset, a tilt, and a field that varies over a few centimetres,
 
     k(x, x') = OFFSET_M^2 + TILT_RAD^2 x.x' + FIELD_M^2 exp(-|x - x'|^2 / (2 FIELD_LENGTH_M^2)).
 
@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 from palpate_models.frames import Array
 
 OFFSET_M = 0.012
-"""Standard deviations before any touch: `docs/errors.md`, camera and its calibration, arm, warming up, all of them together [C];"""
+"""Standard deviations before any touch, after `docs/errors.md`: camera and its calibration, arm and warming up together [C];"""
 TILT_RAD = 0.010
 """hand-eye and arm about two axes [C];"""
 FIELD_M = 0.002
@@ -38,7 +38,7 @@ class SurfaceCorrection:
         self._factor: tuple[Array, bool] = (np.empty((0, 0)), True)
 
     def touch(self, xy_A: Array, height: float, sigma: float) -> None:
-        """The surface was felt at `xy_A`, shape (2,), `height` [m] outward of where it was perceived, give or take `sigma` [m]."""
+        """The surface was felt at `xy_A`, shape (2,), `height` [m] outward of where it was perceived, within `sigma` [m]."""
         self._places = np.vstack((self._places, xy_A))
         self._heights = np.append(self._heights, height)
         self._variances = np.append(self._variances, sigma**2)
@@ -46,7 +46,7 @@ class SurfaceCorrection:
         self._weights = cho_solve(self._factor, self._heights)
 
     def height(self, xy_A: Array) -> float:
-        """c [m] at a place, shape (2,)."""
+        """C [m] at a place, shape (2,)."""
         return float(_covariance(xy_A, self._places) @ self._weights)
 
     def sigma(self, xy_A: Array) -> float:
@@ -59,6 +59,6 @@ class SurfaceCorrection:
 
 
 def _covariance(a: Array, b: Array) -> Array:
-    """k of places a, shape (..., 2), with places b, shape (n, 2): shape (..., n)."""
+    """The covariance of places a, shape (..., 2), with places b, shape (n, 2): shape (..., n)."""
     apart = np.sum((a[..., None, :] - b) ** 2, axis=-1)
     return np.asarray(OFFSET_M**2 + TILT_RAD**2 * (a @ b.T) + FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)))

@@ -4,8 +4,8 @@ At a place x of A's xy plane the wall lies outward of the perceived surface by
 
     c(x) + m(x) w(t),
 
-c the correction (`surface_correction`), m the shape of the breathing motion (`perception/surface`), w how far it moves where m is 1
-(`breath`).
+c the correction (`surface_correction`), m the shape of the breathing motion (`perception/surface`), w how far it moves where m
+is 1 (`breath`).
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ class World:
             answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
         final = self.exam.status.phase is Phase.ASSESS
         reading = SensorReading(self.q.copy(), wrench, qd)
-        outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.soft, self.end, self.lost))
+        outcome = self.exam.step(Observation(self.t, reading, answer, None, final, self.stop, self.soft, self.end, self.lost))
         self.end = ""
         if outcome.trigger:
             self._answer_at = self.t + 300 * MS
