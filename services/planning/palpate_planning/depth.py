@@ -70,7 +70,10 @@ class DepthRegulator:
     """Regulates one stroke; `reset` before the next. One call a planning period."""
 
     def __init__(self, period: float, stiffness: float, force_working: float, depth_max: float) -> None:
-        """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N], `depth_max` [m]: deeper only if asked to."""
+        """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N].
+
+        No deeper than `depth_max` [m] is commanded, unless the target itself is.
+        """
         self._dt, self._stiffness, self._depth_max = period, stiffness, depth_max
         self.force_max = FORCE_FRACTION * force_working
         self.reset(0.0)
