@@ -227,7 +227,7 @@ class Palpation:
             self._motion.restart(contact)
             self._joined = True
         height = _clearance(contact.uncertainty)
-        if not self._watch.calm:
+        if not self._watch.calm or self._recovery.displacement is not None:
             self._descent.start()
         if not self._recovery.paused and self._descent.rest(height, LIFT_MPS):
             self._enter(StrokeStage.DESCEND)
