@@ -44,7 +44,8 @@ class WallWatch:
         self._calm_for, self._restless_for = (self._calm_for + dt, 0.0) if calm else (0.0, self._restless_for + dt)
         self._adrift_for = self._adrift_for + dt if adrift else 0.0
         lost = self._adrift_for > LOST_S
-        self._losses += lost
+        if lost:
+            self._losses, self._adrift_for = self._losses + 1, 0.0
         self.spoiled = lost or not calm
         self.open = not self._gated or abs(breath.displacement(t)) < GATE_M
         if breath.moved:
