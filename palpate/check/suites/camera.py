@@ -16,6 +16,8 @@ from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.frames import Array
 
 IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
+SMALL_IMAGE, SMALL_INFO = "camera/follow/depth", "camera/follow/camera_info"
+SMALL_WIDTHS = (48, 192)
 FRAME = "camera_depth_optical_frame"
 FRAMES = 5
 HALF = 0.15
@@ -63,8 +65,10 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
         f"world -> {FRAME}",
         "none" if X_WC is None else X_WC[:3, 3].round(3),
     )
+    report.section("small images")
+    _small(silent[SMALL_IMAGE], silent[SMALL_INFO], report)
     report.section("bursts")
-    report.expect("takes no frame unasked", not silent[IMAGE], "none", len(silent[IMAGE]))
+    report.expect("takes no whole frame unasked", not silent[IMAGE], "none", len(silent[IMAGE]))
     burst = _burst(rig, feed)
     images, infos = burst[IMAGE], burst[INFO]
     report.expect("takes as many frames as asked", len(images) == FRAMES, FRAMES, len(images))
@@ -86,6 +90,19 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     depth = _format(images[-1], infos[-1], report)
     if depth is not None and X_WC is not None:
         _geometry(depth, infos[-1].message, X_WC, centre, rig, report)
+
+
+def _small(images: list[HeardMessage], infos: list[HeardMessage], report: ConformanceReport) -> None:
+    """Perception follows the wall by them: they come all the time, with intrinsics of their own."""
+    if not report.expect("come unasked", bool(images), "some in half a second", len(images)):
+        return
+    same = [i.message.header.stamp for i in images] == [i.message.header.stamp for i in infos]
+    report.expect("intrinsics with every one, of the same stamp", same, f"{len(images)} pairs", f"{len(infos)} camera_info")
+    width = int(images[-1].message.width)
+    least, most = SMALL_WIDTHS
+    report.expect("are small", least <= width <= most, f"{least} to {most} pixels wide", width)
+    if infos:
+        _format(images[-1], infos[-1], report)
 
 
 def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[HeardMessage]]:

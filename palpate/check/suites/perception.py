@@ -17,6 +17,7 @@ from palpate_bus.messages import (
     Image,
     Quaternion,
     RegionOfInterest,
+    SurfaceMotion,
     TFMessage,
     Transform,
     TransformStamped,
@@ -27,6 +28,7 @@ from palpate_models.frames import Array, apply, inverse, look_at
 from palpate_models.load import exam_input
 
 IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
+SMALL_IMAGE, SMALL_INFO, MOTION = "camera/follow/depth", "camera/follow/camera_info", "perception/motion"
 SURFACE, TARGETS = "perception/surface", "perception/targets"
 FRAMES = 4
 SIZE = (480, 640)
@@ -57,6 +59,8 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.section("surface")
     _surface(rig, X_WA, report)
     _targets(rig, X_WA, report)
+    report.section("following")
+    _following(rig, depth, K, report)
     report.section("silence")
     before = len(rig.log[TARGETS])
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
@@ -75,22 +79,32 @@ def _answer(rig: Rig, feed: Feed) -> bool:
     return bool(rig.log[TARGETS])
 
 
+def _following(rig: Rig, depth: Array, K: Array, report: ConformanceReport) -> None:
+    """Shown every eighth pixel, it tells how the wall moves."""
+    few = np.diag((1 / 8, 1 / 8, 1.0)) @ K
+    shown = rig.run(1.0, _frames(np.ascontiguousarray(depth[::8, ::8]), few, SMALL_IMAGE, SMALL_INFO))[MOTION]
+    if report.expect("tells of small images how the wall moves", bool(shown), MOTION, "so" if shown else "nothing"):
+        count = SurfaceMotion.FORECASTS
+        sizes = {len(heard.message.forecast) for heard in shown}
+        report.expect("with its forecast", sizes == {count}, f"{count} values", sorted(sizes))
+
+
 def _tf(X_WC: Array) -> Any:
     x, y, z, w = map(float, Rotation.from_matrix(X_WC[:3, :3]).as_quat())
     pose = Transform(Vector3(*map(float, X_WC[:3, 3])), Quaternion(x, y, z, w))
     return TFMessage([TransformStamped(header(0, "world"), FRAME, pose)])
 
 
-def _frames(depth: Array, K: Array) -> Feed:
+def _frames(depth: Array, K: Array, image: str = IMAGE, info: str = INFO) -> Feed:
     data = np.ascontiguousarray(depth, "<f4").view(np.uint8).reshape(-1)
     P = np.hstack((K, np.zeros((3, 1)))).ravel()
     whole = RegionOfInterest(0, 0, 0, 0, False)
     height, width = depth.shape
     return {
-        INFO: lambda t: CameraInfo(
+        info: lambda t: CameraInfo(
             header(t, FRAME), height, width, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole
         ),
-        IMAGE: lambda t: Image(header(t, FRAME), height, width, "32FC1", 0, 4 * width, data),
+        image: lambda t: Image(header(t, FRAME), height, width, "32FC1", 0, 4 * width, data),
     }
 
 

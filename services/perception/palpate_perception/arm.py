@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models import lbr
+from palpate_models.compiled import compiled
 from palpate_models.frames import Array, apply
 from palpate_models.lbr_kinematics import link_transforms
 from palpate_models.scenario import Robot
@@ -32,9 +33,7 @@ class ArmMask:
         """
         starts, ends, radii = self._segments(q)
         towards = z[:, np.newaxis] * r_W  # from the camera to the wall
-        hidden = np.zeros(len(z), np.bool_)
-        for start, end, radius in zip(starts - p_WC, ends - p_WC, radii, strict=True):
-            hidden |= segment_distance(towards, start, end) < radius + MARGIN_M
+        hidden = passes(towards, starts - p_WC, ends - p_WC, radii + MARGIN_M)
         dented: NDArray[np.bool_] = np.linalg.norm(p_WC + towards - ends[-1], axis=1) < DENT_M
         return hidden | dented
 
@@ -52,15 +51,25 @@ class ArmMask:
         return np.array(starts), np.array(ends), np.array(radii)
 
 
-def segment_distance(a: Array, p: Array, q: Array) -> Array:
-    """Least distance [m] of the segments from the origin to each of `a`, shape (n, 3), from that between `p` and `q`, shape (n,).
+@compiled
+def passes(a: Array, p: Array, q: Array, reach: Array) -> NDArray[np.bool_]:
+    """Which segments from the origin to `a`, shape (n, 3), pass nearer than `reach`, (m,), to those from `p` to `q`, (m, 3).
 
     Ericson, Real-Time Collision Detection, section 5.1.9: the nearest points s a and p + t (q - p), with s and t in [0, 1].
     """
-    d = q - p
-    aa, dd, ad = np.sum(a * a, axis=1), max(float(d @ d), 1e-12), a @ d
-    ap, dp = a @ p, float(d @ p)
-    s = np.clip((ap * dd - dp * ad) / np.maximum(aa * dd - ad * ad, 1e-12), 0.0, 1.0)
-    t = np.clip((s * ad - dp) / dd, 0.0, 1.0)
-    s = np.clip((ap + t * ad) / aa, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(s[:, np.newaxis] * a - p - t[:, np.newaxis] * d, axis=1))
+    found = np.zeros(len(a), np.bool_)
+    for j in range(len(p)):
+        d = q[j] - p[j]
+        dd, dp, pp = max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, 1e-12), (d * p[j]).sum(), (p[j] ** 2).sum()
+        for i in range(len(a)):
+            if found[i]:
+                continue
+            x, y, z = a[i]
+            aa = x * x + y * y + z * z
+            ad, ap = x * d[0] + y * d[1] + z * d[2], x * p[j, 0] + y * p[j, 1] + z * p[j, 2]
+            s = min(max((ap * dd - dp * ad) / max(aa * dd - ad * ad, 1e-12), 0.0), 1.0)
+            t = min(max((s * ad - dp) / dd, 0.0), 1.0)
+            s = min(max((ap + t * ad) / aa, 0.0), 1.0)
+            squared = s * s * aa + pp + t * t * dd - 2 * s * ap - 2 * s * t * ad + 2 * t * dp
+            found[i] = squared < reach[j] ** 2
+    return found

@@ -23,6 +23,7 @@ from palpate_perception.fusion import DepthFusion
 from palpate_perception.pipeline import Perceived, PerceivedMesh, Pipeline, Targets
 from palpate_perception.views import Intrinsics
 from palpate_perception.wall import Mode
+from palpate_perception.watch import LONGEST_S
 
 IMAGE: Final = "camera/depth/image_raw"
 PATIENCE_NS: Final = 1 * NS
@@ -64,7 +65,8 @@ class PerceptionService(Service):
         self._fuse(burst, inbox)
         full = burst.fusion is not None and burst.fusion.frames >= burst.wanted
         given_up = bool(burst.wrong) or inbox.lost("camera") or (not full and t >= burst.deadline)
-        if not given_up and not (full and self._follower.watched):
+        watched = self._follower.watched or t >= burst.asked + LONGEST_S * NS + PATIENCE_NS
+        if not given_up and not (full and watched):
             return {}
         self._burst = None
         seen = self._follower.end()

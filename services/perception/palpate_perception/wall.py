@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy.interpolate import griddata
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.scenario import Exam
@@ -94,9 +94,10 @@ class Wall:
         """By how much depth changes for a displacement of 1 m, g m, in a window (rows, columns) of another of its images."""
         rows, columns = (np.arange(part.start, part.stop) for part in window)
         v, u = np.meshgrid(*(to_small(x, i, camera.K, self.camera.K) for x, i in ((rows, 1), (columns, 0))), indexing="ij")
-        places, values = np.column_stack(np.divmod(self.pixel, self.camera.shape[1])), self.gain * self.lifts
-        inside = griddata(places, values, (v, u), method="linear")
-        return np.where(np.isnan(inside), griddata(places, values, (v, u), method="nearest"), inside).astype(np.float32)
+        values = np.full(self.camera.shape, np.nan)
+        values.ravel()[self.pixel] = self.gain * self.lifts
+        nearest = distance_transform_edt(np.isnan(values), return_distances=False, return_indices=True)
+        return np.asarray(map_coordinates(values[tuple(nearest)], (v, u), order=1, mode="nearest"), np.float32)
 
 
 def to_small(x: Array, axis: int, K: Array, K_small: Array) -> Array:

@@ -74,10 +74,9 @@ class Patient:
         return SurfaceMesh(header(t, "world"), p_W.ravel(), none, self._triangles, none)
 
 
-def reach(case: Scenario, p_W: Array) -> Array:
-    """Joint positions [rad] with the indenter at `p_W` [m], pointing down: damped least squares from the ready posture."""
-    q = READY.copy()
-    for _ in range(100):
+def reach(case: Scenario, p_W: Array, q: Array, rounds: int) -> Array:
+    """Joint positions [rad] with the indenter at `p_W` [m], pointing down: damped least squares, beginning at `q`."""
+    for _ in range(rounds):
         X = tool_pose(q, case.robot)
         tilt = np.cross(X[:3, 2], (0.0, 0.0, -1.0))
         error = np.concatenate((p_W - X[:3, 3], 0.5 * tilt))
@@ -120,7 +119,7 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True) -> tuple[Run, 
     X_WA = np.array(exam_input(case).X_WA)
     (cx, cy), (width, height) = case.exam.centre_m, case.exam.region_m
     err = np.random.default_rng(case.seed).normal(0.0, 0.001, 7)  # zeros of the joints, as errors.arm
-    home = reach(case, X_WA[:3, 3] + (-0.25, 0.0, 0.45))
+    home = reach(case, X_WA[:3, 3] + (-0.25, 0.0, 0.45), READY, 60)
     image: dict[str, Any] = {}
     q = home
     for k in range(round((LOOK_S + seconds) * 10)):
@@ -129,7 +128,7 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True) -> tuple[Run, 
         if arm_in_view and t > LOOK_S * NS:
             phase = (t / NS - LOOK_S) / 8.0  # a line of 8 s, to and fro
             p = np.array((cx + width * ((0.1 * phase) % 1 - 0.5), cy + height * (abs(2 * (phase % 1) - 1) - 0.5), 0.01))
-            q = reach(case, apply(X_WA, p[np.newaxis])[0]) if k % 2 == 0 else q
+            q = reach(case, apply(X_WA, p[np.newaxis])[0], q, 1 if t > (LOOK_S + 1) * NS else 10)
         status, links = arm(case, t, q, q + err)
         begun = thread_time()
         seen.receive({"sim/surface": patient.skin(t), "sim/link_poses": links, **trigger})
@@ -187,12 +186,17 @@ def main() -> None:
         noticed = "" if not len(moved) else f"{moved[0] - patient.motion.at_s:.1f}" if patient.motion.moves else "FALSE"
         mode, off = heights(result, patient)
         cost = 1e3 * np.quantile(result.cost_s, (0.5, 0.95))
-        print(
-            f"| {name} | {result.answered_s:.1f} | {np.sqrt(np.mean(mode**2)):.3f} "
-            f"| {1e3 * off.mean():.2f}, {1e3 * off.std():.2f} | {error[0]:.2f} | {error[1]:.2f} | {error[2]:.2f} | {', '.join(f'{x:.0f}' for x in share)} | {noticed} "
-            f"| {cost[0]:.1f}, {cost[1]:.1f} |",
-            flush=True,
+        cells = (
+            name,
+            f"{result.answered_s:.1f}",
+            f"{np.sqrt(np.mean(mode**2)):.3f}",
+            f"{1e3 * off.mean():.2f}, {1e3 * off.std():.2f}",
+            *(f"{x:.2f}" for x in error),
+            ", ".join(f"{x:.0f}" for x in share),
+            noticed,
+            f"{cost[0]:.1f}, {cost[1]:.1f}",
         )
+        print(f"| {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

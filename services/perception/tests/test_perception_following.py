@@ -1,0 +1,95 @@
+"""Following the wall: the breath filter, the arm's mask, and what is told of breaths, coughs, shifts and a hidden wall."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bench_perception_following import READY, Patient, Run, run
+
+from palpate_bus.messages import SurfaceMotion
+from palpate_models.lbr_kinematics import tool_pose
+from palpate_models.load import load_scenario
+from palpate_models.scenario import Robot
+from palpate_perception.arm import ArmMask, passes
+from palpate_perception.breath_filter import BreathFilter, strongest_rate
+from palpate_perception.watch import rises
+
+
+def followed(*settings: str, scenario: str = "healthy", seed: int = 3, seconds: float = 20.0) -> tuple[Run, Patient]:
+    return run(load_scenario(scenario, ("exam.region_m=[0.1, 0.1]", *settings), seed), seconds)
+
+
+def test_a_sine_is_forecast() -> None:
+    t = 0.1 * np.arange(400)
+    d = 0.004 * (1 - np.cos(2 * np.pi * t / 4))
+    breath = BreathFilter(t[:100], d[:100])
+    error = []
+    for at, value in zip(t[100:], d[100:], strict=True):
+        breath.forward(float(at))
+        breath.update(float(value), 1e-4)
+        breath.remember(float(value))
+        error.append(breath.forecast(np.array((0.2,)))[0] - 0.004 * (1 - np.cos(2 * np.pi * (at + 0.2) / 4)))
+    assert np.sqrt(np.mean(np.square(error))) < 0.25e-3
+
+
+def test_the_rate_is_found() -> None:
+    t = 0.1 * np.arange(150)
+    assert strongest_rate(t, np.sin(2 * np.pi * 17 / 60 * t)) == pytest.approx(17, abs=1)
+
+
+def test_rises_are_counted_once_for_each_breath() -> None:
+    t = np.linspace(0, 3, 200)
+    noisy = np.sin(2 * np.pi * t) + 0.1 * np.random.default_rng(0).standard_normal(200)
+    assert rises(noisy, -1.0, 1.0) == 3
+
+
+def test_a_ray_past_a_capsule_is_hidden_by_it_and_one_before_it_is_not() -> None:
+    ends = np.array([(0.0, 0.0, 2.0), (0.0, 0.0, 0.9), (0.5, 0.0, 2.0)])
+    start, end = np.array([(-0.2, 0.0, 1.0)]), np.array([(0.2, 0.0, 1.0)])
+    assert passes(ends, start, end, np.array((0.05,))).tolist() == [True, False, False]
+    assert passes(ends, start, end, np.array((0.11,))).tolist() == [True, True, False]
+
+
+def test_the_arm_hides_what_lies_below_it() -> None:
+    robot = Robot()
+    tip = tool_pose(READY, robot)[:3, 3]
+    above = tip + np.array((0.0, 0.0, 1.0))
+    rays = np.array([(0.0, 0.0, -1.0), (0.6, 0.6, -1.0)])
+    assert ArmMask(robot).hides(READY, above, rays, np.array((1.2, 1.2))).tolist() == [True, False]
+
+
+def test_quiet_breathing_is_followed_with_typical_errors_while_the_arm_palpates() -> None:
+    result, patient = followed("phantom.breathing.peak_to_peak_m=0.008")
+    state, told = np.array(result.state), np.array(result.told)
+    assert np.mean(state == SurfaceMotion.QUIET) > 0.9
+    error = told[:, 2] - [patient.curve.excursion(t + 0.1) for t in result.t_s]
+    assert np.sqrt(np.mean(error**2)) < 0.7e-3
+    assert np.abs(error).max() < 5e-3
+    assert np.ptp(told[:, 0]) > 4e-3, "it does breathe"
+
+
+def test_a_still_wall_moves_by_next_to_nothing() -> None:
+    result, _ = followed(scenario="clean", seconds=5.0)
+    assert set(result.state) == {SurfaceMotion.QUIET}
+    assert np.abs(result.told).max() < 0.4e-3
+
+
+def test_a_cough_spoils_and_passes() -> None:
+    result, patient = followed("phantom.breathing.coughs_per_min=6", seed=5, seconds=40.0)
+    state, t = np.array(result.state), np.array(result.t_s)
+    table = patient.curve.table
+    hard = table[(table[:, 1] == 0.15) & (table[:, 4] > 0.012) & (table[:, 0] > t[0]) & (table[:, 0] < t[-1] - 1)]
+    coughs = hard[:, 0] + 0.15
+    assert len(coughs)
+    for moment in coughs:
+        assert np.any(state[(t >= moment - 0.1) & (t < moment + 0.35)] == SurfaceMotion.SPOILED), moment
+    assert np.mean(state == SurfaceMotion.QUIET) > 0.5
+
+
+@pytest.mark.parametrize("kind", ["shift", "turn"])
+def test_a_patient_who_moves_is_noticed_within_a_second(kind: str) -> None:
+    result, patient = followed(f"phantom.motion.kind={kind}", "phantom.motion.at_s=20", scenario="restless", seconds=12.0)
+    t, state = np.array(result.t_s), np.array(result.state)
+    moved = t[state == SurfaceMotion.MOVED]
+    assert len(moved)
+    assert patient.motion.at_s < moved[0] <= patient.motion.at_s + 1.0
