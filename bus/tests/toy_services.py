@@ -142,7 +142,26 @@ class Planning(Service):
                 h, 0, pose(), twist(), wrench(), np.zeros(6), np.zeros(6), q, np.zeros(7), np.zeros(7), duration_message(250 * MS)
             ),
             "exam/state": ExamState(
-                h, 0, "", 0, 0, 0, False, False, False, False, 0.0, 0.0, 0.0, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), end
+                h,
+                0,
+                "",
+                0,
+                0,
+                0,
+                False,
+                False,
+                False,
+                False,
+                0.0,
+                0.0,
+                0.0,
+                Point(0.0, 0.0, 0.0),
+                Vector3(0.0, 0.0, 1.0),
+                end,
+                0.0,
+                0.0,
+                0,
+                False,
             ),
         }
         if t % (500 * MS) == 0:

@@ -157,6 +157,10 @@ class ExamState:
     surface_point: Point
     surface_normal: Vector3
     end_tick: int
+    depth_uncertainty: float
+    wall_displacement: float
+    stroke: int
+    patient_moved: bool
 
 @dataclass
 class Finding:
@@ -329,6 +333,17 @@ class ServiceReport:
     tick: int
     waiting_for: str
     detail: str
+
+@dataclass
+class SkinTouch:
+    __msgtype__: ClassVar[str]
+    header: Header
+    surface_point: Point
+    stroke: int
+    height: float
+    sigma: float
+    expected: float
+    expected_sigma: float
 
 @dataclass
 class StiffnessMap:

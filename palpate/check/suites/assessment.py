@@ -51,7 +51,7 @@ class Examination:
         force = FORCE_N * self.stiffness(x, y) if scanning else 0.0
         return ExamState(
             header(t, "world"), phase, "conformance check", 0, 1, 0, scanning, scanning, False, False, self._depth, depth, force,
-            Point(*map(float, p_W)), Vector3(*map(float, n_W)), -1,
+            Point(*map(float, p_W)), Vector3(*map(float, n_W)), -1, 0.0005, 0.0, 1, False,
         )  # fmt: skip
 
     @staticmethod

@@ -62,7 +62,7 @@ class PlayedArm:
     def _exam(self, t: int) -> Any:
         return ExamState(
             header(t, "world"), ExamState.PHASE_SCAN, "conformance check", 0, 1, 0, False, False, False, False, 0.0, 0.0, 0.0,
-            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1,
+            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0, 0.0, 0, False,
         )  # fmt: skip
 
     def surface(self, t: int, depth: float) -> Any:

@@ -182,6 +182,10 @@ def _state(
         surface_point=Point(*map(float, p_W)),
         surface_normal=Vector3(*map(float, n_W)),
         end_tick=-1,
+        depth_uncertainty=0.0005,
+        wall_displacement=0.0,
+        stroke=1,
+        patient_moved=False,
     )
 
 
