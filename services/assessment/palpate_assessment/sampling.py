@@ -37,6 +37,8 @@ class State:
     counts: bool
     """Whether it belongs into a sample: in contact, at depth, outside transitions."""
     force_limited: bool = False
+    depth_uncertainty: float = 0.0
+    """One sigma of the depth [m]."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,10 @@ class ForceSample:
     time_in_contact: float
     """Since the onset of contact of this stroke [s]."""
     force_limited: bool
+    stroke: int = 0
+    """Descents so far: samples of one stroke share the zero of depth and of force."""
+    depth_uncertainty: float = 0.0
+    """One sigma of the depth [m]."""
 
 
 class Sampler:
@@ -75,6 +81,7 @@ class Sampler:
         self._block: list[State] = []
         self._last: State | None = None
         self._onset: float | None = None
+        self._stroke = 0
 
     def add(self, state: State) -> ForceSample | None:
         """Takes the next state; returns the sample that it completes, if any."""
@@ -82,6 +89,7 @@ class Sampler:
         if state.in_contact:
             if self._onset is None:
                 self._onset = state.time
+                self._stroke += 1
             if self._last is not None:
                 self._memory.add(state.time, state.time - self._last.time, state.position, state.depth)
         else:
@@ -124,4 +132,6 @@ class Sampler:
             lost=self._memory.lost(float(time.mean()), middle),
             time_in_contact=float(time.mean()) - (self._onset if self._onset is not None else float(time[0])),
             force_limited=any(s.force_limited for s in block),
+            stroke=self._stroke,
+            depth_uncertainty=max(s.depth_uncertainty for s in block),
         )

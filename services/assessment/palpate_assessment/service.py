@@ -152,6 +152,8 @@ def sample_message(sample: ForceSample) -> Message:
         tangential_speed=float(np.linalg.norm(sample.velocity)),
         time_in_contact=sample.time_in_contact,
         force_limited=sample.force_limited,
+        stroke=sample.stroke,
+        depth_uncertainty=sample.depth_uncertainty,
     )
 
 
@@ -170,6 +172,7 @@ def map_message(t: int, result: Assessment, common_depth: float) -> Message:
         force=result.force.astype(np.float32),
         stiffness=result.stiffness.astype(np.float32),
         scanned=result.scanned,
+        unassessed=np.where(result.scanned, StiffnessMap.ASSESSED, StiffnessMap.NOT_REACHED).astype(np.uint8),
         finding=finding,
         common_depth=common_depth,
         background=result.background,
@@ -179,7 +182,7 @@ def map_message(t: int, result: Assessment, common_depth: float) -> Message:
 
 def findings_message(t: int, findings: Sequence[StiffArea]) -> Message:
     """`palpation_msgs/Findings`, the final ones."""
-    return Findings(header=header(t, FRAME), findings=[finding_message(f) for f in findings], final=True)
+    return Findings(header=header(t, FRAME), findings=[finding_message(f) for f in findings], candidates=[], final=True)
 
 
 def finding_message(area: StiffArea) -> Message:
