@@ -63,7 +63,7 @@ def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
     xy, lines = [], []
     for j, y in enumerate(np.linspace(-exam.region_m[1] / 2, exam.region_m[1] / 2, ny)):
         x = np.linspace(-exam.region_m[0] / 2, exam.region_m[0] / 2, nx)
-        for value in x[:: -1 if exam.pattern == "snake" and j % 2 else 1]:
+        for value in x[:: -1 if exam.pattern != "raster" and j % 2 else 1]:
             xy.append((value, y))
             lines.append(j)
     points, _ = surface.at(np.array(xy))
@@ -88,7 +88,7 @@ class World:
         self.q = np.array(lbr.HOME)
         self.dome = seen_dome(settings)
         self.truth = seen_dome(settings).surface
-        self.truth.offset = offset
+        self.offset = offset
         self.t = 0
         self.depth = self.pressed = 0.0
         self.answers: list[PerceivedAbdomen | PerceptionFailure] = [self.dome]
@@ -101,8 +101,8 @@ class World:
 
     def _touch(self, X_WI: Array) -> Array:
         """Contact force on the tool at a pose, world axes; sets true depth and force."""
-        _, n, distance = self.truth.nearest(X_WI[:3, 3])
-        self.depth = self.settings.robot.indenter_radius_m - distance
+        _, n, distance, _ = self.truth.nearest(X_WI[:3, 3])
+        self.depth = self.settings.robot.indenter_radius_m - distance + self.offset
         self.pressed = self.force(self.depth)
         return n * self.pressed
 
@@ -137,7 +137,7 @@ class World:
             answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
         final = self.exam.status.phase is Phase.ASSESS
         reading = SensorReading(self.q.copy(), wrench, qd)
-        outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.soft, self.end, self.lost))
+        outcome = self.exam.step(Observation(self.t, reading, answer, None, final, self.stop, self.soft, self.end, self.lost))
         self.end = ""
         if outcome.trigger:
             self._answer_at = self.t + 300 * MS
