@@ -15,7 +15,7 @@ from palpate_assessment.detection import detect
 from palpate_assessment.findings import Z90, Area, areas
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression, usual_amplitudes
-from palpate_assessment.observations import observe
+from palpate_assessment.observations import FEWEST, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_bus.messages import StiffnessMap
 from palpate_models.frames import Array
@@ -55,13 +55,17 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
     o = observe(samples, calibration)
     if o is None:
         return None
-    regression, candidates = detect(o, calibration)
+    reasons = np.where(o.limited, StiffnessMap.YIELDED, StiffnessMap.ASSESSED)
+    telling = np.flatnonzero(~o.limited)
+    if len(telling) < FEWEST:
+        return None
+    regression, candidates = detect(o.part(telling), calibration)
     wrong = contradicted(regression)
     if 0 < wrong.mean() < _MOST_CONTRADICTED:
-        regression, candidates = detect(o.part(np.flatnonzero(~wrong)), calibration)
+        reasons[telling[wrong]] = StiffnessMap.CONTRADICTED
+        regression, candidates = detect(o.part(telling[~wrong]), calibration)
     apart, nearest = cKDTree(o.xy).query(grid.nodes[:, :2])
-    unassessed = np.where(wrong[nearest], StiffnessMap.CONTRADICTED, StiffnessMap.ASSESSED)
-    unassessed[o.limited[nearest]] = StiffnessMap.YIELDED
+    unassessed = reasons[nearest]
     unassessed[apart > reach] = StiffnessMap.NOT_REACHED
     weighed = areas(regression, candidates, grid, unassessed == StiffnessMap.ASSESSED)
     threshold = calibration.threshold(false_findings)

@@ -107,7 +107,11 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
     simplex = start + np.vstack((np.zeros(3), np.diag((0.004, 0.004, 0.25))))
     edge = Bounds((*low, np.log(RADII_M[0])), (*high, np.log(RADII_M[-1] * 1.3)))
     best = minimize(
-        loss, start, method="Nelder-Mead", bounds=edge, options={"initial_simplex": simplex, "maxfev": 40, "xatol": 1e-4, "fatol": 1e-2}
+        loss,
+        start,
+        method="Nelder-Mead",
+        bounds=edge,
+        options={"initial_simplex": simplex, "maxfev": 40, "xatol": 1e-4, "fatol": 1e-2},
     )
     bump = Bump(float(best.x[0]), float(best.x[1]), float(np.exp(best.x[2])))
     return bump, -float(best.fun)

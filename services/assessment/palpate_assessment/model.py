@@ -42,8 +42,11 @@ BREATHING_S = 1.0
 """How long what following leaves of breathing stays alike."""
 LEAST_DEPTH_ERROR_M = 0.0001
 """Prior median of the depth's errors for strokes that claim to have none."""
-SURFACE_M, SURFACE_SHARE = 0.05, 0.5
-"""Length of the perceived surface's error, and its part of the depth's uncertainty: a scan cannot tell it from stiffness."""
+SURFACE_M, SURFACE_SHARE, COMMON_SHARE = 0.05, 0.5, 0.4
+"""Length of the error that strokes share smoothly, its part of the depth's uncertainty, and the part of the error which all share:
+a scan cannot tell either from stiffness."""
+UNLIKE = 0.1
+"""How much a press may feel of a lump otherwise than a slide does, of its log-contrast."""
 TARE_N = 0.05
 """Zero of a stroke's force."""
 WHITE_SD = 0.01
@@ -211,6 +214,9 @@ class Regression:
         prior = LEVEL_SD**2 + variances[:-1].sum() + variances[-1] * bone(xy) ** 2
         prior = prior + sum((LUMP_SD * lump(xy)) ** 2 + (LUMP_FREE_SD * lump(xy, 2 * EDGE_M)) ** 2 for lump in self.lumps)
         variance = np.maximum(prior - (seen**2).sum(axis=0), 1e-8) + self.calibration.conversion_sd**2
+        variance += (COMMON_SHARE * o.depth_uncertainty * float(np.median(o.per_metre))) ** 2
+        if self.lumps:
+            variance += (UNLIKE * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2
         return self.level + self.whitened @ seen, np.sqrt(variance)
 
     def contrast(self, lump: Bump, xy: Array) -> tuple[Array, Array]:

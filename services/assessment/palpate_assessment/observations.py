@@ -16,6 +16,8 @@ from palpate_models.frames import Array
 
 SHALLOWEST_M, WEAKEST_N = 0.002, 0.1
 """Depth and force from which a sample tells stiffness."""
+FEWEST = 10
+"""So many samples are needed to say anything."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Observations:
 def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observations | None:
     """The samples that tell stiffness; None if they are too few to say anything."""
     good = [s for s in samples if s.depth >= SHALLOWEST_M and s.force >= WEAKEST_N]
-    if len(good) < 10:
+    if len(good) < FEWEST:
         return None
     position, velocity = np.array([s.position for s in good]), np.array([s.velocity for s in good])
     depth, force = np.array([s.depth for s in good]), np.array([s.force for s in good])

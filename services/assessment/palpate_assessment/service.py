@@ -17,8 +17,8 @@ from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, 
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import Array, apply, inverse
 from palpate_models import press
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import ExamInput, Scenario

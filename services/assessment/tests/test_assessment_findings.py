@@ -69,7 +69,7 @@ def test_errors_of_strokes_widen_the_band() -> None:
 
 
 def test_a_lower_rate_of_false_findings_reports_less() -> None:
-    samples = lines(lambda xy: LEVEL + natural(3, 0.1)(xy) + lump(xy, (0.0, 0.0), 0.02, 1.35), stroke_m=0.0005)
+    samples = lines(lambda xy: LEVEL + natural(3, 0.1)(xy) + lump(xy, (0.0, 0.0), 0.02, 1.5), stroke_m=0.0007, breathing_m=0.0007)
     strict, lax = (assess(samples, flat_grid(), REACH, rate) for rate in (1e-4, 0.5))
     assert strict is not None
     assert lax is not None

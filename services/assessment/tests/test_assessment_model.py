@@ -37,7 +37,7 @@ def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() ->
     regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
     mean, sd = regression.field(o.xy)
     assert mean == pytest.approx(LEVEL + wall(o.xy), abs=0.05)
-    _, far = regression.field(o.xy + (0.3, 0.0))
+    _, far = regression.field(o.xy + np.array((0.3, 0.0)))
     assert far.min() > 1.5 * sd.max()
 
 

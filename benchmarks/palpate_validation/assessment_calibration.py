@@ -1,7 +1,7 @@
 """Fits the probabilities of the assessment's candidates to tuning patients, and its operating point to healthy ones.
 
-    python -m palpate_benchmarks.assessment_calibration --patients 300       writes calibration.yaml anew
-    python -m palpate_benchmarks.assessment_calibration --patients 300 --first-seed 1000 --check
+    python -m palpate_validation.assessment_calibration --patients 300       writes calibration.yaml anew
+    python -m palpate_validation.assessment_calibration --patients 300 --first-seed 1000 --check
 
 Every second patient is healthy, the others have one lump; persons and scans are those of `felt_scans`. What the regression needs of
 contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over the tissue, and a press is
@@ -24,17 +24,17 @@ import palpate_assessment
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.detection import FEATURES, detect
 from palpate_assessment.observations import observe
-from palpate_benchmarks.felt_scans import FeltPatient, ScanErrors, felt_patient, felt_samples
 from palpate_models.draw import Draw
 from palpate_models.frames import Array
 from palpate_models.patient import Phantom
 from palpate_models.seeds import generator
+from palpate_validation.felt_scans import FeltPatient, ScanErrors, felt_patient, felt_samples
 
 FELT: Final = 1.3
 """Felt contrast from which an area counts as a lump."""
 _TAIL: Final = 0.25
 """Part of the healthy examinations that the tail is fitted to."""
-_RIDGE: Final = 0.02
+_RIDGE: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,9 @@ def told(cases: list[Case], calibration: Calibration, false_findings: float = 0.
     for low, high in ((0.0, 0.1), (0.1, 0.3), (0.3, 0.7), (0.7, 0.9), (0.9, 1.01)):
         here = (probability >= low) & (probability < high)
         if here.any():
-            print(f"probability {low} to {high}: {here.sum()} candidates, {probability[here].mean():.2f} told, {real[here].mean():.2f} true")
+            print(
+                f"probability {low} to {high}: {here.sum()} candidates, {probability[here].mean():.2f} told, {real[here].mean():.2f} true"
+            )
     held = np.array([c.held for c in cases])
     print(f"band holds: mean {held.mean():.3f}, median {np.median(held):.3f}, tenth {np.quantile(held, 0.1):.3f}")
 

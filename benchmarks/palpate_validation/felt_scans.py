@@ -18,9 +18,9 @@ from scipy.special import k0, k1
 
 from palpate_assessment.sampling import ForceSample
 from palpate_models.frames import Array
-from palpate_models.patient import Phantom, Stiffness
+from palpate_models.patient import Phantom
 from palpate_models.person import drawn
-from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.phantom import build_phantom
 from palpate_models.seeds import generator
 from palpate_validation.persons import force_at_10_mm
 
@@ -107,7 +107,9 @@ def _footprint(length: float) -> Array:
     return np.asarray(footprint / footprint.sum())
 
 
-def felt_samples(patient: FeltPatient, errors: ScanErrors, seed: int, spacing: float = 0.0125, region: float = 0.2) -> list[ForceSample]:
+def felt_samples(
+    patient: FeltPatient, errors: ScanErrors, seed: int, spacing: float = 0.0125, region: float = 0.2
+) -> list[ForceSample]:
     """Samples every 5 mm of lines to and fro over the region at 30 mm/s, each line a stroke of its own."""
     rng = generator(seed, "felt-scan")
     lines = np.linspace(-region / 2, region / 2, round(region / spacing) + 1)
@@ -121,7 +123,9 @@ def felt_samples(patient: FeltPatient, errors: ScanErrors, seed: int, spacing: f
     breathing = errors.breathing_m * np.interp(times, clock, wander) / np.sqrt(2)
     field = gaussian_filter(rng.standard_normal((75, 75)), 0.05 / np.sqrt(2) / PITCH_M)
     field *= errors.field_m / max(float(field.std()), 1e-12)
-    xy = np.concatenate([np.column_stack((along[:: 1 if i % 2 == 0 else -1], np.full(len(along), y))) for i, y in enumerate(lines)])
+    xy = np.concatenate(
+        [np.column_stack((along[:: 1 if i % 2 == 0 else -1], np.full(len(along), y))) for i, y in enumerate(lines)]
+    )
     stroke = np.repeat(np.arange(len(lines)), len(along))
     zero = errors.stroke_m * rng.standard_normal(len(lines))[stroke]
     zero = zero + map_coordinates(field, ((xy + HALF_M) / PITCH_M).T[::-1], order=1) + breathing
