@@ -3,9 +3,9 @@
     python -m palpate_validation.assessment_calibration --patients 300       writes calibration.yaml anew
     python -m palpate_validation.assessment_calibration --patients 300 --first-seed 1000 --check
 
-Every second patient is healthy, the others have one lump; persons and scans are those of `felt_scans`. What the regression needs of
-contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over the tissue, and a press is
-made beside it.
+Every second patient is healthy, the others have one lump; persons and scans are those of `felt_scans`. What the regression
+needs of contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over the tissue, and
+a press is made beside it.
 """
 
 from __future__ import annotations

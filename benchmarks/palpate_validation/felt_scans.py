@@ -1,4 +1,4 @@
-"""Scans of persons without physics in time: what an indenter feels of each place, read along lines with the errors that measuring has.
+"""Scans of persons without physics in time: what an indenter feels of each place, read along lines, with errors.
 
 A place's force follows from the wall's stiffness and stiffening there (`force_at_10_mm`) and is averaged over the indenter's
 footprint on a Winkler-Pasternak foundation. It takes a fraction of a second a person, so that thousands can be had, for the
@@ -30,7 +30,7 @@ HALF_M: Final = 0.148
 CONTACT_M: Final = 0.009
 """Radius of the contact of a sphere of 15 mm at 10 mm depth [C, of the foundation's obstacle problem]."""
 POWER: Final = 0.8
-"""A wall that gives way beside a stiff place makes the mean over the footprint a power mean with this exponent [C, transients]."""
+"""A wall that gives way beside a stiff place makes the mean over the footprint a power mean of this exponent [C, transients]."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
 def _footprint(length: float) -> Array:
     """Sensitivity of the force to the modulus about the indenter, on the grid, summing to 1.
 
-    By the envelope theorem dF = dk_w (u phi + l^2 grad u . grad phi) with the influence phi = K0(r / l) / K0(a / l) beyond the contact.
+    By the envelope theorem dF = dk_w (u phi + l^2 grad u . grad phi) with the influence phi = K0(r / l) / K0(a / l)
+    beyond the contact.
     """
     reach = min(round(3 * length / PITCH_M) + 3, 15)
     axis = np.arange(-reach, reach + 1) * PITCH_M

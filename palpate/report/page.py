@@ -135,7 +135,8 @@ def verdict(report: Report) -> str:
 
 def _unassessed(report: Report) -> str:
     """What is not known, which comes first."""
-    return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in report.unassessed_m2.items())
+    parts = report.unassessed_m2.items()
+    return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in parts)
 
 
 def _unreached(report: Report) -> str:

@@ -1,7 +1,8 @@
 """Whether the model can say what the samples say: each piece of a stroke against what all the others predict of it.
 
-With the covariance K of all observations and P = K^-1, the piece k held out has the residual e = (P_kk)^-1 (P y)_k with covariance
-(P_kk)^-1 (Rasmussen and Williams 2006, sec. 5.4.2), so e' P_kk e is chi-squared if the model holds: a posterior predictive check.
+With the covariance K of all observations and P = K^-1, the piece k held out has the residual e = (P_kk)^-1 (P y)_k with
+covariance (P_kk)^-1 (Rasmussen and Williams 2006, sec. 5.4.2), so e' P_kk e is chi-squared if the model holds: a posterior
+predictive check.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from palpate_assessment.observations import Observations
 PIECE_M = 0.03
 """Length of the pieces: what the indenter feels at one place."""
 SURPRISE = 1e-5
-"""A piece whose residual is less probable than this contradicts the model: about one of the healthy examinations in a hundred
-has one, by what the examinations of tuning patients show."""
+"""A piece whose residual is less probable than this contradicts the model: of an examination's hundred pieces, one in a thousand
+examinations where the model holds."""
 
 
 def contradicted(regression: Regression) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""From candidates to findings: how probable each is, its outline, and how much stiffer or softer it feels than its surroundings."""
+"""From candidates to findings: how probable each is, where it ends, and how it feels against its surroundings."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
 
 
 def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed: Mask, logit: float) -> Area | None:
-    """The connected set of nodes about a candidate's peak with at least half of its log-contrast; None if nothing of it is left."""
+    """The connected nodes about a candidate's peak with at least half of its log-contrast; None if nothing of it is left."""
     xy = grid.nodes[:, :2]
     bump, sign = candidate.bump, float(np.sign(candidate.log_contrast))
     near = np.flatnonzero(bump(xy, 0.5 * bump.radius + 0.01) > 1e-3)

@@ -2,9 +2,9 @@
 
     y = z(x) + (n - n0) log(d / D) + (n / d) (stroke zero + breathing left over + surface error(x)) + tare / F + noise
 
-z is a sum of fields of several lengths, of vertical strips that are symmetric about the midline (muscles and the linea alba), of bone
-where ribs and iliac crests may lie, and of the lumps that were detected. The amplitudes of all parts but the lumps are found by type-II maximum likelihood with log-normal
-priors (Rasmussen and Williams 2006, ch. 5): K = K0 + sum_j exp(2 a_j) K_j.
+z is a sum of fields of several lengths, of vertical strips that are symmetric about the midline (muscles and the linea alba), of
+bone where ribs and iliac crests may lie, and of the lumps that were detected. The amplitudes of all parts but the lumps are found
+by type-II maximum likelihood with log-normal priors (Rasmussen and Williams 2006, ch. 5): K = K0 + sum_j exp(2 a_j) K_j.
 """
 
 from __future__ import annotations
