@@ -53,11 +53,12 @@ class Case:
 
 
 def phantom(seed: int) -> Phantom:
-    """Even seeds are healthy."""
+    """Even seeds are healthy; every second of the others has a lump just below the skin, which is felt more."""
     if seed % 2 == 0:
         return Phantom(kind="person")
     contrast = (0.2, 0.6) if seed % 10 == 9 else (1.5, 8.0)
-    draw = Draw(lumps=(1, 1), radius_m=(0.010, 0.035), depth_m=(0, 0.015), contrast=contrast, region_m=(0.17, 0.17))
+    depth = (0.0, 0.004) if seed % 4 == 1 else (0.0, 0.015)
+    draw = Draw(lumps=(1, 1), radius_m=(0.010, 0.035), depth_m=depth, contrast=contrast, region_m=(0.17, 0.17))
     return Phantom(kind="person", draw=draw)
 
 
@@ -123,9 +124,8 @@ def told(cases: list[Case], calibration: Calibration, false_findings: float = 0.
     for low, high in ((0.0, 0.1), (0.1, 0.3), (0.3, 0.7), (0.7, 0.9), (0.9, 1.01)):
         here = (probability >= low) & (probability < high)
         if here.any():
-            print(
-                f"probability {low} to {high}: {here.sum()} candidates, {probability[here].mean():.2f} told, {real[here].mean():.2f} true"
-            )
+            mean, part = probability[here].mean(), real[here].mean()
+            print(f"probability {low} to {high}: {here.sum()} candidates, {mean:.2f} told, {part:.2f} true")
     held = np.array([c.held for c in cases])
     print(f"band holds: mean {held.mean():.3f}, median {np.median(held):.3f}, tenth {np.quantile(held, 0.1):.3f}")
 

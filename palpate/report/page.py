@@ -146,9 +146,9 @@ def _unreached(report: Report) -> str:
 
 def _in_words(f: FindingRow) -> str:
     low, high = f.ratio_90
-    where = QUADRANTS.get(f.quadrant, f.quadrant)
+    where, kind = QUADRANTS.get(f.quadrant, f.quadrant), "stiff" if f.ratio > 1 else "soft"
     return (
-        f"A {'stiff' if f.ratio > 1 else 'soft'} area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
+        f"A {kind} area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
         f"(90 % band {low:.1f} to {high:.1f}), confidence {confidence(f.confidence)}."
     )
 

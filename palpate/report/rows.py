@@ -110,8 +110,8 @@ class Report(_Row):
     candidates: list[FindingRow] = []
     """Areas that were weighed and not reported, the most probable first."""
     unassessed_m2: dict[str, float] = {}
-    """Area that the arm scanned and of which nothing is said, by reason: `contradicted`, the samples disagree by more than stiffness
-    and the known errors explain; `yielded`, the force limit was met before the depth."""
+    """Area that the arm scanned and of which nothing is said, by reason: `contradicted`, the samples disagree by more than
+    stiffness and the known errors explain; `yielded`, the force limit was met before the depth."""
     truth: TruthRow | None
     scores: Scores | None
     """Null when the run ended before there was anything to score, or nothing is known of what could be felt."""

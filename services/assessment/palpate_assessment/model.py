@@ -43,8 +43,8 @@ BREATHING_S = 1.0
 LEAST_DEPTH_ERROR_M = 0.0001
 """Prior median of the depth's errors for strokes that claim to have none."""
 SURFACE_M, SURFACE_SHARE, COMMON_SHARE = 0.05, 0.5, 0.4
-"""Length of the error that strokes share smoothly, its part of the depth's uncertainty, and the part of the error which all share:
-a scan cannot tell either from stiffness."""
+"""Length of the error that strokes share smoothly, its part of the depth's uncertainty, and the part of the error that all
+share: a scan cannot tell either from stiffness."""
 UNLIKE = 0.1
 """How much a press may feel of a lump otherwise than a slide does, of its log-contrast."""
 TARE_N = 0.05

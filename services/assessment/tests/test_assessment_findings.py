@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
 
 from palpate_assessment.assess import Assessment, assess, growing
-from palpate_assessment.findings import Area
 from palpate_assessment.sampling import ForceSample
 from palpate_bus.messages import StiffnessMap
 
@@ -69,13 +69,18 @@ def test_errors_of_strokes_widen_the_band() -> None:
 
 
 def test_a_lower_rate_of_false_findings_reports_less() -> None:
-    samples = lines(lambda xy: LEVEL + natural(3, 0.1)(xy) + lump(xy, (0.0, 0.0), 0.02, 1.5), stroke_m=0.0007, breathing_m=0.0007)
-    strict, lax = (assess(samples, flat_grid(), REACH, rate) for rate in (1e-4, 0.5))
-    assert strict is not None
-    assert lax is not None
-    assert len(strict.findings) < len(lax.findings)
-    reported: list[list[Area]] = [result.findings + result.candidates for result in (strict, lax)]
-    assert len(reported[0]) == len(reported[1])
+    wall, found = natural(3, 0.1), {1e-4: 0, 0.5: 0}
+    for contrast in (1.2, 1.35, 1.5):
+        bump = partial(lump, centre=(0.0, 0.0), radius=0.02, contrast=contrast)
+        samples = lines(lambda xy, bump=bump: LEVEL + wall(xy) + bump(xy), stroke_m=0.0007, breathing_m=0.0007)
+        weighed = []
+        for rate in found:
+            result = assess(samples, flat_grid(), REACH, rate)
+            assert result is not None
+            found[rate] += len(result.findings)
+            weighed.append(len(result.findings) + len(result.candidates))
+        assert weighed[0] == weighed[1]
+    assert found[1e-4] < found[0.5]
 
 
 def test_a_stroke_piece_that_the_others_contradict_is_not_assessed() -> None:
