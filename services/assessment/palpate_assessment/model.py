@@ -36,7 +36,7 @@ ILIAC_M, ILIAC_WIDTH_M = (0.135, -0.12), 0.04
 """The iliac spines beside and below the umbilicus, and how far about them bone may be felt."""
 NATURAL_SD, BONE_SD = 0.08, 0.5
 """Prior medians of the amplitudes: of a factor of 0.2 over all lengths from 10 to 150 mm each field's share; of bone."""
-LEVEL_SD = 1.0
+LEVEL_SD = 3.0
 """Of the patient's own level about the median of his samples."""
 BREATHING_S = 1.0
 """How long what following leaves of breathing stays alike."""
@@ -113,15 +113,12 @@ def errors(o: Observations) -> list[Array]:
 
 
 def fixed(o: Observations, calibration: Calibration) -> Array:
-    """Covariance of what a scan cannot tell about itself: level, exponent, surface, sensor; shape (m, m).
-
-    The tare's amplitude is not sought: its lever 1 / F is made of the data and would explain them.
-    """
+    """Covariance of what a scan cannot tell about itself: level, exponent, surface, sensor; shape (m, m)."""
     lever = np.outer(o.per_metre, o.per_metre)
     surface = (SURFACE_SHARE * o.depth_uncertainty) ** 2 * lever * _smooth(o.xy, o.xy, SURFACE_M)
     covariance = LEVEL_SD**2 + calibration.exponent_sd**2 * np.outer(o.log_depth, o.log_depth) + surface
     covariance += TARE_N**2 * np.outer(o.per_newton, o.per_newton) * o.same_stroke
-    covariance[np.diag_indices(len(o.y))] += (o.noise * o.per_newton) ** 2
+    covariance[np.diag_indices(len(o.y))] += o.noise**2
     return np.asarray(covariance)
 
 

@@ -36,9 +36,10 @@ class Observations:
     per_metre: Array
     """d y / d depth = n / depth [1/m], by which an error of the depth counts."""
     per_newton: Array
-    """1 / F [1/N], by which an error of the force counts."""
+    """1 / F [1/N], by which an error of the force's zero counts: of the stroke's median force, since each sample's own force is what is
+    to be explained, and must not explain itself."""
     noise: Array
-    """Standard deviation of the force's white noise [N]."""
+    """Standard deviation of the force's white noise, over the force [1]."""
     depth_uncertainty: float
     """One sigma of the depth, the median of what the samples say [m]."""
     limited: NDArray[np.bool_]
@@ -63,16 +64,17 @@ def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observa
         return None
     position, velocity = np.array([s.position for s in good]), np.array([s.velocity for s in good])
     depth, force = np.array([s.depth for s in good]), np.array([s.force for s in good])
-    log_depth = np.log(depth / press.DEPTH_M)
+    log_depth, stroke = np.log(depth / press.DEPTH_M), np.array([s.stroke for s in good])
+    usual = {int(one): float(np.median(force[stroke == one])) for one in np.unique(stroke)}
     return Observations(
         xy=(position + calibration.lead_s * velocity)[:, :2],
         time=np.array([s.time for s in good]),
-        stroke=np.array([s.stroke for s in good]),
+        stroke=stroke,
         y=np.log(force) - calibration.exponent * log_depth - calibration.conversion,
         log_depth=log_depth,
         per_metre=calibration.exponent / depth,
-        per_newton=1.0 / force,
-        noise=np.array([s.force_noise for s in good]),
+        per_newton=np.array([1.0 / usual[int(one)] for one in stroke]),
+        noise=np.array([s.force_noise for s in good]) / force,
         depth_uncertainty=float(np.median([s.depth_uncertainty for s in good])),
         limited=np.array([s.force_limited for s in good]),
     )
