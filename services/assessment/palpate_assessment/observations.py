@@ -36,8 +36,8 @@ class Observations:
     per_metre: Array
     """d y / d depth = n / depth [1/m], by which an error of the depth counts."""
     per_newton: Array
-    """1 / F [1/N], by which an error of the force's zero counts: of the stroke's median force, since each sample's own force is what is
-    to be explained, and must not explain itself."""
+    """1 / F [1/N], by which an error of the force's zero counts: F is the stroke's median force, since a sample's own force
+    must not explain itself."""
     noise: Array
     """Standard deviation of the force's white noise, over the force [1]."""
     depth_uncertainty: float

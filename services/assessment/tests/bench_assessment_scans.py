@@ -156,7 +156,8 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
         for k in range(600):
             tissue.step(float(times[-1] + tissue.dt * k), p[-1] + n[-1] * 0.1, zero, robot.indenter_radius_m)
         states.append(_state(times[-1] + 0.05, p[-1], n[-1], -0.08, 0.0, False, X_WA, stroke))
-    states.append(_state(times[-1] + 1.0, p[-1], n[-1], -0.08, 0.0, False, X_WA, stroke, phase=ExamState.PHASE_ASSESS))
+    states.append(_state(times[-1] + 1.0, p[-1], n[-1], -0.08, 0.0, False, X_WA, stroke))
+    states[-1].phase = ExamState.PHASE_ASSESS
     return Scan(scenario, surface, states)
 
 
@@ -169,13 +170,12 @@ def _state(
     steady: bool,
     X_WA: Array,
     stroke: int,
-    phase: int = ExamState.PHASE_SCAN,
 ) -> Any:
     p_W = apply(X_WA, p[None])[0]
     n_W = X_WA[:3, :3] @ n
     return ExamState(
         header=header(round(t * 1e9), "world"),
-        phase=phase,
+        phase=ExamState.PHASE_SCAN,
         message="",
         target_index=0,
         target_count=0,
