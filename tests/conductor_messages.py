@@ -75,6 +75,7 @@ def stiffness_map() -> Any:
         force=(1.1 * apparent).astype(np.float32),
         stiffness=stiffness,
         scanned=(np.abs(vertices[:, :2]) <= 0.105).all(axis=1),
+        unassessed=np.where((np.abs(vertices[:, :2]) <= 0.105).all(axis=1), 0, 1).astype(np.uint8),
         finding=np.where(beyond < 0, 0, -1).astype(np.int32),
         common_depth=0.01,
         background=1.7,
@@ -84,7 +85,7 @@ def stiffness_map() -> Any:
 
 def findings(final: bool = True) -> Any:
     one = Finding(Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999)
-    return Findings(header(60_000_000_000, "abdomen"), [one], final)
+    return Findings(header(60_000_000_000, "abdomen"), [one], [], final)
 
 
 def samples() -> list[Any]:
@@ -99,6 +100,8 @@ def samples() -> list[Any]:
             tangential_speed=0.03,
             time_in_contact=0.1 * k,
             force_limited=False,
+            stroke=1,
+            depth_uncertainty=0.0005,
         )
         for k, (x, y) in enumerate(places)
     ]

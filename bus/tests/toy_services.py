@@ -175,7 +175,7 @@ class Assessment(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         if inbox.latest("exam/state") is None or t % (50 * MS):
             return {}
-        sample = PalpationSample(header(t), Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, False)
+        sample = PalpationSample(header(t), Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, False, 0, 0.0)
         return {"assessment/samples": [sample, sample]}
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import RobotStatus, SurfaceMotion
+from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_matrix, transform_matrix
 from palpate_bus.messages.stamps import nanoseconds
@@ -294,7 +294,7 @@ class DashboardService(Service):
 
     def _stiffness(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.vertices)
-        scanned = np.asarray(message.scanned, dtype=bool)
+        scanned = np.asarray(message.scanned, dtype=bool) & (np.asarray(message.unassessed) == StiffnessMap.ASSESSED)
         apparent = np.asarray(message.apparent, dtype=np.float64)
         if not scanned.any():
             return

@@ -200,6 +200,7 @@ def stiffness_map(t: int, share: float) -> Any:
         1e-5 * mean,
         mean,
         scanned,
+        np.where(scanned, 0, 1).astype(np.uint8),
         none,
         0.01,
         1.7,
@@ -209,7 +210,7 @@ def stiffness_map(t: int, share: float) -> Any:
 
 def findings(t: int) -> Any:
     item = Finding(Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99)
-    return Findings(header(t, "abdomen"), [item], True)
+    return Findings(header(t, "abdomen"), [item], [], True)
 
 
 def robot_status(t: int, torque: Array) -> Any:

@@ -25,7 +25,7 @@ class Threshold(Service):
                 self.places.append((state.surface_point.x, state.surface_point.y, state.surface_point.z))
                 self.forces.append(state.normal_force)
             if state.phase in (ExamState.PHASE_ASSESS, ExamState.PHASE_ABORTED):
-                return {"assessment/findings": Findings(header(t, "abdomen"), self.findings(), final=True)}
+                return {"assessment/findings": Findings(header(t, "abdomen"), self.findings(), [], final=True)}
         return {}
 
     def findings(self):

@@ -73,6 +73,8 @@ class Exam(Section):
     """Width (x) and height (y) of the examined region about `centre_m`."""
     centre_m: Vec2 = (0.0, 0.0)
     """Centre of the region in the abdomen frame."""
+    false_findings: Annotated[float, Field(ge=1e-4, le=0.5)] = 0.02
+    """The operating point: how probable a finding may be in a healthy examination. Less of it misses more."""
 
 
 class LbrConnection(Section):

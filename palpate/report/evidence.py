@@ -15,6 +15,7 @@ from palpate.truth.felt import Felt
 from palpate.truth.pressed import Pressed
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.touched import Touched
+from palpate_bus.messages import StiffnessMap
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.frames import Array, apply, inverse
@@ -81,15 +82,26 @@ def felt_truth(scenario: Scenario, body: TrueBody, pressed: Pressed, touched: To
 
 
 def map_of(message: Any) -> Map:
-    """`palpation_msgs/StiffnessMap`."""
+    """`palpation_msgs/StiffnessMap`: where it says that it does not know, nothing counts as scanned."""
     return Map(
         vertices=points(message),
         apparent=np.asarray(message.apparent, dtype=np.float64),
         lower=np.asarray(message.lower, dtype=np.float64),
         upper=np.asarray(message.upper, dtype=np.float64),
-        scanned=np.asarray(message.scanned, dtype=bool),
+        scanned=np.asarray(message.scanned, dtype=bool) & (np.asarray(message.unassessed) == StiffnessMap.ASSESSED),
         finding=np.asarray(message.finding, dtype=np.int32),
     )
+
+
+def unassessed_of(message: Any) -> dict[str, float]:
+    """Area of the map of which nothing is said although the arm was there, by reason [m^2]; only reasons that there are."""
+    p, triangles = points(message), np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
+    a, b, c = (p[triangles[:, k]] for k in range(3))
+    third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    area = np.bincount(triangles.ravel(), np.repeat(third, 3), minlength=len(p))
+    codes = np.asarray(message.unassessed)
+    reasons = {"contradicted": StiffnessMap.CONTRADICTED, "yielded": StiffnessMap.YIELDED}
+    return {reason: float(area[codes == code].sum()) for reason, code in reasons.items() if (codes == code).any()}
 
 
 def found_of(findings: Any | None) -> list[Found]:

@@ -111,6 +111,12 @@ def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
     return felt_truth(scenario, body_of(evidence.phantom), evidence.pressed, evidence.touched)
 
 
+REASONS = {
+    "contradicted": "where the samples disagree by more than stiffness and the known errors explain",
+    "yielded": "where the force limit was met before the depth, as over bone",
+}
+
+
 def confidence(value: float) -> str:
     """A probability in words: no finding is certain."""
     return "over 99 %" if value > 0.99 else f"{_PERCENT * value:.0f} %"
@@ -123,8 +129,14 @@ def verdict(report: Report) -> str:
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
     if not report.findings:
-        return f"No area was found that is stiffer than healthy variation explains{_unreached(report)}."
-    return " ".join(_in_words(finding) for finding in report.findings)
+        return f"{_unassessed(report)}No lump was found{_unreached(report)}."
+    return _unassessed(report) + " ".join(_in_words(finding) for finding in report.findings)
+
+
+def _unassessed(report: Report) -> str:
+    """What is not known, which comes first."""
+    parts = report.unassessed_m2.items()
+    return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in parts)
 
 
 def _unreached(report: Report) -> str:
@@ -134,9 +146,9 @@ def _unreached(report: Report) -> str:
 
 def _in_words(f: FindingRow) -> str:
     low, high = f.ratio_90
-    where = QUADRANTS.get(f.quadrant, f.quadrant)
+    where, kind = QUADRANTS.get(f.quadrant, f.quadrant), "stiff" if f.ratio > 1 else "soft"
     return (
-        f"A stiff area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
+        f"A {kind} area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
         f"(90 % band {low:.1f} to {high:.1f}), confidence {confidence(f.confidence)}."
     )
 

@@ -23,6 +23,7 @@ from palpate.report.evidence import (
     points,
     samples_of,
     steady_contact,
+    unassessed_of,
 )
 from palpate.report.figures import draw_map
 from palpate.report.files import write_text
@@ -101,6 +102,8 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         surface_rms_error_m=_surface(scenario, c.surface, known.body),
         assessed=final is not None and found is not None,
         findings=[_finding(f) for f in ([] if final is None else final.findings)],
+        candidates=[_finding(f) for f in ([] if final is None else final.candidates)],
+        unassessed_m2={} if c.stiffness_map is None else unassessed_of(c.stiffness_map),
         truth=None if known.body is None else _truth(known.felt),
         scores=scores,
         blame=result.blame,

@@ -16,7 +16,7 @@ class _Row(BaseModel):
 
 
 class FindingRow(_Row):
-    """One stiff area that the examination found."""
+    """One area that the examination found, or weighed."""
 
     centroid_m: Point
     """In the abdomen frame [m]: x to the patient's left, y to the head, z outward, from the umbilicus."""
@@ -28,7 +28,7 @@ class FindingRow(_Row):
     ratio_90: tuple[float, float]
     """Its 90 % band."""
     confidence: float
-    """Probability that the area is stiffer than healthy variation explains."""
+    """Probability that a lump of felt contrast 1.3 or more is there."""
 
 
 class LumpRow(_Row):
@@ -107,6 +107,11 @@ class Report(_Row):
     assessed: bool
     """Whether there are findings that are final, though it be none."""
     findings: list[FindingRow]
+    candidates: list[FindingRow] = []
+    """Areas that were weighed and not reported, the most probable first."""
+    unassessed_m2: dict[str, float] = {}
+    """Area that the arm scanned and of which nothing is said, by reason: `contradicted`, the samples disagree by more than
+    stiffness and the known errors explain; `yielded`, the force limit was met before the depth."""
     truth: TruthRow | None
     scores: Scores | None
     """Null when the run ended before there was anything to score, or nothing is known of what could be felt."""

@@ -88,7 +88,7 @@ def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> No
     whole = assemble(scenario, result(collected(), failure=None), nothing).model_copy(
         update={"findings": [], "skipped_targets": 0}
     )
-    assert verdict(whole) == "No area was found that is stiffer than healthy variation explains."
+    assert verdict(whole) == "No lump was found."
     blind = verdict(whole.model_copy(update={"skipped_targets": 3}))
     assert blind.endswith("; 3 targets were skipped, and nothing is known of what lies there.")
     none = assemble(scenario, result(collected(map_too=False), failure=None), nothing)

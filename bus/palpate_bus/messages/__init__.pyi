@@ -178,6 +178,7 @@ class Findings:
     __msgtype__: ClassVar[str]
     header: Header
     findings: list[Finding]
+    candidates: list[Finding]
     final: bool
 
 @dataclass
@@ -239,6 +240,8 @@ class PalpationSample:
     tangential_speed: float
     time_in_contact: float
     force_limited: bool
+    stroke: int
+    depth_uncertainty: float
 
 @dataclass
 class PalpationTargets:
@@ -348,6 +351,10 @@ class SkinTouch:
 @dataclass
 class StiffnessMap:
     __msgtype__: ClassVar[str]
+    ASSESSED: ClassVar[int]
+    NOT_REACHED: ClassVar[int]
+    CONTRADICTED: ClassVar[int]
+    YIELDED: ClassVar[int]
     header: Header
     vertices: NDArray[np.float32]
     triangles: NDArray[np.uint32]
@@ -357,6 +364,7 @@ class StiffnessMap:
     force: NDArray[np.float32]
     stiffness: NDArray[np.float32]
     scanned: NDArray[np.bool]
+    unassessed: NDArray[np.uint8]
     finding: NDArray[np.int32]
     common_depth: float
     background: float

@@ -12,7 +12,7 @@ from scipy.interpolate import LinearNDInterpolator
 from palpate_models.frames import Array
 
 _DEGREE = 4
-"""Degree of the polynomial that stands for the abdomen's shape: its curvature is that of the trunk, not of the noise."""
+"""Degree of the polynomial that stands for the abdomen's shape: slopes are those of the trunk, not of the noise."""
 _POWER_X, _POWER_Y = np.array([(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]).T
 """Exponents of its terms."""
 
@@ -29,8 +29,6 @@ class MapGrid:
     """Height of the perceived surface [m], shape (ny, nx)."""
     area: Array
     """Area of the surface that belongs to each node [m^2], shape (ny * nx,)."""
-    shape: Array
-    """Coefficients of the smooth shape's polynomial in (x, y) / 0.1 m."""
 
     @property
     def pitch(self) -> float:
@@ -51,21 +49,6 @@ class MapGrid:
         lower = np.column_stack((corner, corner + 1, corner + nx + 1))
         upper = np.column_stack((corner, corner + nx + 1, corner + nx))
         return np.concatenate((lower, upper)).astype(np.uint32)
-
-    def curvature(self, p: Array) -> Array:
-        """Mean curvature [1/m], convex positive, of the smooth shape at points [m], shape (n, 3)."""
-        step = 1e-3
-        x, y = p[:, 0], p[:, 1]
-
-        def z(dx: float, dy: float) -> Array:
-            return _terms(x + dx, y + dy) @ self.shape
-
-        middle, left, right, below, above = z(0, 0), z(-step, 0), z(step, 0), z(0, -step), z(0, step)
-        zx, zy = (right - left) / (2 * step), (above - below) / (2 * step)
-        zxx, zyy = (right - 2 * middle + left) / step**2, (above - 2 * middle + below) / step**2
-        zxy = (z(step, step) - z(step, -step) - z(-step, step) + z(-step, -step)) / (4 * step**2)
-        top = (1 + zy**2) * zxx - 2 * zx * zy * zxy + (1 + zx**2) * zyy
-        return np.asarray(-top / (2 * (1 + zx**2 + zy**2) ** 1.5))
 
 
 def _terms(x: Array, y: Array) -> Array:
@@ -93,4 +76,4 @@ def map_grid(surface: Array, centre: tuple[float, float], size: tuple[float, flo
     z = smooth + LinearNDInterpolator(near[:, :2], rest, fill_value=0.0)(xx, yy)
     zy, zx = np.gradient(smooth, pitch)
     area = pitch**2 * np.sqrt(1 + zx**2 + zy**2)
-    return MapGrid(x, y, z, area.ravel(), np.asarray(shape, dtype=np.float64))
+    return MapGrid(x, y, z, area.ravel())

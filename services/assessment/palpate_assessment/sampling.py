@@ -7,12 +7,10 @@ from math import sqrt
 
 import numpy as np
 
-from palpate_assessment.contact import ReferenceContact
-from palpate_assessment.memory import PathMemory
 from palpate_models.frames import Array
 
 TRAVEL = 0.005
-"""Travel that one sample averages [m]: a third of the footprint's radius, so it blurs nothing."""
+"""Travel that one sample averages [m]: a third of the radius in which the indenter feels, so it blurs little."""
 LONGEST = 0.4
 """Time that one sample averages at most [s], for an indenter that stands still."""
 _FEWEST = 3
@@ -37,6 +35,10 @@ class State:
     counts: bool
     """Whether it belongs into a sample: in contact, at depth, outside transitions."""
     force_limited: bool = False
+    stroke: int = 0
+    """Number of the latest descent."""
+    depth_uncertainty: float = 0.0
+    """One sigma of the depth [m]."""
 
 
 @dataclass(frozen=True)
@@ -53,27 +55,25 @@ class ForceSample:
     """Tangential velocity of the indenter [m/s], shape (3,)."""
     depth: float
     """[m]"""
-    depth_rate: float
-    """[m/s]"""
     force: float
     """[N]"""
     force_noise: float
     """Standard error of the mean force [N]."""
-    lost: float
-    """Force over k_w that the wall's memory takes away [m^3]."""
     time_in_contact: float
     """Since the onset of contact of this stroke [s]."""
     force_limited: bool
+    stroke: int = 0
+    """Number of the descent: samples of one stroke share the zero of depth and of force."""
+    depth_uncertainty: float = 0.0
+    """One sigma of the depth [m]."""
 
 
 class Sampler:
     """Thins states to samples. Feed every state in order; a sample comes out now and then."""
 
-    def __init__(self, contact: ReferenceContact, travel: float = TRAVEL) -> None:
-        self._memory = PathMemory(contact)
+    def __init__(self, travel: float = TRAVEL) -> None:
         self._travel = travel
         self._block: list[State] = []
-        self._last: State | None = None
         self._onset: float | None = None
 
     def add(self, state: State) -> ForceSample | None:
@@ -82,11 +82,8 @@ class Sampler:
         if state.in_contact:
             if self._onset is None:
                 self._onset = state.time
-            if self._last is not None:
-                self._memory.add(state.time, state.time - self._last.time, state.position, state.depth)
         else:
             self._onset = None
-        self._last = state
         if state.in_contact and state.counts:
             self._block.append(state)
             first = self._block[0]
@@ -118,10 +115,10 @@ class Sampler:
             normal=normal,
             velocity=velocity - normal * float(normal @ velocity),
             depth=float(depth.mean()),
-            depth_rate=float(slope @ depth),
             force=float(force.mean()),
             force_noise=float(np.sqrt(rest @ rest / max(len(block) - 2, 1) / len(block))),
-            lost=self._memory.lost(float(time.mean()), middle),
             time_in_contact=float(time.mean()) - (self._onset if self._onset is not None else float(time[0])),
             force_limited=any(s.force_limited for s in block),
+            stroke=block[0].stroke,
+            depth_uncertainty=max(s.depth_uncertainty for s in block),
         )

@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from palpate_assessment.assess import Assessment, assess
-from palpate_assessment.contact import ReferenceContact
-from palpate_assessment.findings import StiffArea
+from palpate_assessment.assess import Assessment, assess, growing
+from palpate_assessment.calibration import learned
+from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import ForceSample, Sampler, State
 from palpate_bus.contract import contract
@@ -17,6 +17,7 @@ from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, 
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models import press
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.phantom import quadrant
@@ -24,9 +25,9 @@ from palpate_models.scenario import ExamInput, Scenario
 
 FRAME = contract().topics["assessment/map"].frame or ""
 PITCH = 0.005
-"""Pitch of the final map's grid [m]: a third of the footprint's radius."""
+"""Pitch of the final map's grid [m]: a third of the radius in which the indenter feels."""
 MARGIN = 0.020
-"""The map's grid goes this far beyond the examined region [m]: what the footprint reaches."""
+"""The map's grid goes this far beyond the examined region [m]: so far a place is felt."""
 GROWING_PITCH = 0.008
 GROWING_SAMPLES = 200
 """A growing map takes every n-th sample, so that it stays cheap."""
@@ -46,9 +47,8 @@ class AssessmentService(Service):
         self._exam = exam.exam
         self._X_AW = inverse(np.array(exam.X_WA))
         self._R_AW, self._p_AW = self._X_AW[:3, :3], self._X_AW[:3, 3]
-        self._contact = ReferenceContact(exam.robot.indenter_radius_m, exam.exam.depth_m)
         self._reach = float(np.clip(0.8 * exam.exam.spacing_m, 0.006, 0.020))
-        self._sampler = Sampler(self._contact)
+        self._sampler = Sampler()
         self._samples: list[ForceSample] = []
         self._surface: Array | None = None
         self._coarse: MapGrid | None = None
@@ -111,6 +111,8 @@ class AssessmentService(Service):
             in_contact=bool(message.in_contact),
             counts=bool(message.steady),
             force_limited=bool(message.force_limited),
+            stroke=int(message.stroke),
+            depth_uncertainty=float(message.depth_uncertainty),
         )
 
     def _due(self, t: int) -> bool:
@@ -122,17 +124,17 @@ class AssessmentService(Service):
         self._last_map, self._mapped = t, len(self._samples)
         every = -(-len(self._samples) // GROWING_SAMPLES)
         chosen = self._samples[::every]
-        result = assess(chosen, self._coarse, self._contact, self._reach, refine=False)
-        return {} if result is None else {"assessment/map": map_message(t, result, self._contact.common_depth)}
+        result = growing(chosen, self._coarse, self._reach)
+        return {} if result is None else {"assessment/map": map_message(t, result, self._exam.depth_m)}
 
     def _finish(self, t: int) -> Outbox:
         if self._surface is not None:
-            self._final = assess(self._samples, self._grid(PITCH), self._contact, self._reach)
+            self._final = assess(self._samples, self._grid(PITCH), self._reach, self._exam.false_findings)
         if self._final is None:
-            return {"assessment/findings": findings_message(t, [])}
+            return {"assessment/findings": findings_message(t, [], [])}
         return {
-            "assessment/map": map_message(t, self._final, self._contact.common_depth),
-            "assessment/findings": findings_message(t, self._final.findings),
+            "assessment/map": map_message(t, self._final, self._exam.depth_m),
+            "assessment/findings": findings_message(t, self._final.findings, self._final.candidates),
         }
 
 
@@ -152,11 +154,15 @@ def sample_message(sample: ForceSample) -> Message:
         tangential_speed=float(np.linalg.norm(sample.velocity)),
         time_in_contact=sample.time_in_contact,
         force_limited=sample.force_limited,
+        stroke=sample.stroke,
+        depth_uncertainty=sample.depth_uncertainty,
     )
 
 
 def map_message(t: int, result: Assessment, common_depth: float) -> Message:
-    """`palpation_msgs/StiffnessMap`."""
+    """`palpation_msgs/StiffnessMap`: its force is what sliding at `common_depth` [m] would feel."""
+    calibration = learned()
+    sliding = float(np.exp(calibration.conversion) * (common_depth / press.DEPTH_M) ** calibration.exponent)
     finding = np.full(len(result.apparent), -1, dtype=np.int32)
     for i, area in enumerate(result.findings):
         finding[area.nodes] = i
@@ -167,9 +173,10 @@ def map_message(t: int, result: Assessment, common_depth: float) -> Message:
         apparent=result.apparent.astype(np.float32),
         lower=result.lower.astype(np.float32),
         upper=result.upper.astype(np.float32),
-        force=result.force.astype(np.float32),
-        stiffness=result.stiffness.astype(np.float32),
-        scanned=result.scanned,
+        force=(result.apparent * sliding).astype(np.float32),
+        stiffness=np.empty(0, dtype=np.float32),
+        scanned=result.unassessed != StiffnessMap.NOT_REACHED,
+        unassessed=result.unassessed,
         finding=finding,
         common_depth=common_depth,
         background=result.background,
@@ -177,12 +184,13 @@ def map_message(t: int, result: Assessment, common_depth: float) -> Message:
     )
 
 
-def findings_message(t: int, findings: Sequence[StiffArea]) -> Message:
-    """`palpation_msgs/Findings`, the final ones."""
-    return Findings(header=header(t, FRAME), findings=[finding_message(f) for f in findings], final=True)
+def findings_message(t: int, findings: Sequence[Area], candidates: Sequence[Area]) -> Message:
+    """`palpation_msgs/Findings`, the final ones, and the areas that were weighed and not reported."""
+    told, weighed = ([finding_message(area) for area in some] for some in (findings, candidates))
+    return Findings(header=header(t, FRAME), findings=told, candidates=weighed, final=True)
 
 
-def finding_message(area: StiffArea) -> Message:
+def finding_message(area: Area) -> Message:
     """`palpation_msgs/Finding`."""
     x, y, z = map(float, area.centroid)
     return Finding(

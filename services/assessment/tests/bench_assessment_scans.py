@@ -136,7 +136,7 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
         if exam.mode is Mode.POINT
         else snake(extent, exam.spacing_m, exam.speed_mps, tissue.dt)
     )
-    for times, path in strokes:
+    for stroke, (times, path) in enumerate(strokes, 1):
         p, n = shape(path)
         off = wrong(p)
         drift = gaussian_filter1d(rng.standard_normal(len(times)), CONTROL_S / np.sqrt(2) / tissue.dt)
@@ -152,22 +152,30 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
         for k in range(9, len(times), 10):
             F = float(force[k - 9 : k + 1].mean()) + errors * FORCE_SD * float(rng.standard_normal())
             steady = bool(times[k] - times[0] > 0.4)
-            states.append(_state(times[k], p[k], n[k], float(measured[k]), F, steady, X_WA))
+            states.append(_state(times[k], p[k], n[k], float(measured[k]), F, steady, X_WA, stroke))
         for k in range(600):
             tissue.step(float(times[-1] + tissue.dt * k), p[-1] + n[-1] * 0.1, zero, robot.indenter_radius_m)
-        states.append(_state(times[-1] + 0.05, p[-1], n[-1], -0.08, 0.0, False, X_WA))
-    states.append(_state(times[-1] + 1.0, p[-1], n[-1], -0.08, 0.0, False, X_WA, phase=ExamState.PHASE_ASSESS))
+        states.append(_state(times[-1] + 0.05, p[-1], n[-1], -0.08, 0.0, False, X_WA, stroke))
+    states.append(_state(times[-1] + 1.0, p[-1], n[-1], -0.08, 0.0, False, X_WA, stroke))
+    states[-1].phase = ExamState.PHASE_ASSESS
     return Scan(scenario, surface, states)
 
 
 def _state(
-    t: float, p: Array, n: Array, depth: float, force: float, steady: bool, X_WA: Array, phase: int = ExamState.PHASE_SCAN
+    t: float,
+    p: Array,
+    n: Array,
+    depth: float,
+    force: float,
+    steady: bool,
+    X_WA: Array,
+    stroke: int,
 ) -> Any:
     p_W = apply(X_WA, p[None])[0]
     n_W = X_WA[:3, :3] @ n
     return ExamState(
         header=header(round(t * 1e9), "world"),
-        phase=phase,
+        phase=ExamState.PHASE_SCAN,
         message="",
         target_index=0,
         target_count=0,
@@ -182,9 +190,9 @@ def _state(
         surface_point=Point(*map(float, p_W)),
         surface_normal=Vector3(*map(float, n_W)),
         end_tick=-1,
-        depth_uncertainty=0.0005,
+        depth_uncertainty=SURFACE_SD,
         wall_displacement=0.0,
-        stroke=1,
+        stroke=stroke,
         patient_moved=False,
     )
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_assessment.contact import ReferenceContact
 from palpate_assessment.grid import map_grid
 from palpate_assessment.sampling import LONGEST, TRAVEL, ForceSample, Sampler, State
 
-CONTACT = ReferenceContact(0.015, 0.010)
 UP = np.array((0.0, 0.0, 1.0))
 
 
@@ -18,7 +16,7 @@ def state(k: int, x: float = 0.0, depth: float = 0.01, force: float = 2.0, count
 
 
 def run(states: list[State]) -> list[ForceSample]:
-    sampler = Sampler(CONTACT)
+    sampler = Sampler()
     return [s for s in map(sampler.add, states) if s is not None]
 
 
@@ -67,12 +65,6 @@ def test_averages_force_depth_and_their_noise() -> None:
     assert np.median([s.force_noise for s in samples]) == pytest.approx(per_sample, rel=0.25)
 
 
-def test_lying_still_the_wall_relaxes_and_sliding_it_hardly_does() -> None:
-    held = run([state(k) for k in range(300)])
-    slid = run([state(k, x=0.0003 * k) for k in range(300)])
-    assert held[-1].lost > 2 * slid[-1].lost > 0
-
-
 def test_the_grid_follows_the_surface() -> None:
     rng = np.random.Generator(np.random.PCG64(1))
     xy = rng.uniform(-0.14, 0.14, (4000, 2))
@@ -80,7 +72,6 @@ def test_the_grid_follows_the_surface() -> None:
     grid = map_grid(np.column_stack((xy, z)), (0.0, 0.0), (0.2, 0.2), 0.02, 0.005)
     nodes = grid.nodes
     assert nodes[:, 2] == pytest.approx(-1.5 * nodes[:, 0] ** 2 - 1.0 * nodes[:, 1] ** 2, abs=2e-4)
-    assert grid.curvature(np.zeros((1, 3)))[0] == pytest.approx(2.5, rel=0.02)
     slope = np.hypot(3.0 * nodes[:, 0], 2.0 * nodes[:, 1])
     assert grid.area == pytest.approx(grid.pitch**2 * np.sqrt(1 + slope**2), rel=0.02)
     a, b, c = (nodes[grid.triangles[:, k]] for k in range(3))

@@ -95,7 +95,7 @@ class BusWorld(World):
             lines = np.asarray(mesh.lines, dtype=np.uint32)
             inbox.put("perception/targets", PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, ""))
         if self.exam.status.phase is Phase.ASSESS:
-            inbox.put("assessment/findings", Findings(header(t, "abdomen"), [], True))
+            inbox.put("assessment/findings", Findings(header(t, "abdomen"), [], [], True))
         out = sent(self.service.step(t, inbox))
         self.states.append(out["exam/state"])
         self.events += [name for name in out if not OUTPUTS[name].periodic]

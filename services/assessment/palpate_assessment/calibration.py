@@ -1,0 +1,48 @@
+"""What was learned from tuning patients: `calibration.yaml`, made by `python -m palpate_validation.assessment_calibration`."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict
+
+from palpate_models.frames import Array
+
+
+class Calibration(BaseModel):
+    """Constants of the regression, and of a candidate's probability."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    exponent: float
+    """n of F ~ depth^n about the examination's depth ..."""
+    exponent_sd: float
+    """... and how it differs between people."""
+    conversion: float
+    """log of the force while sliding at the press's depth over the press's own force ..."""
+    conversion_sd: float
+    """... how it differs between people, tiers and in what all depths have in common."""
+    lead_s: float
+    """A sliding indenter feels this much of its travel ahead [s]."""
+    probability: tuple[float, ...]
+    """Weights of a candidate's features (`detection.FEATURES`) in the logit of its probability, the constant first."""
+    tail: tuple[float, float]
+    """Location and scale of a healthy examination's greatest logit: P(greatest > s) = exp(-(s - location) / scale)."""
+
+    def logit(self, features: Array) -> Array:
+        """Logits of the probability of candidates with `features`, shape (k, f) -> (k,)."""
+        return np.asarray(self.probability[0] + features @ np.array(self.probability[1:]))
+
+    def threshold(self, false_findings: float) -> float:
+        """The logit that a healthy examination exceeds with the probability `false_findings`."""
+        location, scale = self.tail
+        return float(location - scale * np.log(false_findings))
+
+
+@cache
+def learned() -> Calibration:
+    """The calibration of this version."""
+    return Calibration.model_validate(yaml.safe_load(files(__package__).joinpath("calibration.yaml").read_text("utf-8")))

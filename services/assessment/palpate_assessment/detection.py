@@ -1,0 +1,123 @@
+"""Lumps by matched filter: how much of a bump's shape the samples hold that natural variation and errors do not explain.
+
+With the covariance S of everything but the bump, its log-contrast by generalised least squares, and in units of its error, is
+
+    e = b' S^-1 y / b' S^-1 b,      t = b' S^-1 y / sqrt(b' S^-1 b)
+
+which is the best linear test for a known shape (Kay 1998, "Detection theory", ch. 4). Bumps are sought one after the other: the
+strongest becomes part of the model, whose amplitudes are found anew, so that a lump is not taken for a rough background, and a
+rough background not for a lump.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import Bounds, minimize
+from scipy.spatial import cKDTree
+
+from palpate_assessment.calibration import Calibration
+from palpate_assessment.model import Bump, Regression, amplitudes
+from palpate_assessment.observations import Observations
+from palpate_models.frames import Array
+
+RADII_M = (0.008, 0.012, 0.018, 0.026, 0.036)
+PITCH_M = 0.01
+"""Radii and distance of the bumps that are tried, before place and radius are found to the tenth of a millimetre."""
+MOST = 4
+"""So many lumps are sought."""
+WEAKEST = 3.0
+"""Weakest t with which one is weighed."""
+_TOO_NEAR = 0.7
+"""Two lumps are at least this part of the sum of their radii apart."""
+_BORDER_M = 0.010
+"""Centres lie at most so far beyond the samples."""
+
+FEATURES = ("strength", "log-contrast", "log-radius", "softer")
+"""What a candidate's probability depends on."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A lump that is weighed."""
+
+    bump: Bump
+    log_contrast: float
+    """E, by generalised least squares; negative where it is softer than its surroundings."""
+    t: float
+    """E over its standard deviation."""
+
+    @property
+    def features(self) -> Array:
+        """The FEATURES, shape (f,)."""
+        size = np.log(self.bump.radius / RADII_M[2])
+        return np.array((abs(self.t), min(abs(self.log_contrast), 1.0), size, float(self.log_contrast < 0)))
+
+
+def matched(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array]:
+    """Log-contrast e and strength t of bumps under a regression that does not have them, shape (k,) each."""
+    seen = regression.whiten(np.array([bump(regression.observations.xy) for bump in bumps]).T)
+    power = np.maximum((seen**2).sum(axis=0), 1e-9)
+    return regression.whitened @ seen / power, regression.whitened @ seen / np.sqrt(power)
+
+
+def detect(o: Observations, calibration: Calibration) -> tuple[Regression, list[Candidate]]:
+    """The regression with the lumps that stand out, and these, each weighed beside the others."""
+    lumps: tuple[Bump, ...] = ()
+    regression = Regression(o, calibration, lumps, amplitudes(o, calibration, lumps))
+    for _ in range(MOST):
+        bump, strength = strongest(regression)
+        if bump is None or strength < WEAKEST:
+            break
+        lumps = (*lumps, bump)
+        found = amplitudes(o, calibration, lumps, regression.log_amplitudes)
+        regression = Regression(o, calibration, lumps, found)
+    return regression, [weigh(regression, lump) for lump in lumps]
+
+
+def weigh(regression: Regression, lump: Bump) -> Candidate:
+    """A lump of a regression, tested under the regression without it."""
+    others = tuple(other for other in regression.lumps if other is not lump)
+    without = replace(regression, lumps=others)
+    (log_contrast,), (t,) = matched(without, [lump])
+    return Candidate(lump, float(log_contrast), float(t))
+
+
+def strongest(regression: Regression) -> tuple[Bump | None, float]:
+    """The bump that stands out most from what the regression explains, and how much (|t|)."""
+    xy = regression.observations.xy
+    low, high = xy.min(axis=0) - _BORDER_M, xy.max(axis=0) + _BORDER_M
+    x, y = (np.arange(a, b + 1e-9, PITCH_M) for a, b in zip(low, high, strict=True))
+    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    near = cKDTree(xy).query(centres)[0] <= _BORDER_M
+    bumps = [Bump(float(px), float(py), radius) for px, py in centres[near] for radius in RADII_M]
+    bumps = [bump for bump in bumps if _free(bump, regression.lumps)]
+    if not bumps:
+        return None, 0.0
+    _, t = matched(regression, bumps)
+    first = bumps[int(np.argmax(np.abs(t)))]
+
+    def loss(p: Array) -> float:
+        _, strength = matched(regression, [Bump(p[0], p[1], float(np.exp(p[2])))])
+        return -abs(float(strength[0]))
+
+    start = np.array((first.x, first.y, np.log(first.radius)))
+    simplex = start + np.vstack((np.zeros(3), np.diag((0.004, 0.004, 0.25))))
+    edge = Bounds((*low, np.log(RADII_M[0])), (*high, np.log(RADII_M[-1] * 1.3)))
+    best = minimize(
+        loss,
+        start,
+        method="Nelder-Mead",
+        bounds=edge,
+        options={"initial_simplex": simplex, "maxfev": 40, "xatol": 1e-4, "fatol": 1e-2},
+    )
+    bump = Bump(float(best.x[0]), float(best.x[1]), float(np.exp(best.x[2])))
+    return bump, -float(best.fun)
+
+
+def _free(bump: Bump, lumps: Sequence[Bump]) -> bool:
+    """Whether a bump lies beside those found before."""
+    apart = [np.hypot(bump.x - one.x, bump.y - one.y) / (bump.radius + one.radius) for one in lumps]
+    return all(a >= _TOO_NEAR for a in apart)

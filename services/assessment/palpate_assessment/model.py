@@ -1,0 +1,222 @@
+"""The regression: log-force as a field over the belly, and errors in depth, time and force, all Gaussian.
+
+    y = z(x) + (n - n0) log(d / D) + (n / d) (stroke zero + breathing left over + surface error(x)) + tare / F + noise
+
+z is a sum of fields of several lengths, of vertical strips that are symmetric about the midline (muscles and the linea alba), of
+bone where ribs and iliac crests may lie, and of the lumps that were detected. The amplitudes of all parts but the lumps are found
+by type-II maximum likelihood with log-normal priors (Rasmussen and Williams 2006, ch. 5): K = K0 + sum_j exp(2 a_j) K_j.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+from scipy.special import erfc, expit
+
+from palpate_assessment.calibration import Calibration
+from palpate_assessment.observations import Observations
+from palpate_models.frames import Array
+
+LENGTHS_M = (0.012, 0.022, 0.045, 0.09, 0.18)
+"""Lengths of the fields that natural variation is made of."""
+STRIP_M = (0.018, 0.08)
+"""Lengths of the strips, across and along the body."""
+BONE_M = 0.022
+"""Length over which bone changes what is felt."""
+ARCH_M, ARCH_SLOPE, ARCH_WIDTH_M = 0.18, 0.7, 0.025
+"""The costal arch above the umbilicus on the midline, its descent a metre off it, and how unsure both are."""
+ILIAC_M, ILIAC_WIDTH_M = (0.135, -0.12), 0.04
+"""The iliac spines beside and below the umbilicus, and how far about them bone may be felt."""
+NATURAL_SD, BONE_SD = 0.08, 0.5
+"""Prior medians of the amplitudes: of a factor of 0.2 over all lengths from 10 to 150 mm each field's share; of bone."""
+LEVEL_SD = 3.0
+"""Of the patient's own level about the median of his samples."""
+BREATHING_S = 1.0
+"""How long what following leaves of breathing stays alike."""
+LEAST_DEPTH_ERROR_M = 0.0001
+"""Prior median of the depth's errors for strokes that claim to have none."""
+SURFACE_M, SURFACE_SHARE, COMMON_SHARE = 0.05, 0.5, 0.4
+"""Length of the error that strokes share smoothly, its part of the depth's uncertainty, and the part of the error that all
+share: a scan cannot tell either from stiffness."""
+UNLIKE = 0.1
+"""How much a press may feel of a lump otherwise than a slide does, of its log-contrast."""
+TARE_N = 0.05
+"""Zero of a stroke's force."""
+WHITE_SD = 0.01
+"""Prior median of what a sample gets wrong by itself, over the force."""
+_SURE, _UNSURE = 0.7, 1.2
+"""Standard deviations of the logarithms of amplitudes about their medians: of stiffness, of errors."""
+_FITTED, _FIRST_STEPS, _STEPS = 250, 20, 6
+"""So many samples are enough for the amplitudes, and so many steps from their medians, and from those before."""
+EDGE_M = 0.007
+"""Standard deviation of the edge with which a lump is felt: the indenter's footprint."""
+LUMP_SD, LUMP_FREE_SD, LUMP_FREE_M = 1.0, 0.25, 0.012
+"""Prior of a lump's log-contrast; and how it may differ from the ideal shape, and over which length."""
+
+
+@dataclass(frozen=True)
+class Bump:
+    """The shape in which a round lump is felt: 1 inside, 0 outside, with a soft edge."""
+
+    x: float
+    y: float
+    """Centre [m]."""
+    radius: float
+    """[m]"""
+
+    def __call__(self, xy: Array, beyond: float = 0.0) -> Array:
+        """The shape at places [m], shape (k, 2) -> (k,), its radius greater by `beyond`."""
+        r = np.hypot(xy[:, 0] - self.x, xy[:, 1] - self.y)
+        return np.asarray(0.5 * erfc((r - self.radius - beyond) / (np.sqrt(2) * EDGE_M)))
+
+    def covariance(self, a: Array, b: Array) -> Array:
+        """Prior covariance of the lump's log-contrast between places a (k, 2) and b (l, 2), shape (k, l)."""
+        near = 2 * EDGE_M
+        free = LUMP_FREE_SD**2 * np.outer(self(a, near), self(b, near)) * _smooth(a, b, LUMP_FREE_M)
+        return np.asarray(LUMP_SD**2 * np.outer(self(a), self(b)) + free)
+
+
+def _smooth(a: Array, b: Array, length: float | Array) -> Array:
+    """Squared-exponential covariance, shape (k, l)."""
+    return np.asarray(np.exp(-0.5 * cdist(a / length, b / length, "sqeuclidean")))
+
+
+def natural(a: Array, b: Array) -> list[Array]:
+    """Unit covariances of the fields of natural variation between places a (k, 2) and b (l, 2), each of shape (k, l)."""
+    fold = np.array((1.0, 0.0))
+    folded_a, folded_b = (np.where(fold > 0, np.abs(p), p) for p in (a, b))
+    strips = _smooth(folded_a, folded_b, np.array(STRIP_M))
+    over_bone = np.outer(bone(a), bone(b)) * _smooth(a, b, BONE_M)
+    return [*(_smooth(a, b, length) for length in LENGTHS_M), strips, over_bone]
+
+
+def bone(xy: Array) -> Array:
+    """How well ribs or iliac crests may lie under places of the abdomen [m], shape (k, 2) -> (k,)."""
+    beside, up = np.abs(xy[:, 0]), xy[:, 1]
+    ribs = expit((up - ARCH_M + ARCH_SLOPE * beside) / ARCH_WIDTH_M)
+    spine = np.exp(-0.5 * ((beside - ILIAC_M[0]) ** 2 + (up - ILIAC_M[1]) ** 2) / ILIAC_WIDTH_M**2)
+    return np.asarray(np.maximum(ribs, spine))
+
+
+def errors(o: Observations) -> list[Array]:
+    """Unit covariances of the errors whose amplitude is found: stroke zero and breathing [m], noise [1]; (m, m) each."""
+    lever = np.outer(o.per_metre, o.per_metre)
+    breathing = np.exp(-np.abs(o.time[:, None] - o.time) / BREATHING_S)
+    return [lever * o.same_stroke, lever * breathing, np.eye(len(o.y))]
+
+
+def fixed(o: Observations, calibration: Calibration) -> Array:
+    """Covariance of what a scan cannot tell about itself: level, exponent, surface, sensor; shape (m, m)."""
+    lever = np.outer(o.per_metre, o.per_metre)
+    surface = (SURFACE_SHARE * o.depth_uncertainty) ** 2 * lever * _smooth(o.xy, o.xy, SURFACE_M)
+    covariance = LEVEL_SD**2 + calibration.exponent_sd**2 * np.outer(o.log_depth, o.log_depth) + surface
+    covariance += TARE_N**2 * np.outer(o.per_newton, o.per_newton) * o.same_stroke
+    covariance[np.diag_indices(len(o.y))] += o.noise**2
+    return np.asarray(covariance)
+
+
+def _medians(o: Observations) -> tuple[Array, Array]:
+    """Prior of the log-amplitudes: medians' logarithms and standard deviations."""
+    depth = max(o.depth_uncertainty, LEAST_DEPTH_ERROR_M)
+    fields = len(LENGTHS_M) + 1
+    medians = [NATURAL_SD] * fields + [BONE_SD, depth, depth, WHITE_SD]
+    return np.log(medians), np.array([_SURE] * fields + [_UNSURE] * 4)
+
+
+def usual_amplitudes(o: Observations) -> Array:
+    """Log-amplitudes before anything is known of the patient."""
+    return _medians(o)[0]
+
+
+def amplitudes(o: Observations, calibration: Calibration, lumps: Sequence[Bump], start: Array | None = None) -> Array:
+    """Log-amplitudes of the natural fields and the errors under which the data are most likely, given the lumps."""
+    few = o.part(slice(None, None, -(-len(o.y) // _FITTED)))
+    parts = np.array(natural(few.xy, few.xy) + errors(few))
+    rest = fixed(few, calibration) + sum(lump.covariance(few.xy, few.xy) for lump in lumps)
+    middle, spread = _medians(o)
+    y = few.y - np.median(o.y)
+
+    def loss(a: Array) -> tuple[float, Array]:
+        variance = np.exp(2 * a)
+        triangle = cholesky(rest + np.tensordot(variance, parts, 1), lower=True)
+        weights = cho_solve((triangle, True), y)
+        inverse = np.tril(dpotri(triangle, lower=True)[0])
+        inverse += np.tril(inverse, -1).T
+        difference = (a - middle) / spread
+        value = 0.5 * y @ weights + np.log(np.diag(triangle)).sum() + 0.5 * difference @ difference
+        slope = variance * np.tensordot(parts, inverse - np.outer(weights, weights), 2) + difference / spread
+        return float(value), slope
+
+    bounds = list(zip(middle - 3 * spread, middle + 3 * spread, strict=True))
+    first, steps = (middle, _FIRST_STEPS) if start is None else (start, _STEPS)
+    found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
+    return np.asarray(found.x)
+
+
+@dataclass(frozen=True)
+class Regression:
+    """The field given the samples."""
+
+    observations: Observations
+    calibration: Calibration
+    lumps: tuple[Bump, ...]
+    log_amplitudes: Array
+
+    @cached_property
+    def level(self) -> float:
+        """Median of the observations, about which the level is sought."""
+        return float(np.median(self.observations.y))
+
+    @cached_property
+    def triangle(self) -> Array:
+        """Lower Cholesky factor of the observations' covariance, shape (m, m)."""
+        o = self.observations
+        covariance = fixed(o, self.calibration)
+        for log_amplitude, part in zip(self.log_amplitudes, natural(o.xy, o.xy) + errors(o), strict=True):
+            covariance += np.exp(2 * log_amplitude) * part
+        for lump in self.lumps:
+            covariance += lump.covariance(o.xy, o.xy)
+        return np.asarray(cholesky(covariance, lower=True))
+
+    @cached_property
+    def whitened(self) -> Array:
+        """Observations in units of their standard deviation, decorrelated, shape (m,)."""
+        return self.whiten(self.observations.y - self.level)
+
+    def whiten(self, columns: Array) -> Array:
+        """L^-1 times vectors over the samples, shape (m,) or (m, k)."""
+        return np.asarray(solve_triangular(self.triangle, columns, lower=True))
+
+    def healthy_covariance(self, a: Array, b: Array) -> Array:
+        """Covariance of the field without lumps between places, shape (k, l)."""
+        parts = zip(self.log_amplitudes, natural(a, b), strict=False)
+        return np.asarray(LEVEL_SD**2 + sum(np.exp(2 * log_amplitude) * part for log_amplitude, part in parts))
+
+    def lump_covariance(self, a: Array, b: Array) -> Array:
+        """Covariance of all lumps together between places, shape (k, l)."""
+        return np.asarray(sum((lump.covariance(a, b) for lump in self.lumps), np.zeros((len(a), len(b)))))
+
+    def field(self, xy: Array) -> tuple[Array, Array]:
+        """Posterior mean and standard deviation of z at places [m], shape (k, 2) -> (k,) each."""
+        o = self.observations
+        seen = self.whiten(self.healthy_covariance(o.xy, xy) + self.lump_covariance(o.xy, xy))
+        variances = np.exp(2 * self.log_amplitudes[: len(LENGTHS_M) + 2])
+        prior = LEVEL_SD**2 + variances[:-1].sum() + variances[-1] * bone(xy) ** 2
+        prior = prior + sum((LUMP_SD * lump(xy)) ** 2 + (LUMP_FREE_SD * lump(xy, 2 * EDGE_M)) ** 2 for lump in self.lumps)
+        variance = np.maximum(prior - (seen**2).sum(axis=0), 1e-8) + self.calibration.conversion_sd**2
+        variance += (COMMON_SHARE * o.depth_uncertainty * float(np.median(o.per_metre))) ** 2
+        if self.lumps:
+            variance += (UNLIKE * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2
+        return self.level + self.whitened @ seen, np.sqrt(variance)
+
+    def contrast(self, lump: Bump, xy: Array) -> tuple[Array, Array]:
+        """Posterior mean (k,) and covariance (k, k) of one lump's log-contrast at places [m], shape (k, 2)."""
+        seen = self.whiten(lump.covariance(self.observations.xy, xy))
+        return self.whitened @ seen, lump.covariance(xy, xy) - seen.T @ seen

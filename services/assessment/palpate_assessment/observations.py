@@ -1,0 +1,80 @@
+"""Samples as observations of one field: the logarithm of the force that a press to the common depth would feel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_assessment.calibration import Calibration
+from palpate_assessment.sampling import ForceSample
+from palpate_models import press
+from palpate_models.frames import Array
+
+SHALLOWEST_M, WEAKEST_N = 0.002, 0.1
+"""Depth and force from which a sample tells stiffness."""
+FEWEST = 10
+"""So many samples are needed to say anything."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """y = z(x) + errors at m samples, z being the logarithm of apparent stiffness [N]."""
+
+    xy: Array
+    """Where each sample is felt [m], shape (m, 2), in A: ahead of the indenter's middle by `lead_s` of its travel."""
+    time: Array
+    """[s]"""
+    stroke: NDArray[np.intp]
+    y: Array
+    """log F - n log(depth / press depth) - conversion, shape (m,)."""
+    log_depth: Array
+    """log(depth / press depth), by which an error of the exponent n counts."""
+    per_metre: Array
+    """d y / d depth = n / depth [1/m], by which an error of the depth counts."""
+    per_newton: Array
+    """1 / F [1/N], by which an error of the force's zero counts: F is the stroke's median force, since a sample's own force
+    must not explain itself."""
+    noise: Array
+    """Standard deviation of the force's white noise, over the force [1]."""
+    depth_uncertainty: float
+    """One sigma of the depth, the median of what the samples say [m]."""
+    limited: NDArray[np.bool_]
+    """Whether depth yielded to the force limit."""
+
+    @cached_property
+    def same_stroke(self) -> NDArray[np.bool_]:
+        """Whether two samples are of one stroke, shape (m, m)."""
+        return np.asarray(self.stroke[:, None] == self.stroke)
+
+    def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
+        """Some of the samples."""
+        arrays = {name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray) and value.ndim < 3}
+        arrays.pop("same_stroke", None)
+        return Observations(**arrays, depth_uncertainty=self.depth_uncertainty)
+
+
+def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observations | None:
+    """The samples that tell stiffness; None if they are too few to say anything."""
+    good = [s for s in samples if s.depth >= SHALLOWEST_M and s.force >= WEAKEST_N]
+    if len(good) < FEWEST:
+        return None
+    position, velocity = np.array([s.position for s in good]), np.array([s.velocity for s in good])
+    depth, force = np.array([s.depth for s in good]), np.array([s.force for s in good])
+    log_depth, stroke = np.log(depth / press.DEPTH_M), np.array([s.stroke for s in good])
+    usual = {int(one): float(np.median(force[stroke == one])) for one in np.unique(stroke)}
+    return Observations(
+        xy=(position + calibration.lead_s * velocity)[:, :2],
+        time=np.array([s.time for s in good]),
+        stroke=stroke,
+        y=np.log(force) - calibration.exponent * log_depth - calibration.conversion,
+        log_depth=log_depth,
+        per_metre=calibration.exponent / depth,
+        per_newton=np.array([1.0 / usual[int(one)] for one in stroke]),
+        noise=np.array([s.force_noise for s in good]) / force,
+        depth_uncertainty=float(np.median([s.depth_uncertainty for s in good])),
+        limited=np.array([s.force_limited for s in good]),
+    )

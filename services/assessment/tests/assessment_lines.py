@@ -1,0 +1,72 @@
+"""Samples along lines over a belly whose log-force is a known function of place, with errors of one's own choice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from palpate_assessment.calibration import learned
+from palpate_assessment.grid import MapGrid, map_grid
+from palpate_assessment.sampling import ForceSample
+
+REGION = 0.14
+SPACING, ALONG, SPEED = 0.0125, 0.005, 0.03
+LEVEL = float(np.log(2.5))
+Field = Callable[[np.ndarray], np.ndarray]
+
+
+def flat_grid(pitch: float = 0.005) -> MapGrid:
+    axis = np.arange(-0.1, 0.1001, 0.005)
+    x, y = np.meshgrid(axis, axis)
+    surface = np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size)))
+    return map_grid(surface, (0.0, 0.0), (REGION, REGION), 0.02, pitch)
+
+
+def level(xy: np.ndarray) -> np.ndarray:
+    return np.full(len(xy), LEVEL)
+
+
+def lump(xy: np.ndarray, centre: tuple[float, float], radius: float, contrast: float) -> np.ndarray:
+    """Log of the felt contrast of a lump with an edge as wide as an indenter feels it."""
+    beyond = np.linalg.norm(xy - centre, axis=1) - radius
+    return np.log(contrast) / (1 + np.exp(beyond / 0.004))
+
+
+def natural(seed: int, sd: float, length: float = 0.05) -> Field:
+    """A smooth random field, by random Fourier features."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    frequencies, phases = rng.standard_normal((2, 256)) / length, rng.uniform(0, 2 * np.pi, 256)
+    return lambda xy: sd * np.sqrt(2 / 256) * np.cos(xy @ frequencies + phases).sum(axis=1)
+
+
+def lines(field: Field, seed: int = 0, stroke_m: float = 0.0, breathing_m: float = 0.0, noise: float = 0.01) -> list[ForceSample]:
+    """A stroke for each line, there and back; `stroke_m` is the error of each one's zero, `breathing_m` what breathing leaves."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    calibration = learned()
+    along = np.arange(-REGION / 2, REGION / 2 + 1e-9, ALONG)
+    samples = []
+    for stroke, y in enumerate(np.arange(-REGION / 2, REGION / 2 + 1e-9, SPACING)):
+        forth = 1 if stroke % 2 == 0 else -1
+        zero = stroke_m * rng.standard_normal()
+        for k, x in enumerate(along[::forth]):
+            time = 10.0 * stroke + k * ALONG / SPEED
+            wrong = zero + breathing_m * np.sqrt(2) * np.sin(2 * np.pi * time / 4.3)
+            felt = np.array((x + calibration.lead_s * forth * SPEED, y))
+            log_force = field(felt[None])[0] + calibration.conversion + calibration.exponent * np.log1p(wrong / 0.01)
+            samples.append(
+                ForceSample(
+                    time=time,
+                    position=np.array((x, y, 0.0)),
+                    normal=np.array((0.0, 0.0, 1.0)),
+                    velocity=np.array((forth * SPEED, 0.0, 0.0)),
+                    depth=0.010,
+                    force=float(np.exp(log_force + noise * rng.standard_normal())),
+                    force_noise=0.01,
+                    time_in_contact=k * ALONG / SPEED,
+                    force_limited=False,
+                    stroke=stroke,
+                    depth_uncertainty=float(np.hypot(stroke_m, breathing_m)),
+                )
+            )
+    return samples

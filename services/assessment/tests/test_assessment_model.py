@@ -1,0 +1,81 @@
+"""The regression: amplitudes that data of known amplitudes have, and the check of its predictions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from assessment_lines import LEVEL, level, lines, lump, natural
+
+from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.check import contradicted, pieces
+from palpate_assessment.detection import matched
+from palpate_assessment.model import LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
+from palpate_assessment.observations import Observations, observe
+
+
+def observed(stroke_m: float = 0.0, sd: float = 0.15, seed: int = 0) -> Observations:
+    wall = natural(seed, sd)
+    o = observe(lines(lambda xy: LEVEL + wall(xy), seed, stroke_m=stroke_m), learned())
+    assert o is not None
+    return o
+
+
+@pytest.mark.parametrize("stroke_m", [0.0002, 0.0015])
+def test_errors_of_the_strokes_are_found_from_the_data(stroke_m: float) -> None:
+    found = amplitudes(observed(stroke_m), learned(), ())
+    assert np.exp(found[len(LENGTHS_M) + 2]) == pytest.approx(stroke_m, rel=0.6)
+
+
+def test_a_rougher_wall_has_greater_amplitudes() -> None:
+    smooth, rough = (np.exp(2 * amplitudes(observed(sd=sd), learned(), ())[: len(LENGTHS_M)]).sum() for sd in (0.05, 0.3))
+    assert rough > 4 * smooth
+
+
+def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() -> None:
+    wall = natural(0, 0.15)
+    o = observed()
+    regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
+    mean, sd = regression.field(o.xy)
+    assert mean == pytest.approx(LEVEL + wall(o.xy), abs=0.05)
+    _, far = regression.field(o.xy + np.array((0.3, 0.0)))
+    assert far.min() > 1.5 * sd.max()
+
+
+def test_the_matched_filter_reads_a_bump_without_bias() -> None:
+    bump = Bump(0.0, 0.0, 0.02)
+    o = observe(lines(lambda xy: LEVEL + 0.4 * bump(xy), noise=0.002), learned())
+    assert o is not None
+    (log_contrast,), (t,) = matched(Regression(o, learned(), (), usual_amplitudes(o)), [bump])
+    assert log_contrast == pytest.approx(0.4, abs=0.05)
+    assert t > 3
+
+
+def test_a_lump_in_the_model_takes_its_contrast() -> None:
+    bump = Bump(0.0, 0.0, 0.02)
+    o = observe(lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.02, 2.0)), learned())
+    assert o is not None
+    regression = Regression(o, learned(), (bump,), usual_amplitudes(o))
+    mean, covariance = regression.contrast(bump, np.zeros((1, 2)))
+    assert np.exp(mean[0]) == pytest.approx(2.0, rel=0.15)
+    assert covariance[0, 0] > 0
+
+
+def test_every_sample_is_in_one_piece_of_one_stroke() -> None:
+    o = observed()
+    parts = pieces(o)
+    assert np.sort(np.concatenate(parts)).tolist() == list(range(len(o.y)))
+    assert all(len(np.unique(o.stroke[part])) == 1 for part in parts)
+
+
+def test_a_model_that_holds_is_not_contradicted() -> None:
+    o = observe(lines(level), learned())
+    assert o is not None
+    assert not contradicted(Regression(o, learned(), (), usual_amplitudes(o))).any()
+
+
+def test_less_false_findings_need_more_evidence() -> None:
+    calibration = Calibration(
+        exponent=1.3, exponent_sd=0.1, conversion=0, conversion_sd=0.03, lead_s=0, probability=(-5, 1), tail=(-1.0, 0.8)
+    )
+    thresholds = [calibration.threshold(rate) for rate in (0.2, 0.02, 0.002)]
+    assert np.diff(thresholds) == pytest.approx(0.8 * np.log(10) * np.ones(2))
