@@ -68,6 +68,8 @@ class Way:
     """Share of the breathing excursion there, g of them."""
     wrong_m: list[float]
     """How much too far outward the perceived surface is there [m], g of them."""
+    target: list[int]
+    """Index of the target reached last, g of them."""
     gains: Array
     """Rows that take a force in that frame to the normal force that is read of it, shape (g, 3)."""
 
@@ -94,7 +96,6 @@ class Row:
     touching: bool
     steady: bool
     limited: bool
-    target: int
 
 
 class Examination:
@@ -173,6 +174,7 @@ class Examination:
             normal=normal @ self._X_AtA[:3, :3].T,
             breathing=self._breathing(dense + self._loop.aside_m).tolist(),
             wrong_m=self._loop.wrong(dense).tolist(),
+            target=targets[np.maximum(np.searchsorted(path.visits, at, side="right") - 1, 0)].tolist(),
             gains=self._loop.gains(outward @ self._R_AtW.T),
         )
 
@@ -242,5 +244,4 @@ class Examination:
             touching=self._touching,
             steady=steady,
             limited=limited,
-            target=motion.target,
         )

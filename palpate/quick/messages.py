@@ -48,7 +48,7 @@ def _state(row: Row, phase: int, time: float) -> Any:
         header=header(round(time * NS), "world"),
         phase=phase,
         message="",
-        target_index=row.target,
+        target_index=row.way.target[row.at],
         target_count=0,
         targets_skipped=0,
         in_contact=row.touching and not over,
