@@ -11,7 +11,7 @@ before the first stroke. Where the patient lies is what registration got wrong, 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from math import exp
@@ -93,6 +93,26 @@ class LoopErrors(Section):
     regulation_s: Positive
     """Its correlation time, as that of the wander."""
 
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """What stays the same all over one examination."""
+        aside = self.aside_m * rng.standard_normal(2)
+        offset, tilt = self.offset_m.draw(rng), np.array((self.tilt.draw(rng), self.tilt.draw(rng)))
+        return Drawn(offset, tilt, self.followed.draw(rng), aside)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What one examination gets wrong from beginning to end."""
+
+    offset_m: float
+    """How much too far outward the perceived surface is at the centre of the region."""
+    tilt: Array
+    """Its slope along x and y, shape (2,)."""
+    followed: float
+    """Which part of the breathing excursion is followed."""
+    aside_m: Array
+    """Where the tool truly is less where it is believed to be, xy of A, shape (2,)."""
+
 
 @cache
 def studied() -> tuple[LoopErrors, ...]:
@@ -131,16 +151,16 @@ def loop_errors(scenario: Scenario) -> LoopErrors:
 class Loop:
     """What one examination gets wrong. Equal scenarios have equal loops."""
 
-    def __init__(self, scenario: Scenario, errors: LoopErrors) -> None:
-        """Drawn from the scenario's seed."""
+    def __init__(self, scenario: Scenario, errors: LoopErrors, drawn: Drawn | None = None) -> None:
+        """Drawn from the scenario's seed; `drawn` takes the place of what stays the same all over the examination."""
         rng = generator(scenario.seed, "loop")
+        mine = errors.draw(rng)
+        self._drawn = drawn or mine
         self.begin_s = errors.begin_s
         """When the first stroke begins [s]."""
-        self.aside_m: Array = errors.aside_m * rng.standard_normal(2)
+        self.aside_m = self._drawn.aside_m
         """Where the tool truly is less where it is believed to be, xy of A [m], shape (2,)."""
-        self._offset = errors.offset_m.draw(rng)
-        self._tilt = np.array((errors.tilt.draw(rng), errors.tilt.draw(rng)))
-        self.followed = errors.followed.draw(rng)
+        self.followed = self._drawn.followed
         """Which part of the breathing excursion is followed."""
         self._centre = np.array(scenario.exam.centre_m)
         self._field = _field(scenario.exam, errors.field_m, errors.field_length_m, rng)
@@ -150,7 +170,7 @@ class Loop:
 
     def wrong(self, xy: Array) -> Array:
         """How much too far outward the perceived surface is at points [m], shape (p, 2) -> (p,)."""
-        return np.asarray(self._offset + (xy - self._centre) @ self._tilt + self._field.ev(xy[:, 0], xy[:, 1]))
+        return np.asarray(self._drawn.offset_m + (xy - self._centre) @ self._drawn.tilt + self._field.ev(xy[:, 0], xy[:, 1]))
 
     def regulation(self, k: int) -> float:
         """Measured depth less set-point in the k-th period [m]."""

@@ -1,4 +1,4 @@
-"""The implicit steps of the Winkler tissue against the explicit ones: presses, slides over one's own tracks, breathing, guarding."""
+"""The implicit steps of the Winkler tissue against the explicit ones."""
 
 from __future__ import annotations
 
