@@ -45,7 +45,9 @@ def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mesh(vertices: np.ndarray, triangles: np.ndarray, frame: str) -> Any:
-    return SurfaceMesh(header(0, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
+    return SurfaceMesh(
+        header(0, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel(), np.empty(0, np.float32)
+    )
 
 
 def phantom() -> Any:
@@ -121,6 +123,10 @@ def exam_states(measured_error: float) -> list[Any]:
             surface_point=Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
             surface_normal=Vector3(0.0, 0.0, 1.0),
             end_tick=-1,
+            depth_uncertainty=0.0005,
+            wall_displacement=0.0,
+            stroke=1,
+            patient_moved=False,
         )
         for k in range(100)
     ]

@@ -142,7 +142,7 @@ def test_arrays_within_a_sequence_of_messages_are_converted() -> None:
 
 def test_large_strided_arrays_are_encoded_in_order() -> None:
     vertices = np.arange(6000, dtype=np.float32)
-    mesh = SurfaceMesh(header(0), vertices[::2], vertices[:0], np.arange(3, dtype=np.uint32))
+    mesh = SurfaceMesh(header(0), vertices[::2], vertices[:0], np.arange(3, dtype=np.uint32), np.empty(0, np.float32))
     name = "palpation_msgs/msg/SurfaceMesh"
     np.testing.assert_array_equal(codec.decode(codec.encode(mesh, name), name).vertices, vertices[::2])
 

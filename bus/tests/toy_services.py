@@ -105,7 +105,7 @@ class Tissue(Service):
 
     def start(self) -> Outbox:
         none = np.zeros(0, np.float32)
-        mesh = SurfaceMesh(header(0, "abdomen"), np.zeros(3, np.float32), none, np.zeros(0, np.uint32))
+        mesh = SurfaceMesh(header(0, "abdomen"), np.zeros(3, np.float32), none, np.zeros(0, np.uint32), np.empty(0, np.float32))
         return {"truth/phantom": PhantomTruth(mesh, np.zeros(1), np.zeros(1), np.zeros(1, np.int32), pose())}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -117,7 +117,9 @@ class Tissue(Service):
         if t % (50 * MS) == 0:
             out["truth/patient"] = PatientTruth(h, 0.0, pose())
             vertices = np.full(9000, x, np.float32)
-            out["sim/surface"] = SurfaceMesh(h, vertices, np.zeros(0, np.float32), np.zeros(18000, np.uint32))
+            out["sim/surface"] = SurfaceMesh(
+                h, vertices, np.zeros(0, np.float32), np.zeros(18000, np.uint32), np.empty(0, np.float32)
+            )
         return out
 
 
@@ -138,7 +140,26 @@ class Planning(Service):
                 h, 0, pose(), twist(), wrench(), np.zeros(6), np.zeros(6), q, np.zeros(7), np.zeros(7), duration_message(250 * MS)
             ),
             "exam/state": ExamState(
-                h, 0, "", 0, 0, 0, False, False, False, False, 0.0, 0.0, 0.0, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), end
+                h,
+                0,
+                "",
+                0,
+                0,
+                0,
+                False,
+                False,
+                False,
+                False,
+                0.0,
+                0.0,
+                0.0,
+                Point(0.0, 0.0, 0.0),
+                Vector3(0.0, 0.0, 1.0),
+                end,
+                0.0,
+                0.0,
+                0,
+                False,
             ),
         }
         if t % (500 * MS) == 0:
@@ -183,7 +204,11 @@ class Perception(Service):
         if not images:
             return {}
         level = np.full(3, float(images[-1].data[0]), np.float32)
-        return {"perception/surface": SurfaceMesh(header(t), level, np.zeros(0, np.float32), np.zeros(0, np.uint32))}
+        return {
+            "perception/surface": SurfaceMesh(
+                header(t), level, np.zeros(0, np.float32), np.zeros(0, np.uint32), np.empty(0, np.float32)
+            )
+        }
 
 
 class Supervisor(Service):

@@ -109,7 +109,9 @@ def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 def surface(t: int, vertices: NDArray[np.float32], triangles: NDArray[np.uint32], frame: str) -> Any:
-    return SurfaceMesh(header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel())
+    return SurfaceMesh(
+        header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel(), np.empty(0, np.float32)
+    )
 
 
 def pose(position: Array, rotation: Rotation | None = None) -> Any:
@@ -227,7 +229,7 @@ def exam(t: int, phase: int, message: str, depth: float, force: float, visited: 
     pressed = force > 0.1
     return ExamState(
         header(t, "world"), phase, message, visited, 200, 1, pressed, pressed, False, False, 0.01 if pressed else 0.0,
-        depth, force, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1,
+        depth, force, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0005, 0.0, 1, False,
     )  # fmt: skip
 
 

@@ -22,8 +22,12 @@ from palpate_models.section import Force, Length, NonNegative, Pose, Positive, S
 class Pattern(StrEnum):
     """Coverage pattern."""
 
-    SNAKE = "snake"
+    LINES = "lines"
+    """There and back, lifted at each line's end."""
     RASTER = "raster"
+    """All lines one way, lifted at their ends."""
+    SNAKE = "snake"
+    """There and back, line ends joined in contact."""
 
 
 class Mode(StrEnum):
@@ -33,6 +37,17 @@ class Mode(StrEnum):
     POINT = "point"
 
 
+class Following(StrEnum):
+    """What is done about the wall's breathing."""
+
+    FOLLOW = "follow"
+    """The indenter follows the wall."""
+    GATE = "gate"
+    """It follows, and samples are taken at the end of expiration alone."""
+    IGNORE = "ignore"
+    """It does not follow, as if the patient did not breathe."""
+
+
 class Exam(Section):
     """What is examined, and how."""
 
@@ -40,10 +55,11 @@ class Exam(Section):
     """Of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
-    pattern: Pattern = Pattern.SNAKE
+    pattern: Pattern = Pattern.LINES
     mode: Mode = Mode.CONTINUOUS
+    breathing: Following = Following.FOLLOW
     depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
-    """Indentation along the inward normal from the perceived rest surface."""
+    """Indentation along the inward normal from where the skin is touched."""
     spacing_m: Annotated[float, Field(ge=0.004, le=0.05)] = 0.0125
     """Distance of scan lines, and of points on a line."""
     speed_mps: Annotated[float, Field(ge=0.005, le=0.1)] = 0.03

@@ -157,6 +157,10 @@ class ExamState:
     surface_point: Point
     surface_normal: Vector3
     end_tick: int
+    depth_uncertainty: float
+    wall_displacement: float
+    stroke: int
+    patient_moved: bool
 
 @dataclass
 class Finding:
@@ -331,6 +335,17 @@ class ServiceReport:
     detail: str
 
 @dataclass
+class SkinTouch:
+    __msgtype__: ClassVar[str]
+    header: Header
+    surface_point: Point
+    stroke: int
+    height: float
+    sigma: float
+    expected: float
+    expected_sigma: float
+
+@dataclass
 class StiffnessMap:
     __msgtype__: ClassVar[str]
     header: Header
@@ -381,6 +396,23 @@ class SurfaceMesh:
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
     triangles: NDArray[np.uint32]
+    breathing: NDArray[np.float32]
+
+@dataclass
+class SurfaceMotion:
+    __msgtype__: ClassVar[str]
+    QUIET: ClassVar[int]
+    SPOILED: ClassVar[int]
+    MOVED: ClassVar[int]
+    LOST: ClassVar[int]
+    FORECASTS: ClassVar[int]
+    FORECAST_STEP_MS: ClassVar[int]
+    header: Header
+    state: int
+    displacement: float
+    forecast: NDArray[np.float64]
+    uncertainty: float
+    shift: Vector3
 
 @dataclass
 class ToolState:

@@ -9,7 +9,8 @@ from palpate_bus.messages.cdr import LENGTH, StructCodec, pack_header, pack_text
 
 _PHASE = Struct("<B")
 _COUNTS = Struct("<III????")  # target index and count, targets skipped; in contact, steady, force limited, view blocked
-_EXAM = Struct("<3d3d3dq")  # depth set-point, depth, force; surface point, surface normal; end tick
+_EXAM = Struct("<3d3d3dq2dI?")
+# depth set-point, depth, force; surface point, surface normal; end tick; uncertainty, wall displacement, stroke, patient moved
 _LEVEL = Struct("<BB")  # level, cause
 _SUPERVISOR = Struct("<3dI")  # force, depth, speed; refusals
 _INDENTATION = Struct("<4dI4x3dd")  # depth, normal, tangential and peak force; contacts; surface point, stiffness
@@ -25,7 +26,8 @@ def encode_exam_state(message: ExamState) -> bytes:
     )  # fmt: skip
     p, n = message.surface_point, message.surface_normal
     return data + bytes(padding(len(data), 8)) + _EXAM.pack(
-        message.depth_setpoint, message.depth, message.normal_force, p.x, p.y, p.z, n.x, n.y, n.z, message.end_tick
+        message.depth_setpoint, message.depth, message.normal_force, p.x, p.y, p.z, n.x, n.y, n.z, message.end_tick,
+        message.depth_uncertainty, message.wall_displacement, message.stroke, message.patient_moved,
     )  # fmt: skip
 
 
@@ -38,10 +40,10 @@ def decode_exam_state(data: bytes) -> tuple[ExamState, int]:
     index, count, skipped, touching, steady, force_limited, blocked = _COUNTS.unpack_from(data, place)
     place += _COUNTS.size
     place += padding(place, 8)
-    setpoint, depth, force, px, py, pz, nx, ny, nz, end_tick = _EXAM.unpack_from(data, place)
+    setpoint, depth, force, px, py, pz, nx, ny, nz, *rest = _EXAM.unpack_from(data, place)
     message = ExamState(
         header, phase, text, index, count, skipped, touching, steady, force_limited, blocked,
-        setpoint, depth, force, Point(px, py, pz), Vector3(nx, ny, nz), end_tick,
+        setpoint, depth, force, Point(px, py, pz), Vector3(nx, ny, nz), *rest,
     )  # fmt: skip
     return message, place + _EXAM.size
 

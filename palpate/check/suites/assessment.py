@@ -51,7 +51,7 @@ class Examination:
         force = FORCE_N * self.stiffness(x, y) if scanning else 0.0
         return ExamState(
             header(t, "world"), phase, "conformance check", 0, 1, 0, scanning, scanning, False, False, self._depth, depth, force,
-            Point(*map(float, p_W)), Vector3(*map(float, n_W)), -1,
+            Point(*map(float, p_W)), Vector3(*map(float, n_W)), -1, 0.0005, 0.0, 1, False,
         )  # fmt: skip
 
     @staticmethod
@@ -69,7 +69,10 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.section("before contact")
     vertices, normals, triangles = shapes.mesh(0.12, 0.006)
     flat = (apply(X_WA, vertices).astype(np.float32).ravel(), (normals @ X_WA[:3, :3].T).astype(np.float32).ravel())
-    rig.send("perception/surface", SurfaceMesh(header(rig.t, "world"), *flat, triangles.astype(np.uint32).ravel()))
+    rig.send(
+        "perception/surface",
+        SurfaceMesh(header(rig.t, "world"), *flat, triangles.astype(np.uint32).ravel(), np.empty(0, np.float32)),
+    )
     rig.run(0.2, {})
     quiet = len(rig.log[SAMPLES]) + len(rig.log[FINDINGS])
     report.expect("finds nothing before contact", quiet == 0, "no samples, no findings", quiet)

@@ -46,7 +46,7 @@ def plane(centre: Array) -> Source:
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     triangles = np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d)))).astype(np.uint32)
     flat, up = vertices.astype(np.float32).ravel(), np.tile((0.0, 0.0, 1.0), x.size).astype(np.float32)
-    return lambda t: SurfaceMesh(header(t, "world"), flat, up, triangles.ravel())
+    return lambda t: SurfaceMesh(header(t, "world"), flat, up, triangles.ravel(), np.empty(0, np.float32))
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

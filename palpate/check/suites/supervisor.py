@@ -62,7 +62,7 @@ class PlayedArm:
     def _exam(self, t: int) -> Any:
         return ExamState(
             header(t, "world"), ExamState.PHASE_SCAN, "conformance check", 0, 1, 0, False, False, False, False, 0.0, 0.0, 0.0,
-            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1,
+            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0, 0.0, 0, False,
         )  # fmt: skip
 
     def surface(self, t: int, depth: float) -> Any:
@@ -76,7 +76,7 @@ class PlayedArm:
         index = np.arange(x.size, dtype=np.uint32).reshape(21, 21)
         a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
         triangles = np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d))))
-        return SurfaceMesh(header(t, "world"), vertices.ravel(), normals.ravel(), triangles.ravel())
+        return SurfaceMesh(header(t, "world"), vertices.ravel(), normals.ravel(), triangles.ravel(), np.empty(0, np.float32))
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

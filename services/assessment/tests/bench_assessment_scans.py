@@ -122,7 +122,11 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
     p, n = shape(xy)
     perceived = p + n * wrong(p)[:, None]
     surface = SurfaceMesh(
-        header(0, "world"), apply(X_WA, perceived).astype(np.float32).ravel(), np.empty(0, np.float32), np.empty(0, np.uint32)
+        header(0, "world"),
+        apply(X_WA, perceived).astype(np.float32).ravel(),
+        np.empty(0, np.float32),
+        np.empty(0, np.uint32),
+        np.empty(0, np.float32),
     )
     states: list[Any] = []
     zero = np.zeros(3)
@@ -178,6 +182,10 @@ def _state(
         surface_point=Point(*map(float, p_W)),
         surface_normal=Vector3(*map(float, n_W)),
         end_tick=-1,
+        depth_uncertainty=0.0005,
+        wall_displacement=0.0,
+        stroke=1,
+        patient_moved=False,
     )
 
 

@@ -12,8 +12,8 @@ from palpate_bus.messages import CameraTrigger, SurfaceMesh
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.bias import DepthBias, field
-from palpate_camera.backends.kinect.pinhole import Pinhole
 from palpate_camera.backends.kinect.service import CameraService
+from palpate_camera.pinhole import Pinhole
 from palpate_models.errors import CameraErrors, DrawnCamera, Errors, draw_errors
 from palpate_models.load import plant_input
 from palpate_models.scenario import Camera, Scenario
@@ -37,7 +37,9 @@ def photograph(frames: int = 1, seed: int = 0, **given: float) -> np.ndarray:
     errors = Errors(level="none", camera=CameraErrors(**given))
     camera, inbox = CameraService(plant_input(Scenario(seed=seed, errors=errors))), HandInbox()
     vertices = np.array([(0.41, -0.15, 0.9), (0.71, -0.15, 0.9), (0.71, 0.15, 0.9), (0.41, 0.15, 0.9)], np.float32)
-    surface = SurfaceMesh(header(0, "world"), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]))
+    surface = SurfaceMesh(
+        header(0, "world"), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]), np.empty(0, np.float32)
+    )
     inbox.receive({"sim/surface": surface, "planning/camera_trigger": CameraTrigger(header(0), frames)})
     sent: list[Any] = [camera.step(0, inbox)]
     sent += [camera.step(k * 100 * MS, inbox.receive({})) for k in range(1, frames)]

@@ -14,7 +14,8 @@ from palpate_bus.messages.codec import encode
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_camera.backends.kinect.service import create as create_camera
-from palpate_camera.backends.replay.service import IMAGE, INFO, POSE, ReplayedCamera, create
+from palpate_camera.backends.replay.service import POSE, ReplayedCamera, create
+from palpate_camera.pictures import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_models.load import load_scenario
 from palpate_recorder.service import RecorderService
 
@@ -31,7 +32,10 @@ def seen() -> dict[str, list[HeardMessage]]:
     return rig.log
 
 
-def record(folder: Path, log: dict[str, list[HeardMessage]], topics: tuple[str, ...] = (IMAGE, INFO, POSE)) -> Path:
+ALL = (IMAGE, INFO, POSE, SMALL_IMAGE, SMALL_INFO)
+
+
+def record(folder: Path, log: dict[str, list[HeardMessage]], topics: tuple[str, ...] = ALL) -> Path:
     recorder = RecorderService(folder)
     rows = contract().topics
     for topic in topics:
@@ -65,6 +69,26 @@ def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: P
         assert nanoseconds(heard.message.header.stamp) == nanoseconds(info.message.header.stamp) == heard.t
         assert heard.t >= 2000 * MS
     assert rig.last(POSE) == seen[POSE][-1].message
+
+
+def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, seen: dict[str, list[HeardMessage]]) -> None:
+    rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
+    shown = rig.run(0.5, {})
+    assert len(shown[SMALL_IMAGE]) == len(shown[SMALL_INFO]) >= 5
+    for heard, then in zip(shown[SMALL_IMAGE], seen[SMALL_IMAGE], strict=False):
+        np.testing.assert_array_equal(heard.message.data, then.message.data)
+        assert nanoseconds(heard.message.header.stamp) == heard.t
+
+
+def test_a_recording_without_small_images_has_those_of_its_whole_ones(
+    seen: dict[str, list[HeardMessage]], tmp_path: Path
+) -> None:
+    folder = record(tmp_path / "recording_mcap", seen, (IMAGE, INFO, POSE))
+    shown = ServiceRig(ReplayedCamera(open_recording(folder)), RigSettings(SCENARIO)).run(0.5, {})
+    whole = np.frombuffer(seen[IMAGE][0].message.data, "<f4").reshape(480, 640)
+    small = shown[SMALL_IMAGE][0].message
+    np.testing.assert_array_equal(np.frombuffer(small.data, "<f4").reshape(small.height, small.width), whole[3::7, 3::7])
+    assert shown[SMALL_INFO][0].message.k.tolist() == pytest.approx(seen[SMALL_INFO][0].message.k.tolist())
 
 
 def test_frames_differ_as_their_noise_does(seen: dict[str, list[HeardMessage]]) -> None:

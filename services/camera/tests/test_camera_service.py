@@ -1,4 +1,4 @@
-"""The service: idle until triggered, one frame a tick, messages as the contract has them, the robot occludes."""
+"""The service: small images all the time, whole ones when triggered; messages as the contract has them, the robot occludes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def plate(height: float = 0.9, half: float = 0.15, frame: str = "world") -> Any:
     """A horizontal square at the patient's place."""
     corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     vertices = np.column_stack((corners[:, 0] + 0.56, corners[:, 1], np.full(4, height))).astype(np.float32)
-    return SurfaceMesh(header(0, frame), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]))
+    return SurfaceMesh(
+        header(0, frame), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]), np.empty(0, np.float32)
+    )
 
 
 def trigger(frames: int, t: int = 0) -> Any:
@@ -38,12 +40,16 @@ def depth(message: Any) -> np.ndarray:
     return np.frombuffer(message.data, "<f4").reshape(message.height, message.width)
 
 
-def test_idle_until_triggered_then_one_frame_a_tick() -> None:
+SMALL = {"camera/follow/depth", "camera/follow/camera_info"}
+WHOLE = {"camera/depth/image_raw", "camera/depth/camera_info"}
+
+
+def test_small_images_until_triggered_then_whole_ones_too() -> None:
     camera, inbox = CameraService(plant_input(Scenario())), HandInbox()
-    assert camera.step(0, inbox.receive({"sim/surface": plate()})) == {}
+    assert set(camera.step(0, inbox.receive({"sim/surface": plate()}))) == SMALL
     sent = [camera.step(100 * MS, inbox.receive({"planning/camera_trigger": trigger(3)}))]
     sent += [camera.step(t * MS, inbox.receive({})) for t in (200, 300, 400, 500)]
-    assert [bool(outbox) for outbox in sent] == [True, True, True, False, False]
+    assert [set(outbox) for outbox in sent] == [SMALL | WHOLE] * 3 + [SMALL] * 2
     stamps = [nanoseconds(outbox["camera/depth/image_raw"].header.stamp) for outbox in sent[:3]]
     assert stamps == [100 * MS, 200 * MS, 300 * MS]
     assert camera.finish() == {"bursts": 1, "frames": 3}
@@ -54,13 +60,38 @@ def test_a_new_trigger_replaces_the_burst() -> None:
     camera.step(0, inbox.receive({"sim/surface": plate(), "planning/camera_trigger": trigger(50)}))
     sent = [camera.step(100 * MS, inbox.receive({"planning/camera_trigger": trigger(2)}))]
     sent += [camera.step(t * MS, inbox.receive({})) for t in (200, 300)]
-    assert [bool(outbox) for outbox in sent] == [True, True, False]
+    assert [set(outbox) for outbox in sent] == [SMALL | WHOLE] * 2 + [SMALL]
 
 
 def test_a_burst_waits_for_the_first_surface() -> None:
     camera, inbox = CameraService(plant_input(Scenario())), HandInbox()
     assert camera.step(0, inbox.receive({"planning/camera_trigger": trigger(1)})) == {}
-    assert camera.step(100 * MS, inbox.receive({"sim/surface": plate()}))
+    assert set(camera.step(100 * MS, inbox.receive({"sim/surface": plate()}))) >= WHOLE
+
+
+def test_the_small_image_is_every_seventh_pixel_of_the_whole_one() -> None:
+    service = CameraService(plant_input(scenario(camera={"noise_scale": 0.0, "field_m": 0.01, "lost_patches": 30.0})))
+    sent = service.step(0, HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(1)}))
+    whole, small = (depth(sent[topic]) for topic in ("camera/depth/image_raw", "camera/follow/depth"))
+    assert small.shape == (69, 91)
+    np.testing.assert_allclose(small, whole[3::7, 3::7], atol=1e-5)
+    fx, _, cx, _, fy, cy, *_ = sent["camera/follow/camera_info"].k
+    assert (7 * fx, 7 * cx + 3, 7 * fy, 7 * cy + 3) == pytest.approx((585.0, 319.5, 585.0, 239.5))
+
+
+def test_the_small_image_is_as_noisy_as_the_whole_one() -> None:
+    noisy, ideal = (CameraService(plant_input(scenario(camera={"noise_scale": scale}))) for scale in (1.0, 0.0))
+    once, always = (HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(40)}) for _ in range(2))
+    errors: dict[str, list[np.ndarray]] = {"camera/depth/image_raw": [], "camera/follow/depth": []}
+    true = ideal.step(0, once)
+    for k in range(40):
+        sent = noisy.step(k * 100 * MS, always)
+        always.receive({})
+        for topic, seen in errors.items():
+            middle = tuple(slice(int(0.48 * size), int(0.52 * size)) for size in depth(true[topic]).shape)
+            seen.append((depth(sent[topic]) - depth(true[topic]))[middle].ravel())
+    whole, small = (float(np.nanstd(np.concatenate(seen))) for seen in errors.values())
+    assert small == pytest.approx(whole, rel=0.1)
 
 
 def test_messages_are_what_the_contract_says() -> None:

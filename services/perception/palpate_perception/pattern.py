@@ -44,10 +44,10 @@ def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
 def order(lines: int, points: int, pattern: Pattern) -> Index:
     """Step 5: the order in which nodes (line * points + point) are visited, shape (lines * points,).
 
-    Raster: every line foot to head. Snake: every other line back.
+    Raster: every line foot to head. Else every other line back.
     """
     index = np.arange(lines * points).reshape(lines, points)
-    if pattern is Pattern.SNAKE:
+    if pattern is not Pattern.RASTER:
         index[1::2] = index[1::2, ::-1].copy()
     return index.ravel()
 

@@ -174,7 +174,9 @@ def points(t: int, p_W: Array) -> Message:
 def surface(t: int, mesh: PerceivedMesh) -> Message:
     """`palpation_msgs/SurfaceMesh` in world."""
     vertices, normals = (np.ascontiguousarray(x, np.float32).reshape(-1) for x in (mesh.p_W, mesh.n_W))
-    return SurfaceMesh(header(t, FRAME), vertices, normals, np.ascontiguousarray(mesh.triangles).reshape(-1))
+    return SurfaceMesh(
+        header(t, FRAME), vertices, normals, np.ascontiguousarray(mesh.triangles).reshape(-1), np.zeros(len(mesh.p_W), np.float32)
+    )
 
 
 def targets(t: int, perceived: Perceived) -> Message:

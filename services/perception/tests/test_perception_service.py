@@ -38,7 +38,9 @@ def skin(case: Scenario, rise: float = 0.0) -> Any:
     """sim/surface of the phantom at rest, lifted by `rise` [m]."""
     p_W = apply(matrix(true_pose(case)), phantom().vertices) + np.array((0, 0, rise))
     triangles = phantom().triangles.astype(np.uint32).ravel()
-    return SurfaceMesh(header(0, "world"), p_W.astype(np.float32).ravel(), np.empty(0, np.float32), triangles)
+    return SurfaceMesh(
+        header(0, "world"), p_W.astype(np.float32).ravel(), np.empty(0, np.float32), triangles, np.empty(0, np.float32)
+    )
 
 
 @cache

@@ -8,12 +8,13 @@ import numpy as np
 
 from palpate_models.frames import Array
 from palpate_planning.kinematics import ArmKinematics
-from palpate_planning.surface import PerceivedSurface
+from palpate_planning.surface import Foot
 from palpate_planning.tool_weight import ToolWeight
+from palpate_planning.wall import Wall
 
-CONTACT_ON_N = 0.15
-"""Normal force that counts as contact: nine standard deviations of the averaged noise."""
-CONTACT_OFF_N = 0.08
+CONTACT_ON_N = 0.3
+"""Normal force that counts as contact: more than noise and the drift since the last tare."""
+CONTACT_OFF_N = 0.15
 """Contact ends below this normal force."""
 
 
@@ -35,38 +36,51 @@ class ContactMeasurement(NamedTuple):
     """Pose of the indenter, shape (4, 4)."""
     R_WS: Array
     """Orientation of the force/torque sensor, shape (3, 3)."""
-    p_W: Array
-    """Rest surface point under the indenter [m], shape (3,)."""
-    n_W: Array
-    """Outward normal there."""
+    foot: Foot
+    """The point of the perceived surface under the indenter."""
+    correction: float
+    """How far outward of it the skin is at the end of expiration, as far as touch has told [m]."""
+    displacement: float
+    """How far outward of that the breath has moved it [m]."""
+    uncertainty: float
+    """Standard deviation of both together, and so of the depth [m]."""
     depth: float
-    """Radius less the signed distance of the sphere's centre from the rest surface [m]; negative: gap."""
+    """Radius less the signed distance of the sphere's centre from the unpressed skin, where it is now [m]; negative: gap."""
     force: float
     """Normal force [N], positive when the tissue is pressed."""
     touching: bool
 
 
 class ContactSensing:
-    """Turns sensor readings into contact, against the surface perceived so far."""
+    """Turns sensor readings into contact with the wall as it is believed to be."""
 
-    def __init__(
-        self, kinematics: ArmKinematics, weight: ToolWeight, surface: PerceivedSurface, radius: float, period_s: float
-    ) -> None:
+    def __init__(self, kinematics: ArmKinematics, weight: ToolWeight, wall: Wall, radius: float, period_s: float) -> None:
         """`radius` of the sphere [m]; a reading comes every `period_s`."""
-        self.surface = surface
+        self.wall = wall
         self.weight = weight
         self._kinematics, self._radius, self._period_s = kinematics, radius, period_s
         self._touching = False
         self._velocity: Array | None = None
         """Velocity of the sphere's centre at the reading before [m/s], world axes, shape (3,)."""
 
-    def sense(self, reading: SensorReading) -> ContactMeasurement:
-        """The contact at a reading."""
+    def sense(self, reading: SensorReading, t: int) -> ContactMeasurement:
+        """The contact at the reading of time `t` [ns]."""
         X_WI, R_WS = self._kinematics.poses(reading.q)
-        p_W, n_W, distance = self.surface.nearest(X_WI[:3, 3])
+        wall, foot = self.wall, self.wall.perceived.nearest(X_WI[:3, 3])
+        correction, displacement = wall.correction.height(foot.xy_A), wall.displacement(foot.xy_A, t)
         velocity = self._kinematics.jacobian(reading.q)[:3] @ reading.qd
         acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
         self._velocity = velocity
-        force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ n_W)
+        force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ foot.n_W)
         self._touching = force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
-        return ContactMeasurement(X_WI, R_WS, p_W, n_W, self._radius - distance, force, self._touching)
+        return ContactMeasurement(
+            X_WI,
+            R_WS,
+            foot,
+            correction,
+            displacement,
+            wall.sigma(foot.xy_A, t),
+            self._radius - foot.distance + correction + displacement,
+            force,
+            self._touching,
+        )

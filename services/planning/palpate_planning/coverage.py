@@ -1,7 +1,8 @@
 """Coverage: from targets to strokes, each a smooth curve in the abdomen's xy plane.
 
-Snake: lines joined by arcs, one stroke in contact. Raster: a stroke a line, retracted in between. Mode point: a stroke a
-target. A skipped target ends a stroke: the arm must not slide over what it cannot reach. So does a break: the way between two
+Lines: a stroke a line, there and back, retracted in between, so that each has a touch and a tare of its own. Raster: the same,
+all of them one way. Snake: lines joined by arcs, one stroke in contact. Mode point: a stroke a target. A skipped target ends a
+stroke: the arm must not slide over what it cannot reach. So does a break: the way between two
 targets that are in reach may itself be out of reach.
 """
 
@@ -21,6 +22,8 @@ from palpate_models.scenario import Mode, Pattern
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
+TOUCHES_M = 0.07
+"""Largest distance of the touches before the scan: they fix offset, tilt and field of the perceived surface."""
 SAMPLE_M = 0.002
 """Spacing of the samples of a stroke."""
 JOIN_SPACINGS = 2.5
@@ -37,6 +40,8 @@ class Stroke:
     """Indices of the targets that it visits, in order, shape (m,)."""
     visits: Ints
     """Sample at which each of them is reached, shape (m,)."""
+    touch: bool = False
+    """Whether the skin is only touched, not pressed."""
 
 
 def line_through(points: Array) -> tuple[Array, Ints]:
@@ -96,7 +101,7 @@ def strokes(
         xy: targets in frame A [m], shape (n, 2), in coverage order.
         lines: index of each target's scan line, shape (n,).
         usable: whether it may be visited, shape (n,).
-        pattern: joins line ends (snake) or not (raster).
+        pattern: joins line ends (snake) or not.
         mode: continuous, or a stroke a target.
         spacing: distance of the lines [m].
         breaks: targets after which the stroke ends.
@@ -124,6 +129,19 @@ def strokes(
             np.concatenate((last.visits, piece.visits + offset)),
         )
     return joined
+
+
+def touches(xy: Array, usable: Bools) -> list[Stroke]:
+    """Touches at usable targets, spread over all of them: near the centres of equal cells, the last one near the first target."""
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    counts = np.maximum(1, np.ceil((high - low) / TOUCHES_M - 1e-9)).astype(int)
+    columns, rows = (low[k] + (high[k] - low[k]) * (np.arange(counts[k]) + 0.5) / counts[k] for k in (0, 1))
+    centres = np.array([(x, y) for j, y in enumerate(rows) for x in columns[:: -1 if j % 2 else 1]])
+    if np.linalg.norm(centres[-1] - xy[0]) > np.linalg.norm(centres[0] - xy[0]):
+        centres = centres[::-1]
+    candidates = np.flatnonzero(usable)
+    nearest = [candidates[np.argmin(np.linalg.norm(xy[candidates] - c, axis=1))] for c in centres] if len(candidates) else []
+    return [Stroke(xy[[i]], np.array([i]), np.zeros(1, np.int64), touch=True) for i in dict.fromkeys(nearest)]
 
 
 def transfer(a: Array, b: Array) -> Array:

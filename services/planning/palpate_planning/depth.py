@@ -70,7 +70,10 @@ class DepthRegulator:
     """Regulates one stroke; `reset` before the next. One call a planning period."""
 
     def __init__(self, period: float, stiffness: float, force_working: float, depth_max: float) -> None:
-        """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N], `depth_max` [m]."""
+        """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N].
+
+        No deeper than `depth_max` [m] is commanded, unless the target itself is.
+        """
         self._dt, self._stiffness, self._depth_max = period, stiffness, depth_max
         self.force_max = FORCE_FRACTION * force_working
         self.reset(0.0)
@@ -108,7 +111,7 @@ class DepthRegulator:
             self._integral = min(max(self._integral, -INTEGRAL_MAX_M), INTEGRAL_MAX_M)
         elif not in_contact:
             self._integral -= dt / INTEGRAL_FADE_S * self._integral
-        command = min(reference + self._integral - self._guard, self._depth_max)
+        command = min(reference + self._integral - self._guard, max(target, self._depth_max))
         rate = (command - self._command) / dt
         self._command = command
         feed = FEED_FORWARD * min(max(self._force, 0.0), self.force_max)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.placement import plan_redundancy, prepare
 from palpate_models.scenario import ExamInput
-from palpate_planning.coverage import strokes
+from palpate_planning.coverage import strokes, touches
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.motion_planning import NoPathError, timed_motion
 from palpate_planning.poses import centre, pose
@@ -36,8 +36,6 @@ class PerceivedAbdomen:
     triangles: Ints
     """Vertex indices, shape (l, 3)."""
     surface: PerceivedSurface
-    noise: float = 0.0
-    """Standard deviation of the surface that perception estimates, its motion included [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +53,7 @@ class ExamPlan:
         """Poses of the indenter at depth along all strokes, about 5 mm apart, shape (n, 4, 4)."""
         out = []
         for segment in self.segments:
-            if segment.contact:
+            if segment.contact and not segment.touch:
                 step = max(1, len(segment.path.s) * 5 // max(1, round(segment.path.length * 1e3)))
                 centres = centre(segment.path.p, segment.path.n, radius, depth)
                 out += [pose(segment.path.R[i], centres[i]) for i in range(0, len(centres), step)]
@@ -102,7 +100,8 @@ class ExamPlanner:
         breaks: set[int] = set()
         while True:  # ends: each round takes targets or joints away
             usable = np.array([i not in skipped for i in range(len(xy))], dtype=bool)
-            pieces = strokes(xy, perceived.lines, usable, exam.pattern, exam.mode, exam.spacing_m, breaks)
+            scan = strokes(xy, perceived.lines, usable, exam.pattern, exam.mode, exam.spacing_m, breaks)
+            pieces = touches(xy, usable) + scan
             layout = segments.lay(pieces)
             if not layout.troubled:
                 break

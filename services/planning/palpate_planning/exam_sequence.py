@@ -24,17 +24,15 @@ from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import Stops
-from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import RestartRamp
 from palpate_planning.tool_weight import ToolWeight
+from palpate_planning.wall import TouchedSkin, Wall, plane
 
 LOOKS_MAX = 3
 REST = 200 * MS
-"""Time at rest before looking or taring [ns]: the arm's oscillations fade."""
-TARE = 300 * MS
-"""Time of taring [ns]: 30 means over 10 ms of 0.05 N noise leave 3 mN."""
-LOOK_PATIENCE = 3 * SECOND
-"""Time that perception may take beyond the burst [ns]."""
+"""Time at rest before looking [ns]: the arm's oscillations fade."""
+LOOK_PATIENCE = 12 * SECOND
+"""Time that perception may take beyond the burst [ns]: it watches about two breaths."""
 PLANNING_TIME = 2 * SECOND
 """Simulated time that planning the examination takes [ns]."""
 ASSESS_PATIENCE = 30 * SECOND
@@ -48,13 +46,11 @@ class ExamSequence:
         """`lockstep`: heavy planning takes exactly its simulated time; else at least that, and as long as it takes."""
         self._known, self._periods, self._lockstep = known, periods, lockstep
         self._kinematics = ArmKinematics(known.robot, known.limits)
-        plane = PerceivedSurface.plane(np.array(known.X_WA))
-        plane.nearest(np.zeros(3))  # compiles it ahead of any deadline
         compile_ahead()
         self._sense = ContactSensing(
             self._kinematics,
             ToolWeight.of(known.robot),
-            plane,
+            plane(np.array(known.X_WA)),
             known.robot.indenter_radius_m,
             periods.step_s,
         )
@@ -88,16 +84,12 @@ class ExamSequence:
         self._skipped: dict[int, str] = {}
         self._trigger = False
         self._path: Array | None = None
+        self._touched: TouchedSkin | None = None
 
     @property
     def status(self) -> ExamStatus:
         """Where the examination stands."""
         return self._course.status
-
-    @property
-    def surface_offset(self) -> float:
-        """Outward shift of the perceived surface that the onset of force called for [m]."""
-        return 0.0 if self._course.palpation is None else self._course.palpation.surface_offset
 
     @property
     def skipped(self) -> dict[int, str]:
@@ -116,12 +108,14 @@ class ExamSequence:
             course.arm.hold(now.reading.q)
             course.enter(Phase.HOME, now.t, "going home")
         status.steady = status.force_limited = False
-        self._trigger, self._path = False, None
-        course.contact = self._sense.sense(now.reading)
+        self._trigger, self._path, self._touched = False, None, None
+        if now.motion is not None:
+            self._sense.wall.breath.hear(now.motion, now.t)
+        course.contact = self._sense.sense(now.reading, now.t)
         status.depth_setpoint = course.contact.depth
         self._stops.watch(now)
         setpoint = self._phases[status.phase](now) or course.arm.step(now.t, course.rate)
-        return ExamStep(setpoint, course.contact, self._trigger, self._path)
+        return ExamStep(setpoint, course.contact, self._trigger, self._path, self._touched)
 
     # --- before contact -----------------------------------------------------------------------------------------------
 
@@ -149,7 +143,7 @@ class ExamSequence:
                 self._look_again(now, f"look posture cannot be reached: {error}")
         elif isinstance(now.perceived, PerceivedAbdomen):
             course.perceived = now.perceived
-            self._sense.surface = now.perceived.surface
+            self._sense.wall = Wall(now.perceived.surface, self._sense.wall.breath)
             self.status.target_count, self.status.view_blocked = len(now.perceived.positions), False
             course.enter(Phase.PLAN, now.t, f"planning over {self.status.target_count} targets")
         elif isinstance(now.perceived, PerceptionFailure):
@@ -189,34 +183,32 @@ class ExamSequence:
 
     def _approach(self, now: Observation) -> Setpoint | None:
         course = self._course
-        assert now.reading is not None
         if not course.arm.arrived:
             course.since = now.t
-            self._sense.weight.start_tare()
-        elif now.t - course.since >= REST + TARE:
-            assert course.plan is not None and course.perceived is not None
+        elif now.t - course.since >= REST:
+            assert course.plan is not None
             course.palpation = Palpation(
                 course.plan.segments,
                 self._known.exam,
                 self._known.limits,
                 self._known.robot.indenter_radius_m,
                 self._periods.step_s,
-                course.perceived.noise,
+                self._sense.wall,
             )
-            course.enter(Phase.INDENT, now.t, StrokeStage.DESCEND.value)
             return self._palpate(now)
-        elif now.t - course.since >= REST:
-            self._sense.weight.tare(course.contact.R_WS, now.reading.wrench_S)
         return None
 
     # --- in contact ---------------------------------------------------------------------------------------------------
 
     def _palpate(self, now: Observation) -> Setpoint | None:
         course = self._course
-        assert course.palpation is not None
+        assert course.palpation is not None and now.reading is not None
         step = course.palpation.step(now.t, course.contact, course.rate)
         self._report(step, course.palpation, now.t)
-        self._sense.surface.offset = course.palpation.surface_offset
+        if step.taring:
+            self._sense.weight.tare(course.contact.R_WS, now.reading.wrench_S)
+        else:
+            self._sense.weight.start_tare()
         if step.stage is StrokeStage.DONE:
             course.go_home(now, course.palpation.failed)
         return step.setpoint
@@ -224,10 +216,12 @@ class ExamSequence:
     def _report(self, step: PalpationStep, palpation: Palpation, t: int) -> None:
         status = self.status
         self._skipped |= palpation.skipped
+        self._touched, status.stroke = step.touched, palpation.stroke
+        status.patient_moved = self._sense.wall.breath.moved
         status.steady, status.force_limited = step.steady, step.limited
         status.depth_setpoint, status.target_index = step.depth_setpoint, step.target
         status.targets_skipped = len(self._skipped)
-        phase, message = PHASE_OF[step.stage], palpation.failed or step.stage.value
+        phase, message = PHASE_OF[step.stage], palpation.failed or palpation.left or step.stage.value
         if phase is not status.phase or message != status.message:
             self._course.enter(phase, t, message)
 

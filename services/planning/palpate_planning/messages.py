@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_bus.messages import ExamState, Path, Point, PoseStamped, Vector3
+from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header
 from palpate_models.frames import Array
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.status import ExamStatus
+from palpate_planning.wall import TouchedSkin
 
 
 def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None) -> Message:
     """`palpation_msgs/ExamState`; without a contact (the robot has not been heard of) nothing is measured."""
-    p = np.zeros(3) if contact is None else contact.p_W
-    n = np.array((0.0, 0.0, 1.0)) if contact is None else contact.n_W
+    p, n = np.zeros(3), np.array((0.0, 0.0, 1.0))
+    if contact is not None:
+        n = contact.foot.n_W
+        p = contact.foot.p_W + contact.correction * n
     return ExamState(
         header=header(t, "world"),
         phase=int(status.phase),
@@ -34,6 +37,18 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
         surface_point=Point(*p.tolist()),
         surface_normal=Vector3(*n.tolist()),
         end_tick=status.end_tick,
+        depth_uncertainty=0.0 if contact is None else contact.uncertainty,
+        wall_displacement=0.0 if contact is None else contact.displacement,
+        stroke=status.stroke,
+        patient_moved=status.patient_moved,
+    )
+
+
+def touch_message(t: int, touched: TouchedSkin) -> Message:
+    """`palpation_msgs/SkinTouch` of a touch at `t` [ns]."""
+    point = Point(*touched.p_W.tolist())
+    return SkinTouch(
+        header(t, "world"), point, touched.stroke, touched.height, touched.sigma, touched.expected, touched.expected_sigma
     )
 
 

@@ -1,4 +1,4 @@
-"""The sequence of the strokes: descend, indent, slide or hold at depth, lift, move over to the next."""
+"""The sequence of the strokes: rest, descend to the touch, indent, slide or hold at depth, lift, move over to the next."""
 
 from __future__ import annotations
 
@@ -11,21 +11,15 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.contact_onset import ContactOnset
+from palpate_planning.descent import ALLOWANCE_M, SIGMAS, Descent
 from palpate_planning.recovery import MOVED_M, Recovery
 from palpate_planning.segments import HOVER_M, Segment
-from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
+from palpate_planning.stroke_motion import StrokeMotion
+from palpate_planning.wall import TouchedSkin, Wall
+from palpate_planning.wall_watch import WallWatch
 
-SLOW_M = 0.003
-"""Nearer to the surface than this the indenter descends slowly: more than the surface can be wrong after the first touch."""
-HOP_M = 0.008
-"""Height of short ways between strokes ..."""
-HOP_LENGTH_M = 0.05
-"""... shorter than this; on longer ones and on free motions it is `HOVER_M`."""
-DESCEND_MPS = 0.08
-PROBE_MPS = 0.008
-"""Speed of the first descent, in which the onset of force is sought, from `PROBE_M` above the surface on."""
-PROBE_M = 0.008
+HOP_M = 0.010
+"""Least height of the ways between strokes; it is `HOVER_M` on free motions, and where the surface is not known well."""
 LIFT_MPS = 0.12
 SETTLED_M = 0.0005
 """Depth error at which an indentation counts as settled ..."""
@@ -39,11 +33,14 @@ STEADY_FRACTION = 0.5
 """Samples count from this part of the path's speed on."""
 STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
+REPEAT_M = 0.010
+"""So much of the stroke before the interruption is repeated: it is noticed after about 0.2 s."""
 
 
 class StrokeStage(Enum):
     """Part of a stroke."""
 
+    REST = "resting above the skin"
     DESCEND = "descending"
     SETTLE = "settling at depth"
     SLIDE = "sliding at depth"
@@ -71,6 +68,10 @@ class PalpationStep(NamedTuple):
     """Whether force keeps the indenter from the depth asked for."""
     target: int
     """Index of the latest target reached."""
+    taring: bool = False
+    """Whether the arm rests in free air: what the sensor reads now is bias."""
+    touched: TouchedSkin | None = None
+    """The touch of this step, if there was one."""
 
 
 class Palpation:
@@ -83,20 +84,25 @@ class Palpation:
         limits: Limits,
         radius: float,
         period_s: float,
-        surface_noise: float = 0.0,
+        wall: Wall,
     ) -> None:
-        """`radius` of the sphere [m]; `surface_noise`: standard deviation of the perceived surface [m]."""
+        """`radius` of the sphere [m]; `wall`: what is pressed, and learns from every touch."""
         self._segments, self._exam, self._limits, self._period_s = segments, exam, limits, period_s
-        self._motion = StrokeMotion(exam, limits, radius, period_s)
+        self._watch = WallWatch(wall.breath, exam.breathing, period_s)
+        self.left = ""
+        """Why the strokes end early, in good order; empty if they do not."""
+        self._motion = StrokeMotion(exam, limits, radius, period_s, wall)
         self._recovery = Recovery(exam, limits, period_s)
-        self._onset = ContactOnset(surface_noise)
+        self._descent = Descent(self._motion, exam.depth_m, period_s)
         self._number = -1
+        self._joined = False
+        """Whether the commanded depth is where the arm is; after a free motion it is measured first."""
         self._next_segment()
 
     @property
-    def surface_offset(self) -> float:
-        """Outward shift of the perceived surface that the onset of force asks for [m]."""
-        return self._motion.surface_offset
+    def stroke(self) -> int:
+        """Number of the latest descent, 0 before the first."""
+        return self._descent.stroke
 
     @property
     def skipped(self) -> dict[int, str]:
@@ -122,6 +128,18 @@ class Palpation:
         if self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
             self._enter(StrokeStage.LIFT)
 
+    def leave(self, why: str) -> None:
+        """Lifts off and ends, in good order: what is left of the plan counts as skipped."""
+        if self.left or self.stage is StrokeStage.DONE:
+            return
+        self.left = why
+        ahead = [i for segment in self._segments[self._number + 1 :] for i in segment.path.targets if segment.contact]
+        path = self._motion.segment.path
+        ahead += list(path.targets[path.visits > self._motion.along.position]) if self._motion.segment.contact else []
+        self._recovery.skipped |= {int(i): why for i in ahead}
+        if self.stage is not StrokeStage.LIFT:
+            self._enter(StrokeStage.LIFT)
+
     def pause(self) -> None:
         """Lifts off along the normal and waits there; `resume` comes back to where it was."""
         self._recovery.paused = True
@@ -130,15 +148,16 @@ class Palpation:
             self._recovery.resume_at = min(stop, self._motion.segment.path.length)
             self._enter(StrokeStage.LIFT)
 
-    def resume(self, contact: ContactMeasurement) -> None:
-        """Goes on after a pause, from where the arm is now: while the driver held, the tissue has pushed it.
+    def resume(self, t: int, contact: ContactMeasurement) -> None:
+        """At `t` [ns], goes on after a pause, from where the arm is now: while the driver held, the tissue has pushed it.
 
         Sideways too: what is on the path may be deep in the tissue, and the arm is not to be drawn through it.
         """
         self._recovery.paused = False
         if self._motion.segment.free is not None:
             return
-        aside = self._recovery.measure_displacement(contact, self._motion.point, self._motion.centre_height)
+        centre_height = self._motion.centre_height(t)
+        aside = self._recovery.measure_displacement(contact, self._motion.point, centre_height)
         if aside > MOVED_M:
             self.abandon(f"the arm was moved {aside * 1e3:.0f} mm aside while it was held")
         self._motion.restart(contact)
@@ -153,29 +172,44 @@ class Palpation:
     def step(self, t: int, contact: ContactMeasurement, rate: float = 1.0) -> PalpationStep:
         """One planning period on, at `t` [ns], given the measured contact; `rate` as in `RestartRamp`."""
         self._time += self._period_s
+        self._descent.taring, self._descent.touched = False, None
         self._recovery.return_to_path(contact)
         if contact.force > self._limits.force_soft_stop_n and self.stage in PRESSING:
             self._recovery.soft_stop(contact.force, self._motion.segment.path, self._motion.along.position)
             self._enter(StrokeStage.LIFT)
+        self._heed_the_wall(t, contact)
         if self.stage is StrokeStage.SLIDE:
             self._slide()
         elif self.stage is StrokeStage.LIFT:
-            self._lift()
+            self._lift(t)
         elif self.stage is StrokeStage.TRANSFER:
             self._transfer(rate)
+        elif self.stage is StrokeStage.REST:
+            self._rest(contact)
         elif self.stage is StrokeStage.DESCEND:
-            self._descend(contact)
+            self._descend(t, contact)
         elif self.stage is StrokeStage.SETTLE:
             self._settle(contact)
-        elif self.stage is StrokeStage.HOLD and self._time >= HOLD_S:
-            self._enter(StrokeStage.LIFT)
+        elif self.stage is StrokeStage.HOLD:
+            self._hold()
         self._motion.regulate(contact, in_contact=contact.touching and self.stage is not StrokeStage.LIFT)
         return self._report(t, contact, rate)
 
+    def _heed_the_wall(self, t: int, contact: ContactMeasurement) -> None:
+        """Lifts off where the wall does what was not expected; that piece of the stroke is repeated."""
+        sliding = self.stage is StrokeStage.SLIDE
+        self._watch.step(t, adrift=sliding and not contact.touching)
+        if self._watch.ended:
+            self.leave(self._watch.ended)
+        elif self._watch.spoiled and self.stage in PRESSING:
+            self._recovery.resume_at = max(self._motion.along.position - (REPEAT_M if sliding else 0.0), 0.0)
+            self._enter(StrokeStage.LIFT)
+
     def _enter(self, stage: StrokeStage) -> None:
         self.stage = stage
-        self._time = 0.0
-        self._settled = 0.0
+        self._time = self._settled = self._held = 0.0
+        if stage is StrokeStage.REST:
+            self._descent.start()
 
     def _next_segment(self) -> None:
         if self._number + 1 == len(self._segments):
@@ -184,31 +218,34 @@ class Palpation:
         self._number += 1
         segment = self._segments[self._number]
         self._motion.start(segment)
-        self._enter(StrokeStage.DESCEND if segment.contact else StrokeStage.TRANSFER)
+        self._joined = self._joined and segment.free is None
+        self._enter(StrokeStage.REST if segment.contact else StrokeStage.TRANSFER)
 
-    def _descend(self, contact: ContactMeasurement) -> None:
-        if not self._onset.done:
-            self._probe(contact)
-            return
-        there = self._motion.deepen() if self._nearer_than(SLOW_M) else self._motion.depth.step(self._exam.depth_m, DESCEND_MPS)
-        stopped = self._motion.slowdown(0.7, 1.0, 0.0) < STOPPED
-        self._settled = self._settled + self._period_s if stopped else 0.0
-        if there or self._settled > SETTLED_S:  # at depth, or as deep as the force allows
-            self._enter(StrokeStage.SETTLE)
+    def _rest(self, contact: ContactMeasurement) -> None:
+        """Above the skin, in free air, until the sensor is tared."""
+        if not self._joined:
+            self._motion.restart(contact)
+            self._joined = True
+        height = _clearance(contact.uncertainty)
+        if not self._watch.calm or self._recovery.displacement is not None:
+            self._descent.start()
+        if not self._recovery.paused and self._descent.rest(height, LIFT_MPS):
+            self._enter(StrokeStage.DESCEND)
 
-    def _probe(self, contact: ContactMeasurement) -> None:
-        """The first descent: slow, down to where the tissue begins, wherever the camera said it would be."""
-        speed = PROBE_MPS if self._nearer_than(PROBE_M) else DESCEND_MPS
-        self._onset.add(contact.depth, contact.force)
-        if self._onset.done:
-            self._motion.shift_surface(self._onset.correction())
-        elif self._motion.depth.step(self._limits.depth_m, speed):
-            self.abandon(f"no tissue felt down to {self._limits.depth_m * 1e3:.0f} mm below the perceived surface")
-
-    def _nearer_than(self, height: float) -> bool:
-        """Whether the indenter, were it to brake now, would come nearer to the surface than `height` [m]."""
-        depth = self._motion.depth
-        return depth.position > -height - depth.velocity**2 / DEPTH_ACCELERATION
+    def _descend(self, t: int, contact: ContactMeasurement) -> None:
+        """Down to the skin, and once it is touched down to depth, or as deep as the force allows."""
+        if not self._descent.probe(contact, t):
+            if self._descent.missed:
+                end = self.abandon if self.stroke == 1 else self.leave
+                end(self._descent.missed)
+        elif self._motion.segment.touch:
+            self._enter(StrokeStage.LIFT)
+        else:
+            there = self._motion.deepen()
+            stopped = self._motion.slowdown(0.7, 1.0, 0.0) < STOPPED
+            self._settled = self._settled + self._period_s if stopped else 0.0
+            if there or self._settled > SETTLED_S:
+                self._enter(StrokeStage.SETTLE)
 
     def _settle(self, contact: ContactMeasurement) -> None:
         self._motion.deepen()
@@ -219,30 +256,37 @@ class Palpation:
 
     def _slide(self) -> None:
         self._motion.deepen()
-        if self._motion.slide():
+        if not self._watch.open:
+            self._motion.brake()
+        elif self._motion.slide():
             self._enter(StrokeStage.LIFT)
 
-    def _lift(self) -> None:
+    def _hold(self) -> None:
+        self._held += self._period_s if self._watch.open else 0.0
+        if self._held >= HOLD_S:
+            self._enter(StrokeStage.LIFT)
+
+    def _lift(self, t: int) -> None:
         self._motion.brake()
-        if not self._motion.depth.step(-self._height, LIFT_MPS) or self._recovery.paused:
+        if not self._motion.depth.step(-self._height(t), LIFT_MPS) or self._recovery.paused:
             return
-        if self.failed:
+        if self.failed or self.left:
             self._enter(StrokeStage.DONE)
-        elif self._recovery.displacement is not None:
+        elif not self._watch.calm or self._recovery.displacement is not None:
             return
         elif self._recovery.resume_at is not None:
             self._enter(StrokeStage.TRANSFER)
         else:
             self._next_segment()
 
-    @property
-    def _height(self) -> float:
-        """How high to lift [m]: low before a short way, or to hop on within the stroke."""
-        if self.failed or self._number == len(self._segments) - 1:
+    def _height(self, t: int) -> float:
+        """How high to lift at `t` [ns]; in metres."""
+        if self.failed or self.left or not self._watch.calm or self._number == len(self._segments) - 1:
             return HOVER_M
-        way = self._segments[self._number + 1]
-        short = way.free is None and way.path.length < HOP_LENGTH_M
-        return HOP_M if self._recovery.resume_at is not None or short else HOVER_M
+        if self._recovery.resume_at is not None:
+            return HOP_M
+        way, wall = self._segments[self._number + 1], self._motion.wall
+        return HOVER_M if way.free is not None else _clearance(wall.sigma(wall.perceived.xy(way.path.p[-1]), t))
 
     def _transfer(self, rate: float) -> None:
         motion, recovery = self._motion, self._recovery
@@ -258,7 +302,7 @@ class Palpation:
                 self._next_segment()
         elif motion.travel(recovery.resume_at):
             recovery.resume_at = None
-            self._enter(StrokeStage.DESCEND)
+            self._enter(StrokeStage.REST)
 
     def _report(self, t: int, contact: ContactMeasurement, rate: float) -> PalpationStep:
         motion = self._motion
@@ -269,5 +313,17 @@ class Palpation:
             setpoint = self._recovery.displacement.move(setpoint)
         limited = motion.regulation.limited or (motion.short_of_depth and self.stage in AT_DEPTH)
         fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
-        steady = contact.touching and (self.stage is StrokeStage.HOLD or (self.stage is StrokeStage.SLIDE and fast))
-        return PalpationStep(setpoint, self.stage, motion.regulation.reference, steady, limited, motion.target)
+        steady = (
+            contact.touching
+            and self._watch.open
+            and (self.stage is StrokeStage.HOLD or (self.stage is StrokeStage.SLIDE and fast))
+        )
+        descent = self._descent
+        return PalpationStep(
+            setpoint, self.stage, motion.regulation.reference, steady, limited, motion.target, descent.taring, descent.touched
+        )
+
+
+def _clearance(sigma: float) -> float:
+    """Height [m] at which the skin, known within `sigma` [m], is surely not touched, and from which it is sought."""
+    return min(max(HOP_M, SIGMAS * sigma + ALLOWANCE_M), HOVER_M)

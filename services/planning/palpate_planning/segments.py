@@ -18,8 +18,9 @@ from palpate_planning.scene import CollisionScene
 from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import JointTrajectory
 
-HOVER_M = 0.02
-"""Height of the sphere's deepest point above the surface before, between and after strokes."""
+HOVER_M = 0.025
+"""Height of the sphere's deepest point above the surface before, between and after strokes: twice what the perceived surface is
+usually wrong by (`surface_correction`)."""
 POSTURE_EVERY = 4
 """Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
 REACH = "out of the arm's reach"
@@ -36,6 +37,8 @@ class Segment:
     """On the surface; of a free motion only its ends count."""
     contact: bool
     """At depth; else above the surface, on the way to the next stroke."""
+    touch: bool = False
+    """Whether the skin is only touched, not pressed."""
     free: JointTrajectory | None = None
     """A free motion, where the straight way above the surface cannot be taken."""
 
@@ -100,7 +103,7 @@ class SegmentPlanner:
                     layout.dropped[int(piece.targets[0])] = f"no way to it: {why}"
                 else:
                     layout.segments.append(segment)
-            layout.segments.append(Segment(path, contact=True))
+            layout.segments.append(Segment(path, contact=True, touch=piece.touch))
         return layout
 
     def hover(self, piece: Stroke, end: int) -> Array | None:

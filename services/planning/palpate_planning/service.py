@@ -17,12 +17,13 @@ from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.scenario import ExamInput, Following, Scenario
 from palpate_planning.background import WORKER
+from palpate_planning.breath import Motion, motion_of
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
-from palpate_planning.messages import path_message, state_message
+from palpate_planning.messages import path_message, state_message, touch_message
 from palpate_planning.periods import Periods
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 from palpate_planning.surface import PerceivedSurface
@@ -65,6 +66,7 @@ class PlanningService(Service):
                 t=t,
                 reading=self._reading,
                 perceived=self._perceived(inbox),
+                motion=self._motion(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
                 stop=stop,
                 soft=soft,
@@ -80,6 +82,8 @@ class PlanningService(Service):
         }
         if step.trigger:
             outbox["planning/camera_trigger"] = CameraTrigger(header(t), self._known.camera.frames)
+        if step.touched is not None:
+            outbox["exam/touches"] = touch_message(t, step.touched)
         if step.path is not None:
             outbox["planning/path"] = path_message(t, step.path)
         return outbox
@@ -94,7 +98,6 @@ class PlanningService(Service):
             "skipped_targets": {str(i): why for i, why in sorted(self._exam.skipped.items())},
             "peak_force_N": self._peak_force,
             "unreadable_statuses": self._unreadable,
-            "surface_offset_m": self._exam.surface_offset,
         }
 
     def _read(self, status: Message) -> None:
@@ -124,7 +127,7 @@ class PlanningService(Service):
         vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
         normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
         try:
-            surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA)
+            surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA, np.asarray(mesh.breathing))
         except ValueError as error:
             return PerceptionFailure(f"perception/surface: {error}")
         return PerceivedAbdomen(
@@ -133,8 +136,12 @@ class PlanningService(Service):
             vertices=vertices,
             triangles=np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3),
             surface=surface,
-            noise=float(targets.surface_noise),
         )
+
+    def _motion(self, inbox: Inbox) -> Motion | None:
+        """The wall's newest motion, if there is one and it is to be followed."""
+        heard = [motion_of(message) for message in inbox.new("perception/motion")]
+        return heard[-1] if heard and self._known.exam.breathing is not Following.IGNORE else None
 
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
         """Roles that are needed and gone. A supervisor silent for longer than a set-point is valid is gone, too."""

@@ -8,9 +8,11 @@ from typing import Final, NamedTuple
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.frames import Array
+from palpate_planning.breath import Motion
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.palpation import StrokeStage
+from palpate_planning.wall import TouchedSkin
 
 
 class Phase(IntEnum):
@@ -31,6 +33,7 @@ class Phase(IntEnum):
 
 
 PHASE_OF: Final = {
+    StrokeStage.REST: Phase.INDENT,
     StrokeStage.DESCEND: Phase.INDENT,
     StrokeStage.SETTLE: Phase.INDENT,
     StrokeStage.SLIDE: Phase.SCAN,
@@ -62,6 +65,8 @@ class Observation(NamedTuple):
     """None before the first joint states."""
     perceived: PerceivedAbdomen | PerceptionFailure | None = None
     """Perception's answer, at the step at which it came."""
+    motion: Motion | None = None
+    """Perception's newest word about the breath, at the step at which it came."""
     findings_final: bool = False
     """Whether the assessment has sent its final findings."""
     stop: str = ""
@@ -90,6 +95,10 @@ class ExamStatus:
     """[m]"""
     end_tick: int = -1
     """When the run is to end [ns]; -1 until that is known."""
+    stroke: int = 0
+    """Number of the latest descent, 0 before the first."""
+    patient_moved: bool = False
+    """Whether the patient has moved since the surface was perceived."""
 
 
 @dataclass(slots=True)
@@ -103,3 +112,5 @@ class ExamStep:
     """Ask the camera for a burst now."""
     path: Array | None = None
     """Planned poses of the indenter at depth, shape (n, 4, 4), once."""
+    touched: TouchedSkin | None = None
+    """The touch of this step, if there was one."""

@@ -86,7 +86,7 @@ class Stops:
         if palpation is None:
             return
         if goal is None:
-            palpation.resume(course.contact)
+            palpation.resume(now.t, course.contact)
         else:
             palpation.skip_free_motion()
 

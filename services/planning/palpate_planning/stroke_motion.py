@@ -9,9 +9,11 @@ from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
 from palpate_planning.path import ACCELERATION, PathPoint
+from palpate_planning.periods import SECOND
 from palpate_planning.segments import HOVER_M, Segment
 from palpate_planning.setpoints import NORMAL_STIFFNESS, cartesian_setpoint, joint_setpoint
 from palpate_planning.timing import JerkLimitedAxis
+from palpate_planning.wall import Wall
 
 DEPTH_ACCELERATION = 0.5
 """[m/s^2]"""
@@ -49,12 +51,11 @@ def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sink
 class StrokeMotion:
     """Moves the commanded indenter along one segment after the other, and up and down, within speed and acceleration."""
 
-    def __init__(self, exam: Exam, limits: Limits, radius: float, period_s: float) -> None:
-        """`radius` of the sphere [m]."""
+    def __init__(self, exam: Exam, limits: Limits, radius: float, period_s: float, wall: Wall) -> None:
+        """`radius` of the sphere [m]; depth is counted from the `wall` where it is at the moment."""
         self._exam, self._limits, self._radius, self._period_s = exam, limits, radius, period_s
+        self.wall = wall
         self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
-        self.surface_offset = 0.0
-        """Outward shift of the perceived surface that the onset of force asks for [m]."""
         self.regulation = Regulation(-HOVER_M, 0.0, -HOVER_M, 0.0, False, 0.0)
         self.depth = self._depth_axis(-HOVER_M)
         """Target depth [m], negative above the surface."""
@@ -83,11 +84,10 @@ class StrokeMotion:
         self.depth = self._depth_axis(contact.depth)
         self.along = self._path_axis(self.along.position)
 
-    def shift_surface(self, onset: float) -> None:
-        """Counts depth from where force set in, at depth `onset` [m]; the commanded position stays where it is."""
-        self.surface_offset -= onset
-        self.depth.shift(-onset)
-        self._regulator.shift(-onset)
+    def shift(self, outward: float) -> None:
+        """The wall is found to be `outward` [m] of where it was counted from: the commanded position stays where it is."""
+        self.depth.shift(outward)
+        self._regulator.shift(outward)
 
     @property
     def point(self) -> PathPoint:
@@ -99,10 +99,9 @@ class StrokeMotion:
         """Index of the latest target reached."""
         return self.segment.path.target(self.along.position + 1e-6)
 
-    @property
-    def centre_height(self) -> float:
-        """Distance of the sphere's centre from the perceived surface at zero depth [m]."""
-        return self._radius + self.surface_offset
+    def centre_height(self, t: int) -> float:
+        """Distance of the sphere's centre from the perceived surface at zero depth, at `t` [ns]; in metres."""
+        return self._radius + self.wall.outward(self.point.p, t)
 
     @property
     def stopping_distance(self) -> float:
@@ -155,6 +154,8 @@ class StrokeMotion:
         if self.segment.free is not None:
             q, qd = self.segment.free.at(self._sample)
             return joint_setpoint(t, contact.X_WI, q, rate * qd)
-        regulation = self.regulation
-        distance = self.centre_height - regulation.depth
-        return stroke_setpoint(t, self.point, self.along.velocity, distance, regulation.rate, regulation.force)
+        regulation, point, speed, dt = self.regulation, self.point, self.along.velocity, self._period_s
+        outward = self.wall.outward(point.p, t)
+        rising = (self.wall.outward(point.p + point.dp * speed * dt, t + round(dt * SECOND)) - outward) / dt
+        distance = self._radius + outward - regulation.depth
+        return stroke_setpoint(t, point, speed, distance, regulation.rate - rising, regulation.force)

@@ -6,6 +6,8 @@ are smooth enough to regulate depth against: a mesh's facets would show as rippl
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NdBSpline, NearestNDInterpolator, make_interp_spline
 
@@ -41,18 +43,31 @@ class BicubicField:
         return np.asarray(NdBSpline((knots_x, knots_y), coefficients, 3)(np.clip(xy, self._low, self._high)))
 
 
+class Foot(NamedTuple):
+    """The foot of a perpendicular on the surface."""
+
+    p_W: Array
+    """[m], shape (3,)."""
+    n_W: Array
+    """Outward unit normal there, shape (3,)."""
+    distance: float
+    """Signed length of the perpendicular [m], positive outward."""
+    xy_A: Array
+    """Where it is in A's xy plane [m], shape (2,)."""
+
+
 class PerceivedSurface:
     """The perceived surface z = h(x, y) in frame A with outward normals. Points in and out are in W unless named otherwise."""
 
-    def __init__(self, X_WA: Array, field: BicubicField) -> None:
+    def __init__(self, X_WA: Array, field: BicubicField, mode: BicubicField | None = None) -> None:
+        """`mode`: see `breathing`, without it nothing moves."""
         self._X_WA = X_WA
-        self._field = field
-        self.offset = 0.0
-        """Shift of the whole surface along its outward normals [m], from the onset of force."""
+        self._field, self._mode = field, mode
 
     @staticmethod
-    def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array) -> PerceivedSurface:
-        """Fits the field to a mesh: vertices [m] shape (n, 3), outward unit normals of the same shape or None.
+    def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array, breathing: Array | None = None) -> PerceivedSurface:
+        """Fits the field to a mesh: vertices [m] shape (n, 3), outward unit normals of the same shape or None, and at each
+        vertex how far breathing moves it, shape (n,), or None where nothing is known to move.
 
         Slopes come from the normals where they are given (perception smooths them), else from the heights. Outside the
         mesh the nearest vertex's height and slope hold. Raises ValueError for fewer than four vertices, no extent, or what is not
@@ -75,15 +90,20 @@ class PerceivedSurface:
             n_A = np.asarray(normals_W, dtype=float) @ X_WA[:3, :3]
             up = np.maximum(n_A[:, 2], 1.0 / STEEPEST)
             columns += [-n_A[:, 0] / up, -n_A[:, 1] / up]
+        heights = len(columns)
+        if breathing is not None and len(breathing):
+            columns.append(breathing)
         given = np.stack(columns, axis=1)
         values = np.asarray(LinearNDInterpolator(xy, given)(grid))
         outside = np.isnan(values[..., 0])
         if outside.any():
             values[outside] = NearestNDInterpolator(xy, given)(grid[outside])
-        if len(columns) == 1:
+        mode = BicubicField(axes[0], axes[1], values[..., heights:]) if heights < len(columns) else None
+        values = values[..., :heights]
+        if heights == 1:
             slopes = np.gradient(values[..., 0], *axes)
             values = np.stack((values[..., 0], *slopes), axis=-1)
-        return PerceivedSurface(X_WA, BicubicField(axes[0], axes[1], values))
+        return PerceivedSurface(X_WA, BicubicField(axes[0], axes[1], values), mode)
 
     @staticmethod
     def plane(X_WA: Array) -> PerceivedSurface:
@@ -97,19 +117,27 @@ class PerceivedSurface:
         p_A = np.column_stack((xy_A, values[:, 0]))
         n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
         n_A /= np.linalg.norm(n_A, axis=1, keepdims=True)
-        return apply(self._X_WA, p_A + self.offset * n_A), n_A @ self._X_WA[:3, :3].T
+        return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
 
-    def nearest(self, c_W: Array) -> tuple[Array, Array, float]:
-        """Foot of the perpendicular from c_W, shape (3,): surface point, outward normal (world), signed distance [m].
+    def xy(self, p_W: Array) -> Array:
+        """Where a point of the surface, shape (3,), is in A's xy plane [m], shape (2,)."""
+        return np.asarray(((p_W - self._X_WA[:3, 3]) @ self._X_WA[:3, :3])[:2])
+
+    def breathing(self, xy_A: Array) -> float:
+        """How far the wall moves outward at a place, shape (2,), relative to where breathing moves it most."""
+        return 0.0 if self._mode is None else float(bicubic_at(self._mode.spline, xy_A[0], xy_A[1])[0])
+
+    def nearest(self, c_W: Array) -> Foot:
+        """Foot of the perpendicular from c_W, shape (3,).
 
         Fixed point: slide the foot by the tangential part of what separates it from c. Converges at the rate of distance
         over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
         """
-        return foot(self._field.spline, self._X_WA, self.offset, np.ascontiguousarray(c_W))
+        return Foot(*foot(self._field.spline, self._X_WA, np.ascontiguousarray(c_W)))
 
 
 @compiled
-def foot(field: BicubicSpline, X_WA: Array, offset: float, c_W: Array) -> tuple[Array, Array, float]:
+def foot(field: BicubicSpline, X_WA: Array, c_W: Array) -> tuple[Array, Array, float, Array]:
     """`PerceivedSurface.nearest` from the parts of the surface."""
     R_WA, p_WA = X_WA[:3, :3].copy(), X_WA[:3, 3]
     c_A = (c_W - p_WA) @ R_WA
@@ -126,4 +154,4 @@ def foot(field: BicubicSpline, X_WA: Array, offset: float, c_W: Array) -> tuple[
         if size < CONVERGED_M:
             break
         xy_A = xy_A + min(1.0, STRIDE_M / size) * slide
-    return R_WA @ (p_A + offset * n_A) + p_WA, R_WA @ n_A, distance - offset
+    return R_WA @ p_A + p_WA, R_WA @ n_A, distance, p_A[:2]

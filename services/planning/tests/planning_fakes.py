@@ -14,6 +14,7 @@ from palpate_models.frames import Array, apply
 from palpate_models.load import exam_input
 from palpate_models.scenario import Exam as ExamSettings
 from palpate_models.scenario import ExamInput, Robot, Scenario
+from palpate_planning.breath import FORECAST_STEP, Motion
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
@@ -52,18 +53,18 @@ def grid_mesh(half: tuple[float, float], step: float = 0.006) -> tuple[Array, ND
 
 
 def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
-    """What a perfect perception gives: surface and targets in snake or raster order."""
+    """What a perfect perception gives: surface, all of which breathes alike, and targets in snake or raster order."""
     X_WA = np.array(settings.X_WA)
     exam = settings.exam
     half = (exam.region_m[0] / 2 + 0.04, exam.region_m[1] / 2 + 0.04)
     vertices, triangles = grid_mesh(half)
     p_W = apply(X_WA, vertices)
-    surface = PerceivedSurface.from_mesh(p_W, None, X_WA)
+    surface = PerceivedSurface.from_mesh(p_W, None, X_WA, np.ones(len(p_W)))
     nx, ny = (round(size / exam.spacing_m) + 1 for size in exam.region_m)
     xy, lines = [], []
     for j, y in enumerate(np.linspace(-exam.region_m[1] / 2, exam.region_m[1] / 2, ny)):
         x = np.linspace(-exam.region_m[0] / 2, exam.region_m[0] / 2, nx)
-        for value in x[:: -1 if exam.pattern == "snake" and j % 2 else 1]:
+        for value in x[:: -1 if exam.pattern != "raster" and j % 2 else 1]:
             xy.append((value, y))
             lines.append(j)
     points, _ = surface.at(np.array(xy))
@@ -78,8 +79,19 @@ def hertz(newton_at_10mm: float) -> Callable[[float], float]:
 class World:
     """Closes the loop about an `Exam`, one planning period a step."""
 
-    def __init__(self, settings: ExamInput, force: Callable[[float], float] | None = None, offset: float = 0.0) -> None:
-        """`force` by true depth; the true surface lies `offset` [m] outward of the perceived one."""
+    def __init__(
+        self,
+        settings: ExamInput,
+        force: Callable[[float], float] | None = None,
+        offset: float = 0.0,
+        excursion: Callable[[float], float] | None = None,
+    ) -> None:
+        """`force` by true depth; the true surface lies `offset` [m] outward of the perceived one, and `excursion` [m] more at a
+        time [s], which perception forecasts as it is, every 0.1 s; without it nothing is said about a motion.
+        """
+        self.excursion = excursion
+        self.calm, self.moved = True, False
+        """What is said about the motion."""
         self.settings, self.force = settings, force or hertz(2.4)
         self.exam = ExamSequence(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
@@ -88,7 +100,7 @@ class World:
         self.q = np.array(lbr.HOME)
         self.dome = seen_dome(settings)
         self.truth = seen_dome(settings).surface
-        self.truth.offset = offset
+        self.offset = offset
         self.t = 0
         self.depth = self.pressed = 0.0
         self.answers: list[PerceivedAbdomen | PerceptionFailure] = [self.dome]
@@ -101,8 +113,10 @@ class World:
 
     def _touch(self, X_WI: Array) -> Array:
         """Contact force on the tool at a pose, world axes; sets true depth and force."""
-        _, n, distance = self.truth.nearest(X_WI[:3, 3])
-        self.depth = self.settings.robot.indenter_radius_m - distance
+        _, n, distance, _ = self.truth.nearest(X_WI[:3, 3])
+        self.depth = self.settings.robot.indenter_radius_m - distance + self.offset
+        if self.excursion is not None:
+            self.depth += self.excursion(self.t / SECOND)
         self.pressed = self.force(self.depth)
         return n * self.pressed
 
@@ -137,7 +151,8 @@ class World:
             answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
         final = self.exam.status.phase is Phase.ASSESS
         reading = SensorReading(self.q.copy(), wrench, qd)
-        outcome = self.exam.step(Observation(self.t, reading, answer, final, self.stop, self.soft, self.end, self.lost))
+        motion = self._motion() if self.excursion is not None and self.t % (100 * MS) == 0 else None
+        outcome = self.exam.step(Observation(self.t, reading, answer, motion, final, self.stop, self.soft, self.end, self.lost))
         self.end = ""
         if outcome.trigger:
             self._answer_at = self.t + 300 * MS
@@ -148,6 +163,13 @@ class World:
             self._obey(outcome.setpoint)
         self.t += PERIODS.step
         return outcome
+
+    def _motion(self) -> Motion:
+        """Perception's word about an exposure 0.1 s ago."""
+        assert self.excursion is not None
+        stamp = self.t - 100 * MS
+        forecast = np.array([self.excursion((stamp + k * FORECAST_STEP) / SECOND) for k in range(11)])
+        return Motion(stamp, forecast, 3e-4, self.calm, self.moved)
 
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
         """Steps until the exam has ended (or `until`), at most `seconds` of simulated time."""

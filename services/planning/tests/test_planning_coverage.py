@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate_models.scenario import Mode, Pattern
-from palpate_planning.coverage import SAMPLE_M, strokes, transfer
+from palpate_planning.coverage import SAMPLE_M, TOUCHES_M, strokes, touches, transfer
 
 SPACING = 0.0125
 
@@ -79,3 +79,15 @@ def test_transfer_is_straight_and_may_be_nothing() -> None:
     assert way[0].tolist() == [0, 0]
     assert way[-1] == pytest.approx((0.03, 0.04))
     assert len(transfer(np.zeros(2), np.zeros(2))) == 1
+
+
+def test_touches_are_spread_over_all_that_is_usable() -> None:
+    xy, _ = grid(17, 17, snake=True)
+    usable = np.ones(len(xy), dtype=bool)
+    usable[:40] = False
+    spread = touches(xy, usable)
+    assert all(piece.touch and len(piece.xy) == 1 and usable[piece.targets[0]] for piece in spread)
+    places = np.array([piece.xy[0] for piece in spread])
+    assert len(places) == 9
+    assert np.linalg.norm(xy[usable][:, None] - places, axis=-1).min(axis=1).max() < TOUCHES_M
+    assert touches(xy, np.zeros(len(xy), dtype=bool)) == []

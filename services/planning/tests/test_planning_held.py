@@ -104,7 +104,7 @@ def drawn_sideways(world: World) -> float:
     begun, worst = len(world.rows), 0.0
     while world.exam.status.end_tick < 0 and len(world.rows) < begun + 500:
         p_W = world.kinematics.pose(world.q)[:3, 3]
-        _, n, distance = world.truth.nearest(p_W)
+        _, n, distance, _ = world.truth.nearest(p_W)
         setpoint = world.step().setpoint
         if world.settings.robot.indenter_radius_m > distance and setpoint.mode is ControlMode.CARTESIAN:
             gap = setpoint.p_WD - p_W

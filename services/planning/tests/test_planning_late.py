@@ -19,7 +19,9 @@ from palpate_planning.path import SurfacePath
 from palpate_planning.periods import MS
 from palpate_planning.segments import Segment
 from palpate_planning.status import Phase
+from palpate_planning.surface import Foot
 from palpate_planning.timing import BRAKED_NS, JOINT_ACCELERATION, RESTART_NS, JointTrajectory, RestartRamp, joint_trajectory
+from palpate_planning.wall import plane
 
 KINEMATICS = ArmKinematics(BASE, Limits())
 START = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.0, 0.0])
@@ -27,7 +29,8 @@ GOAL = START + np.array([0.9, -0.2, 0.1, 0.3, 0.0, -0.2, 0.5])
 MOTION = joint_trajectory(KINEMATICS, np.array([START, GOAL]), Limits(), PERIOD_S)
 DOWN, ONE = np.diag([1.0, -1.0, -1.0]), np.zeros(1, dtype=int)
 PLACE = SurfacePath(np.zeros(1), np.zeros((1, 3)), -DOWN[None, 2], DOWN[None], GOAL[None], ONE, ONE)
-ABOVE = ContactMeasurement(np.eye(4), np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]), -0.02, 0.0, False)
+FOOT = Foot(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.02, np.zeros(2))
+ABOVE = ContactMeasurement(np.eye(4), np.eye(3), FOOT, 0.0, 0.0, 0.01, -0.02, 0.0, False)
 
 
 def ticks(late_at: int, late: int, count: int) -> list[int]:
@@ -53,7 +56,8 @@ def palpated(times: list[int]) -> list[Setpoint]:
 def free_palpation() -> Palpation:
     """A palpation of two segments that both are `MOTION`."""
     segment = Segment(PLACE, contact=False, free=MOTION)
-    return Palpation((segment, segment), ExamSettings(), Limits(), BASE.indenter_radius_m, PERIOD_S)
+    wall = plane(np.eye(4))
+    return Palpation((segment, segment), ExamSettings(), Limits(), BASE.indenter_radius_m, PERIOD_S, wall)
 
 
 MOVERS = {"follower": followed, "free segment": palpated}

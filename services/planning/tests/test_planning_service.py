@@ -86,7 +86,10 @@ class BusWorld(World):
             mesh, found = self.dome, self.dome.positions
             flat = np.ascontiguousarray(mesh.vertices, dtype=np.float32).ravel()
             triangles = np.ascontiguousarray(mesh.triangles, dtype=np.uint32).ravel()
-            inbox.put("perception/surface", SurfaceMesh(header(t, "world"), flat, np.zeros(0, dtype=np.float32), triangles))
+            inbox.put(
+                "perception/surface",
+                SurfaceMesh(header(t, "world"), flat, np.zeros(0, dtype=np.float32), triangles, np.empty(0, np.float32)),
+            )
             normals = [Vector3(0.0, 0.0, 1.0)] * len(found)
             points = [Point(*map(float, p)) for p in found]
             lines = np.asarray(mesh.lines, dtype=np.uint32)

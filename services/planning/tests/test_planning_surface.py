@@ -38,7 +38,7 @@ def test_points_and_normals_are_those_of_the_dome(x: float, y: float) -> None:
 @settings(deadline=None)
 def test_nearest_finds_the_foot_of_the_perpendicular(x: float, y: float, height: float) -> None:
     p, n = (a[0] for a in SURFACE.at(np.array([[x, y]])))
-    foot, normal, distance = SURFACE.nearest(p + height * n)
+    foot, normal, distance, _ = SURFACE.nearest(p + height * n)
     assert foot == pytest.approx(p, abs=2e-5)
     assert normal == pytest.approx(n, abs=2e-4)
     assert distance == pytest.approx(height, abs=1e-6)
@@ -58,7 +58,7 @@ def test_outside_the_mesh_the_edge_holds() -> None:
 
 
 def test_before_perception_depth_is_counted_from_the_plane_of_a() -> None:
-    _, normal, distance = PerceivedSurface.plane(X_WA).nearest(apply(X_WA, np.array([[0.02, 0.03, 0.04]]))[0])
+    _, normal, distance, _ = PerceivedSurface.plane(X_WA).nearest(apply(X_WA, np.array([[0.02, 0.03, 0.04]]))[0])
     assert distance == pytest.approx(0.04)
     assert normal == pytest.approx(X_WA[:3, 2])
 

@@ -64,7 +64,7 @@ def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:
         if i % 50 == 0:
             dent = 0.01 * np.exp(-((grid - (0.1 * np.sin(t / 1e9), 0)) ** 2).sum(axis=1) / 8e-4)
             vertices = np.column_stack((grid, -dent)).astype(np.float32).ravel()
-            mesh = SurfaceMesh(header(t, "world"), vertices, np.empty(0, np.float32), triangles)
+            mesh = SurfaceMesh(header(t, "world"), vertices, np.empty(0, np.float32), triangles, np.empty(0, np.float32))
             add("sim/surface", mesh, t, i // 50)
     return found
 

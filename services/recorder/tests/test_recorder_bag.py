@@ -35,7 +35,7 @@ def surface(t: int) -> bytes:
     vertices = np.random.default_rng(t).random(9000, dtype=np.float32)  # does not compress
     vertices[0] = t / 1e9
     empty = np.empty(0, dtype=np.float32)
-    message = SurfaceMesh(header(t, "world"), vertices, empty, np.arange(18000, dtype=np.uint32) % 3000)
+    message = SurfaceMesh(header(t, "world"), vertices, empty, np.arange(18000, dtype=np.uint32) % 3000, np.empty(0, np.float32))
     return codec.encode(message, "palpation_msgs/msg/SurfaceMesh")
 
 
@@ -157,6 +157,7 @@ def test_memory_stays_bounded_by_the_chunk(tmp_path: Path) -> None:
             np.random.default_rng(0).random(2_000_000, dtype=np.float32),
             np.empty(0, np.float32),
             np.empty(0, np.uint32),
+            np.empty(0, np.float32),
         ),
         "palpation_msgs/msg/SurfaceMesh",
     )

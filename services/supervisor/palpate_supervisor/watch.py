@@ -25,8 +25,9 @@ PATIENCE = 50_000_000
 """Planning retreats by itself at the soft limit; the supervisor steps in when the force stays over it for so long [ns]."""
 SPEED_MARGIN = 1.3
 """Free motion is planned to reach `speed_mps`; the arm overshoots it by some percent."""
-DEPTH_MARGIN_M = 0.005
-"""How wrong the perceived surface may be before depth means anything [A]: planning counts it from the onset of force."""
+DEPTH_MARGIN_M = 0.025
+"""How wrong the perceived surface may be, by which depth is judged here: camera and arm agree to centimetres (docs/errors.md),
+and the wall moves. Planning counts depth from where the skin is touched."""
 CONTACT_N = 5.0
 """Untared force that is surely contact: the sensor's bias is up to 1.7 N, the tool's inertia takes 1.4 N at 4 m/s^2."""
 

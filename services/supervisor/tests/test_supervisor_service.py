@@ -16,7 +16,9 @@ from palpate_supervisor.service import create
 
 @pytest.mark.parametrize(("vertices", "normals"), [(4, 6), (6, 5), (6, 9), (9, 6)])
 def test_a_surface_that_is_none_stops_softly_and_ends_nobody(vertices: int, normals: int) -> None:
-    mesh = SurfaceMesh(header(0), np.zeros(vertices, np.float32), np.zeros(normals, np.float32), np.zeros(0, np.uint32))
+    mesh = SurfaceMesh(
+        header(0), np.zeros(vertices, np.float32), np.zeros(normals, np.float32), np.zeros(0, np.uint32), np.empty(0, np.float32)
+    )
     inbox = HandInbox()
     inbox.events["perception/surface"] = [mesh]
     state: Any = create(load_scenario("healthy")).step(0, inbox)["supervisor/state"]

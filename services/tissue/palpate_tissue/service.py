@@ -68,7 +68,9 @@ class TissueService(Service):
         """The truth about the phantom, latched; logs the facts."""
         truth = self._truth
         _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
-        surface = SurfaceMesh(header(0, "abdomen"), _flat(truth.vertices.T), _flat(truth.normals.T), self._triangles)
+        surface = SurfaceMesh(
+            header(0, "abdomen"), _flat(truth.vertices.T), _flat(truth.normals.T), self._triangles, np.empty(0, np.float32)
+        )
         message = PhantomTruth(surface, truth.stiffness.copy(), truth.background.copy(), truth.lesion.copy(), self._lies)
         return {"truth/phantom": message}
 
@@ -130,7 +132,7 @@ class TissueService(Service):
         inward = self.backend.inward
         vertices_W = self._vertices_W - inward * self._normals_W
         normals_W = self._R_WA @ self._surface.normals(inward)
-        return SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_W), self._triangles)
+        return SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_W), self._triangles, np.empty(0, np.float32))
 
     def _indentation(self, t: int, tool: Message | None, f_W: Array) -> Message:
         """Where the indenter is against the rest surface, and the force on it along the normal there and across."""

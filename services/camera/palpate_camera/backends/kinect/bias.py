@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_camera.backends.kinect.pinhole import Pinhole
 from palpate_camera.backends.kinect.scene import Image
+from palpate_camera.pinhole import Pinhole
 from palpate_models.errors import DrawnCamera
 from palpate_models.frames import Array
 
@@ -34,16 +34,21 @@ class DepthBias:
         self._nodes = rng.standard_normal((self._rows.shape[1], self._columns.shape[1]))
         self._t_s = 0.0
 
-    def image(self, t_s: float, skin: Mask) -> Image:
-        """The error [m] at time `t_s` [s], where `skin` is what shows the patient, shape (height, width)."""
+    def image(self, t_s: float, skin: Mask, every: slice = slice(None)) -> Image:
+        """The error [m] at time `t_s` [s] of the pixels `every` in rows and columns; `skin`, of their shape, shows the patient.
+
+        Time does not run back from one call to the next.
+        """
         given = self._given
-        bias = self._constant + np.float32(self._drawn.warm_up_m * (1 - np.exp(-t_s / given.warm_up_s)))
+        bias = self._constant[every, every] + np.float32(self._drawn.warm_up_m * (1 - np.exp(-t_s / given.warm_up_s)))
         bias[skin] += np.float32(given.skin_m)
         if given.wander_m > 0:
-            kept = np.exp((self._t_s - t_s) / given.wander_s)
-            self._nodes = kept * self._nodes + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._nodes.shape)
-            bias += np.float32(given.wander_m) * (self._rows @ self._nodes.astype(np.float32) @ self._columns.T)
-        self._t_s = t_s
+            if t_s > self._t_s:
+                kept = np.exp((self._t_s - t_s) / given.wander_s)
+                self._nodes = kept * self._nodes + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._nodes.shape)
+                self._t_s = t_s
+            nodes = np.float32(given.wander_m) * self._nodes.astype(np.float32)
+            bias += self._rows[every] @ nodes @ self._columns[every].T
         return bias
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_camera.backends.kinect.open3d_loader import open3d
-from palpate_camera.backends.kinect.pinhole import Pinhole
+from palpate_camera.backends.kinect.raster import rasterise
+from palpate_camera.pinhole import Pinhole
 from palpate_models.frames import Array, apply, inverse
 
 Image = NDArray[np.float32]
@@ -66,36 +66,12 @@ class Caster:
         """A camera with true pose `X_WC` (optical frame in world), shape (4, 4)."""
         self.pinhole = pinhole
         self._X_CW = inverse(X_WC)
-        self._right = (X_WC[:3, 0] / pinhole.fx).astype(np.float32)
-        self._down = (X_WC[:3, 1] / pinhole.fy).astype(np.float32)
-        directions = pinhole.directions() @ X_WC[:3, :3].T
-        self._rays = np.empty((pinhole.height, pinhole.width, 6), np.float32)
-        self._rays[..., :3] = X_WC[:3, 3]
-        self._rays[..., 3:] = directions
-        self._length = np.linalg.norm(directions, axis=2).astype(np.float32)
 
     def cast(self, mesh: Mesh) -> View:
-        """The view of one mesh. Rays have unit z in C, so the hit parameter of Open3D is the depth [m]."""
+        """The view of one mesh, either side of its triangles."""
         view = View.empty(self.pinhole.height, self.pinhole.width)
-        rows, columns = self.pinhole.window(apply(self._X_CW, mesh.vertices))
-        if rows.start == rows.stop or columns.start == columns.stop:
-            return view
-        scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-        tensor = open3d.core.Tensor.from_numpy
-        scene.add_triangles(
-            tensor(np.ascontiguousarray(mesh.vertices, np.float32)),
-            tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),
-        )
-        rays = np.ascontiguousarray(self._rays[rows, columns])
-        hits = scene.cast_rays(tensor(rays), nthreads=1)
-        z, normal = hits["t_hit"].numpy(), hits["primitive_normals"].numpy()
-        slope = np.einsum("ijk,ijk->ij", normal, rays[..., 3:])
-        hit = np.isfinite(z) & (slope != 0)
-        z, slope = np.where(hit, z, np.inf), np.where(hit, slope, 1.0)
-        view.w[rows, columns] = w = 1 / z
-        view.gu[rows, columns] = w * (normal @ self._right) / slope
-        view.gv[rows, columns] = w * (normal @ self._down) / slope
-        view.cos[rows, columns] = np.where(hit, np.abs(slope) / self._length[rows, columns], 0)
+        lens = np.array((self.pinhole.fx, self.pinhole.fy, self.pinhole.cx, self.pinhole.cy))
+        rasterise(apply(self._X_CW, mesh.vertices), mesh.triangles, lens, *view.images)
         return view
 
 

@@ -1,5 +1,7 @@
 """The camera as a service that plays a recording: a trigger gets the recorded frames in their order, one a tick.
 
+Small images come in their order too, one a tick all the time; a recording without any has those of its whole ones.
+
 The recording is a tape without an end: a new burst goes on where the last one stopped, and after the last frame comes the first.
 Every message is stamped anew, with the tick that it is sent at. The pose of the camera is the recording's too (`tf_static`).
 """
@@ -10,14 +12,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message, decode
 from palpate_bus.messages.stamps import time_message
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_camera import pictures
+from palpate_camera.pictures import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_models.scenario import Scenario
 
-IMAGE, INFO, POSE = "camera/depth/image_raw", "camera/depth/camera_info", "tf_static"
+POSE = "tf_static"
+_Pair = tuple[RecordedMessage, RecordedMessage]
 
 
 class ReplayedCamera(Service):
@@ -28,45 +35,63 @@ class ReplayedCamera(Service):
     def __init__(self, recording: Recording) -> None:
         """Reads the frames, about 1 MB each. Raises RecordingError when the recording has no frame or no pose."""
         rules = contract()
-        recording.check(rules, (IMAGE, INFO, POSE))
-        by_topic: dict[str, dict[int, RecordedMessage]] = {IMAGE: {}, INFO: {}, POSE: {}}
+        by_topic: dict[str, dict[int, RecordedMessage]] = {topic: {} for topic in (IMAGE, INFO, POSE, SMALL_IMAGE, SMALL_INFO)}
+        recording.check(rules, by_topic)
         for message in recording.messages(by_topic):
             by_topic[message.topic][message.stamp] = message
-        for topic, messages in by_topic.items():
-            if not messages:
+        for topic in (IMAGE, INFO, POSE):
+            if not by_topic[topic]:
                 raise RecordingError(f"{recording.path}: has no message of {topic}; a camera can be replayed only from all of "
-                                     f"{', '.join(by_topic)}")  # fmt: skip
+                                     f"{IMAGE}, {INFO}, {POSE}")  # fmt: skip
         self._types = {topic: rules.topics[topic].type for topic in by_topic}
         self._pose = self._message(next(iter(by_topic[POSE].values())))
-        self._frames = [(by_topic[IMAGE][t], by_topic[INFO][t]) for t in sorted(by_topic[IMAGE]) if t in by_topic[INFO]]
+        self._frames = _pairs(by_topic[IMAGE], by_topic[INFO])
         if not self._frames:
             raise RecordingError(f"{recording.path}: no image has a camera_info of its stamp")
+        self._small = _pairs(by_topic[SMALL_IMAGE], by_topic[SMALL_INFO])
         self._path = recording.path
         self._wanted = 0
-        self._shown = 0
+        self._shown = self._ticks = 0
 
     def start(self) -> Outbox:
         """The recorded pose of the optical frame in world, latched."""
         return {POSE: self._pose}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """The next frame with its intrinsics while a burst lasts; a new trigger replaces the burst that is under way."""
+        """The next small image, and the next whole one while a burst lasts; a new trigger replaces the burst under way."""
         for trigger in inbox.new("planning/camera_trigger"):
             self._wanted = int(trigger.frames)
-        if self._wanted == 0:
-            return {}
-        image, info = (self._message(part) for part in self._frames[self._shown % len(self._frames)])
-        self._wanted -= 1
-        self._shown += 1
-        image.header.stamp = info.header.stamp = time_message(t)
-        return {IMAGE: image, INFO: info}
+        outbox = self._next_small(t)
+        self._ticks += 1
+        if self._wanted:
+            outbox |= self._pair(t, self._frames, self._shown, (IMAGE, INFO))
+            self._wanted -= 1
+            self._shown += 1
+        return outbox
 
     def finish(self) -> Mapping[str, Any]:
         """How many frames were shown, and how many different ones there are."""
         return {"recording": str(self._path), "frames": self._shown, "frames_recorded": len(self._frames)}
 
+    def _next_small(self, t: int) -> dict[str, Message]:
+        if self._small:
+            return self._pair(t, self._small, self._ticks, (SMALL_IMAGE, SMALL_INFO))
+        image, info = self._pair(t, self._frames, self._ticks, (IMAGE, INFO)).values()
+        depth = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)[:, : 4 * image.width].copy().view("<f4")
+        return pictures.every_few(t, depth, pictures.pinhole_of(info))
+
+    def _pair(self, t: int, pairs: list[_Pair], index: int, topics: tuple[str, str]) -> dict[str, Message]:
+        image, info = (self._message(part) for part in pairs[index % len(pairs)])
+        image.header.stamp = info.header.stamp = time_message(t)
+        return dict(zip(topics, (image, info), strict=True))
+
     def _message(self, recorded: RecordedMessage) -> Message:
         return decode(recorded.payload, self._types[recorded.topic])
+
+
+def _pairs(images: Mapping[int, RecordedMessage], infos: Mapping[int, RecordedMessage]) -> list[_Pair]:
+    """Images with the intrinsics of their stamp, in their order."""
+    return [(images[t], infos[t]) for t in sorted(images) if t in infos]
 
 
 def create(scenario: Scenario) -> ReplayedCamera:

@@ -10,17 +10,19 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from palpate_bus.messages import CameraInfo, Image, Quaternion, TFMessage, Transform, TransformStamped, Vector3
+from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
 from palpate_bus.messages.stamps import header
 from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_camera.backends.ros.convert import CameraError, chain, depth_metres
+from palpate_camera import pictures
+from palpate_camera.backends.ros.convert import CameraError, Depth, chain, depth_metres
+from palpate_camera.pictures import FRAME
+from palpate_camera.pinhole import Pinhole
 from palpate_models.frames import Array
 from palpate_models.scenario import RosCamera, Scenario
 
-FRAME = "camera_depth_optical_frame"
 POSE_WAIT_S = 20.0
 """How long the camera's pose is waited for before the run."""
 
@@ -91,26 +93,28 @@ class RosCameraService(Service):
         return {"tf_static": TFMessage([TransformStamped(header(0, "world"), FRAME, pose)])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """The newest frame while a burst lasts; what came before the trigger is passed over."""
+        """The newest frame's small image, and the whole one while a burst lasts, but not what came before its trigger."""
         images, info = self._port.images(), self._port.info()
         triggers = list(inbox.new("planning/camera_trigger"))
         if triggers:
             self._wanted = int(triggers[-1].frames)
             self._facts["bursts"] += len(triggers)
-            return {}
-        if not self._wanted or not images or info is None:
+        if not images or info is None:
             return {}
         try:
             _agree(images[-1], info, self._frame)
-            image = _image(t, images[-1])
-            intrinsics = _intrinsics(t, info, rectified=self._port.rectified)
+            depth = _depth(images[-1])
+            pinhole = _pinhole(info, rectified=self._port.rectified)
         except CameraError as error:
             self._facts["frames_rejected"] += 1
             self._problem = str(error)
             return {}
-        self._wanted -= 1
-        self._facts["frames"] += 1
-        return {"camera/depth/image_raw": image, "camera/depth/camera_info": intrinsics}
+        outbox = pictures.every_few(t, depth, pinhole)
+        if self._wanted and not triggers:
+            self._wanted -= 1
+            self._facts["frames"] += 1
+            outbox |= pictures.whole(t, depth, pinhole)
+        return outbox
 
     def finish(self) -> Mapping[str, Any]:
         """How much was passed on, and why something was not."""
@@ -146,15 +150,13 @@ def _agree(image: Any, info: Any, frame: str) -> None:
         raise CameraError(f"depth image is {image.width} x {image.height}, camera_info says {info.width} x {info.height}")
 
 
-def _image(t: int, image: Any) -> Any:
-    depth = depth_metres(
+def _depth(image: Any) -> Depth:
+    return depth_metres(
         image.encoding, int(image.height), int(image.width), int(image.step), bool(image.is_bigendian), np.asarray(image.data)
     )
-    data = np.ascontiguousarray(depth, "<f4").view(np.uint8).reshape(-1)
-    return Image(header(t, FRAME), image.height, image.width, "32FC1", 0, 4 * image.width, data)
 
 
-def _intrinsics(t: int, info: Any, *, rectified: bool) -> Any:
+def _pinhole(info: Any, *, rectified: bool) -> Pinhole:
     """Intrinsics of the image as it is, without distortion: of a rectified one P's, where it is set (sensor_msgs/CameraInfo)."""
     P = np.asarray(info.p, dtype=float).reshape(3, 4)
     K, name = (P[:, :3], "p") if rectified and P.any() else (np.asarray(info.k, dtype=float).reshape(3, 3), "k")
@@ -164,9 +166,7 @@ def _intrinsics(t: int, info: Any, *, rectified: bool) -> Any:
         )
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise CameraError(f"camera_info: {name} = {K.ravel().tolist()}: the focal lengths must be positive")
-    P = np.hstack((K, np.zeros((3, 1))))
-    size = (info.height, info.width)
-    return CameraInfo(header(t, FRAME), *size, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P.ravel(), 0, 0, info.roi)
+    return Pinhole(int(info.width), int(info.height), *map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 
 
 def create(scenario: Scenario) -> RosCameraService:

@@ -42,20 +42,8 @@ class Pinhole:
         directions[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, np.newaxis]
         return directions
 
-    def window(self, p_C: Array) -> tuple[slice, slice]:
-        """Rows and columns that hold the image of points in C, shape (n, 3), with a pixel to spare.
-
-        The whole image when a point is at the camera or behind it.
-        """
-        z = p_C[:, 2]
-        if z.min() < 1e-3:
-            return slice(0, self.height), slice(0, self.width)
-        u = self.fx * p_C[:, 0] / z + self.cx
-        v = self.fy * p_C[:, 1] / z + self.cy
-        return _span(v, self.height), _span(u, self.width)
-
-
-def _span(x: Array, size: int) -> slice:
-    low = min(max(int(np.floor(x.min())) - 1, 0), size)
-    high = min(max(int(np.ceil(x.max())) + 2, low), size)
-    return slice(low, high)
+    def every(self, k: int) -> Pinhole:
+        """The camera of every `k`-th pixel: its pixel (i, j) is (k // 2 + k i, k // 2 + k j) of this one."""
+        first = k // 2
+        size = len(range(first, self.width, k)), len(range(first, self.height, k))
+        return Pinhole(*size, self.fx / k, self.fy / k, (self.cx - first) / k, (self.cy - first) / k)

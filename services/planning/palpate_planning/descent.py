@@ -1,0 +1,75 @@
+"""The descent of a stroke: a rest above the skin in which the sensor is tared, then slowly down to the touch that zeroes depth.
+
+It comes down fast to as near as the wall can be, and from there at probe speed until force sets in; the touch corrects the wall,
+and depth is counted from there on.
+"""
+
+from __future__ import annotations
+
+from palpate_planning.contact import ContactMeasurement
+from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
+from palpate_planning.touch import FELT_N, Onset
+from palpate_planning.wall import TouchedSkin
+
+DESCEND_MPS = 0.08
+PROBE_MPS = 0.014
+"""Speed at which the skin is sought: force rises by about 3 N/s."""
+SIGMAS = 3.0
+"""Within so many standard deviations of where the skin is believed to be it is sought,"""
+ALLOWANCE_M = 0.003
+"""from this above: the onset is fitted to force before it, too."""
+REST_S = 0.15
+"""Time at rest before taring: the arm's oscillations fade."""
+TARE_S = 0.25
+"""Time of taring: 25 means over 10 ms of 0.1 N noise leave 6 mN."""
+
+
+class Descent:
+    """Takes one stroke after another down to the skin; `start` before each."""
+
+    def __init__(self, motion: StrokeMotion, depth: float, period_s: float) -> None:
+        """`depth` [m]: so far below the skin, at least, force is felt."""
+        self._motion, self._depth, self._period_s = motion, depth, period_s
+        self.stroke = 0
+        """Number of the descent under way or last made, from 1 on."""
+        self.taring = False
+        """Whether the arm is at rest in free air, so that what the sensor reads is bias and weight."""
+        self.touched: TouchedSkin | None = None
+        """The touch of the latest step, at which there was one."""
+        self.missed = ""
+        """Why no skin was felt; empty if it was, or may be yet."""
+        self.start()
+
+    def start(self) -> None:
+        """Before a descent: at rest, soon, above the skin."""
+        self._rested = 0.0
+        self._onset: Onset | None = Onset()
+
+    def rest(self, height: float, speed: float) -> bool:
+        """Rests `height` [m] above the skin, getting there at `speed` [m/s]; returns whether it has rested and tared."""
+        self._rested = self._rested + self._period_s if self._motion.depth.step(-height, speed) else 0.0
+        self.taring = self._rested >= REST_S
+        if self._rested < REST_S + TARE_S:
+            return False
+        self.taring = False
+        self.stroke += 1
+        return True
+
+    def probe(self, contact: ContactMeasurement, t: int) -> bool:
+        """Sinks towards the skin at `t` [ns]; returns whether it has been touched, at this step or before."""
+        if self._onset is None:
+            return True
+        motion = self._motion
+        unsure = SIGMAS * contact.uncertainty
+        braking = motion.depth.velocity**2 / DEPTH_ACCELERATION
+        near = motion.depth.position > -unsure - ALLOWANCE_M - braking
+        deepest = motion.depth.step(unsure + self._depth, PROBE_MPS if near else DESCEND_MPS)
+        if near:
+            self._onset.add(contact.depth, contact.force)
+        if contact.force >= FELT_N or (deepest and contact.touching):
+            self.touched, outward = motion.wall.touched(contact.foot, self._onset.touch(), self.stroke, t)
+            motion.shift(outward)
+            self._onset = None
+        elif deepest:
+            self.missed = f"no tissue felt down to {(unsure + self._depth) * 1e3:.0f} mm below where it is believed to be"
+        return self._onset is None

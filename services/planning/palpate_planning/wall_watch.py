@@ -1,0 +1,56 @@
+"""Whether the wall can be palpated now: what a cough, a deep breath, a patient who moves and a skin that is gone call for."""
+
+from __future__ import annotations
+
+from palpate_models.scenario import Following
+from palpate_planning.breath import Breath
+
+CALM_S = 1.0
+"""After a cough or a deep breath the skin is left alone until the wall has been followed well for so long."""
+CALM_PATIENCE_S = 60.0
+"""A wall that cannot be followed for so long ends the strokes."""
+LOST_S = 0.3
+"""Without contact at depth for so long, the wall is not where it was touched: it is touched anew."""
+LOST_MAX = 5
+"""With this many losses of contact the strokes end."""
+GATE_M = 0.001
+"""So far from the end of expiration, where the wall moves most, samples are taken when breathing is gated."""
+
+
+class WallWatch:
+    """Judges the breath that is followed and the contact; one `step` each planning period."""
+
+    def __init__(self, breath: Breath, following: Following, period_s: float) -> None:
+        self._breath, self._gated, self._period_s = breath, following is Following.GATE, period_s
+        self._calm_for, self._restless_for, self._adrift_for = CALM_S, 0.0, 0.0
+        """For how long the wall was followed well, for how long it was not, for how long there was no contact at depth [s]."""
+        self._losses = 0
+        self.spoiled = False
+        """Whether what is measured now is worth nothing: the indenter has to lift off."""
+        self.open = True
+        """Whether samples may be taken at this moment of the breath."""
+        self.ended = ""
+        """Why the strokes have to end; empty while they need not."""
+
+    @property
+    def calm(self) -> bool:
+        """Whether the wall has been followed well for long enough to touch it."""
+        return self._calm_for >= CALM_S
+
+    def step(self, t: int, *, adrift: bool) -> None:
+        """Judges the moment `t` [ns]; `adrift`: at depth, and yet nothing is felt."""
+        breath, dt = self._breath, self._period_s
+        calm = breath.calm(t)
+        self._calm_for, self._restless_for = (self._calm_for + dt, 0.0) if calm else (0.0, self._restless_for + dt)
+        self._adrift_for = self._adrift_for + dt if adrift else 0.0
+        lost = self._adrift_for > LOST_S
+        if lost:
+            self._losses, self._adrift_for = self._losses + 1, 0.0
+        self.spoiled = lost or not calm
+        self.open = not self._gated or abs(breath.displacement(t)) < GATE_M
+        if breath.moved:
+            self.ended = "the patient has moved"
+        elif self._restless_for > CALM_PATIENCE_S:
+            self.ended = f"the wall could not be followed for {CALM_PATIENCE_S:g} s"
+        elif self._losses >= LOST_MAX:
+            self.ended = f"contact was lost {self._losses} times"

@@ -1,0 +1,131 @@
+"""The breath as perception forecasts it, and what is done when it is not as forecast."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planning_fakes import World, known
+
+from palpate_models.scenario import Following
+from palpate_planning.breath import JOIN_S, Breath, Motion
+from palpate_planning.periods import MS, SECOND
+from palpate_planning.status import Phase
+from palpate_planning.wall_watch import CALM_S, LOST_MAX, LOST_S, WallWatch
+
+DT = 0.01
+
+
+def motion(stamp: int, *forecast: float, calm: bool = True, moved: bool = False) -> Motion:
+    return Motion(stamp, np.array(forecast), 3e-4, calm, moved)
+
+
+def breathing(t_s: float) -> float:
+    """8 mm peak to peak, 14 a minute [m]."""
+    return 0.004 * (1 - float(np.cos(2 * np.pi * 14 / 60 * t_s)))
+
+
+def test_without_a_word_the_wall_is_at_rest() -> None:
+    breath = Breath()
+    assert breath.displacement(5 * SECOND) == 0.0
+    assert breath.calm(5 * SECOND)
+    assert not breath.moved
+
+
+def test_in_between_the_forecast_is_interpolated() -> None:
+    breath = Breath()
+    breath.hear(motion(SECOND, 0.0, 0.001, 0.003), SECOND + 100 * MS)
+    assert breath.displacement(SECOND + 75 * MS) == pytest.approx(0.002)
+    assert breath.displacement(3 * SECOND) == pytest.approx(0.003)
+
+
+def test_a_new_forecast_is_joined_without_a_step() -> None:
+    breath = Breath()
+    breath.hear(motion(0, 0.002, 0.002), 100 * MS)
+    breath.hear(motion(100 * MS, 0.004, 0.004), 200 * MS)
+    assert breath.displacement(200 * MS) == pytest.approx(0.002)
+    assert breath.displacement(200 * MS + round(JOIN_S * SECOND)) == pytest.approx(0.004 - 0.002 / np.e)
+
+
+def test_a_forecast_that_is_too_old_is_not_relied_on() -> None:
+    breath = Breath()
+    breath.hear(motion(0, 0.0, 0.0), 0)
+    assert breath.calm(400 * MS)
+    assert not breath.calm(600 * MS)
+
+
+def test_a_spoiled_wall_is_left_alone_until_it_has_been_calm() -> None:
+    breath = Breath()
+    watch = WallWatch(breath, Following.FOLLOW, DT)
+    breath.hear(motion(0, 0.0, calm=False), 0)
+    watch.step(0, adrift=False)
+    assert watch.spoiled and not watch.calm
+    steps = 0
+    while not watch.calm:
+        breath.hear(motion(0, 0.0), 0)
+        watch.step(0, adrift=False)
+        steps += 1
+    assert steps * DT == pytest.approx(CALM_S, abs=0.02)
+
+
+def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
+    watch = WallWatch(Breath(), Following.FOLLOW, DT)
+    losses = 0
+    while not watch.ended:
+        for _ in range(round(LOST_S / DT) + 1):
+            watch.step(0, adrift=True)
+        losses += watch.spoiled
+        watch.step(0, adrift=False)
+    assert losses == LOST_MAX
+
+
+def test_gated_samples_are_those_of_the_end_of_expiration() -> None:
+    breath = Breath()
+    watch = WallWatch(breath, Following.GATE, DT)
+    for displacement, open_ in ((0.0, True), (0.006, False)):
+        breath.hear(motion(0, displacement), 0)
+        watch.step(SECOND, adrift=False)
+        assert watch.open is open_
+
+
+@pytest.mark.parametrize(("following", "most"), [("follow", 6e-4), ("gate", 6e-4)])
+def test_a_breathing_wall_is_palpated_at_the_depth_asked_for(following: str, most: float) -> None:
+    world = World(known(region_m=(0.025, 0.0125), breathing=following), offset=0.006, excursion=breathing)
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    steady = np.array([row[4] for row in world.rows if row[1]])
+    assert len(steady) > 100
+    assert np.sqrt(np.mean((steady - 0.010) ** 2)) < most
+
+
+def test_what_a_cough_spoils_is_repeated() -> None:
+    world = World(known(region_m=(0.025, 0.0125)), excursion=breathing)
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    for _ in range(30):
+        world.step()
+    stroke = world.exam.status.stroke
+    world.calm = False
+    for _ in range(100):
+        world.step()
+    assert world.pressed == 0.0
+    assert not world.exam.status.steady
+    world.calm = True
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    assert world.exam.status.stroke == stroke + 1
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert world.exam.status.targets_skipped == 0
+
+
+def test_a_patient_who_moves_is_left_within_a_second() -> None:
+    world = World(known(region_m=(0.025, 0.025)), excursion=breathing)
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    world.moved = True
+    for _ in range(100):
+        world.step()
+    assert world.depth < -0.008
+    world.run()
+    status = world.exam.status
+    assert status.phase is Phase.DONE
+    assert status.patient_moved
+    assert 0 < status.targets_skipped < status.target_count
+    assert "moved" in next(iter(world.exam.skipped.values()))

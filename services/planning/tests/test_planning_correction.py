@@ -1,0 +1,55 @@
+"""The correction of the perceived surface, from touches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate_planning.surface_correction import FIELD_M, OFFSET_M, SurfaceCorrection
+
+PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
+BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])
+
+
+def tilted(xy: np.ndarray) -> np.ndarray:
+    """[m] outward."""
+    return np.asarray(0.015 + xy @ np.array((0.012, -0.008)))
+
+
+def test_untouched_it_is_nothing_and_unsure() -> None:
+    correction = SurfaceCorrection()
+    assert correction.height(np.zeros(2)) == 0.0
+    assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(OFFSET_M, FIELD_M))
+
+
+def test_offset_and_tilt_are_found_in_between() -> None:
+    correction = SurfaceCorrection()
+    for place in PLACES:
+        correction.touch(place, float(tilted(place)), 2e-4)
+    for place in BETWEEN:
+        assert correction.height(place) == pytest.approx(float(tilted(place)), abs=3e-4)
+        assert correction.sigma(place) < 0.0015
+    assert correction.sigma(np.array((0.2, 0.2))) > correction.sigma(BETWEEN[0])
+
+
+def test_touches_at_one_place_are_averaged() -> None:
+    correction = SurfaceCorrection()
+    for height in (0.0042, 0.0038):
+        correction.touch(np.zeros(2), height, 5e-4)
+    assert correction.height(np.zeros(2)) == pytest.approx(0.004, abs=2e-5)
+    assert correction.sigma(np.zeros(2)) == pytest.approx(5e-4 / np.sqrt(2), rel=0.01)
+
+
+def test_its_errors_are_as_large_as_it_says() -> None:
+    rng = np.random.default_rng(3)
+    everywhere = np.vstack((PLACES, BETWEEN))
+    apart = np.sum((everywhere[:, None] - everywhere) ** 2, axis=-1)
+    covariance = OFFSET_M**2 + 0.010**2 * everywhere @ everywhere.T + FIELD_M**2 * np.exp(-apart / (2 * 0.05**2))
+    scores = []
+    for _ in range(50):
+        truth = rng.multivariate_normal(np.zeros(len(everywhere)), covariance)
+        correction = SurfaceCorrection()
+        for place, height in zip(PLACES, truth, strict=False):
+            correction.touch(place, float(height + 4e-4 * rng.standard_normal()), 4e-4)
+        scores += [(correction.height(p) - h) / correction.sigma(p) for p, h in zip(BETWEEN, truth[len(PLACES) :], strict=True)]
+    assert np.std(scores) == pytest.approx(1.0, abs=0.2)

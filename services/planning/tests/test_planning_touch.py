@@ -1,0 +1,40 @@
+"""Where the skin is, from depth and force of a slow descent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from palpate_planning.touch import FELT_N, UNFITTED_M, find_touch
+
+
+def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:
+    """Rows of depth [m] and force [N] every 0.14 mm, until the force is felt; `stiffness` [N] at 4 mm."""
+    depth = np.arange(onset - 0.008, onset + 0.012, 0.00014)
+    force = stiffness * (np.maximum(depth - onset, 0.0) / 0.004) ** exponent
+    force = force + bias + noise * np.random.default_rng(seed).standard_normal(len(depth))
+    return np.column_stack((depth, force))[: int(np.argmax(force >= FELT_N)) + 1]
+
+
+@given(st.floats(-0.02, 0.02), st.floats(0.6, 4.0), st.floats(1.2, 1.45), st.floats(-0.1, 0.1), st.integers(0, 1000))
+@settings(deadline=None)
+def test_the_skin_is_found_within_its_uncertainty(
+    onset: float, stiffness: float, exponent: float, bias: float, seed: int
+) -> None:
+    touch = find_touch(descent(onset, stiffness, exponent, bias, 0.03, seed))
+    assert abs(touch.depth - onset) < 4 * touch.sigma
+    assert touch.sigma < 0.0012
+
+
+def test_the_law_itself_is_found_exactly() -> None:
+    touch = find_touch(descent(0.003, 1.5, 1.3, 0.05, 0.0))
+    assert touch.depth == pytest.approx(0.003, abs=1e-5)
+
+
+def test_on_bone_the_skin_is_where_force_begins() -> None:
+    rows = np.array([(-0.0003, 0.0), (-0.0002, 0.01), (-0.0001, 0.0), (0.0, 0.0), (0.0001, 1.2)])
+    touch = find_touch(rows)
+    assert touch.depth == pytest.approx(0.0, abs=1e-9)
+    assert touch.sigma == UNFITTED_M
