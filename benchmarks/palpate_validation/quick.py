@@ -2,8 +2,8 @@
 
 RUN is the folder of a completed whole examination. Its patient is examined by the quick tier with what this run got wrong from
 beginning to end (offset, tilt, place, how far breathing was followed, when it began), so that both are paired; the rest is drawn
-anew. With `--drawn` all is drawn, as in studies. What is compared is what studies report, each as the mean over cases of quick less
-whole. The tiers count as equivalent in it when its 90 % interval lies within the margin (two one-sided t tests of 5 %).
+anew. With `--drawn` all is drawn, as in studies. What is compared is what studies report, each as the mean over cases of quick
+less whole. The tiers count as equivalent in it when its 90 % interval lies within the margin (two one-sided t tests of 5 %).
 """
 
 from __future__ import annotations
@@ -169,7 +169,8 @@ def main(
         verdict = "equivalent" if row.equivalent else "not shown to be"
         print(
             f"{row.name:15} {row.cases:3} cases  quick {row.quick:8.4f}  whole {row.whole:8.4f}  "
-            f"difference {row.difference:8.4f} ({row.low:.4f} to {row.high:.4f}), margin {row.margin:g}: {verdict}  [{MARGINS[row.name][1]}]"
+            f"difference {row.difference:8.4f} ({row.low:.4f} to {row.high:.4f}), margin {row.margin:g}: {verdict}  "
+            f"[{MARGINS[row.name][1]}]"
         )
     out.mkdir(parents=True, exist_ok=True)
     found = {"paired": not drawn, "compared": [asdict(row) for row in rows], "cases": cases}

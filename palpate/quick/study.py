@@ -54,7 +54,9 @@ class Trace:
 
     scenario: Scenario
     begin_s: float
-    """When the first stroke began [s]."""
+    """When the first stroke that presses began [s]."""
+    stroke: Array
+    """In which stroke, from 0 on, shape (n,)."""
     time: Array
     """[s], shape (n,)."""
     place: Array
@@ -76,6 +78,10 @@ def trace_of(folder: Path) -> Trace:
     there = evidence.steady & np.isin(stamps, true_stamps)
     time = evidence.time[there]
     true_depth = evidence.true_depth[np.searchsorted(true_stamps, stamps[there])]
+    descents = np.cumsum(
+        np.diff(evidence.phase == ExamState.PHASE_INDENT, prepend=False) & (evidence.phase == ExamState.PHASE_INDENT)
+    )
+    strokes = np.unique(descents[there], return_inverse=True)[1]
     X_WA, X_WT = np.array(exam_input(scenario).X_WA), matrix(true_pose(scenario))
     touched = evidence.touched
     off_W = apply(X_WT, touched.true) - apply(X_WA, touched.believed)
@@ -85,7 +91,8 @@ def trace_of(folder: Path) -> Trace:
     excursion = np.array([curve.excursion(t) for t in time.tolist()])
     return Trace(
         scenario=scenario,
-        begin_s=float(evidence.time[int(np.argmax(evidence.phase == ExamState.PHASE_INDENT))]),
+        begin_s=_began(evidence.time, evidence.phase),
+        stroke=strokes,
         time=time,
         place=touched.believed[:, :2] - scenario.exam.centre_m,
         aside=(off_W @ X_WA[:3, :3])[:, :2],
@@ -93,6 +100,13 @@ def trace_of(folder: Path) -> Trace:
         unseen=skin.between(model.breathing)(touched.true[:, :2]) * (excursion - curve.mean_m),
         regulation=evidence.depth[there] - evidence.setpoint[there],
     )
+
+
+def _began(time: Array, phase: Array) -> float:
+    """When the descent began that led to the first state in phase SCAN [s]."""
+    indents = np.flatnonzero(np.diff(phase == ExamState.PHASE_INDENT, prepend=False) & (phase == ExamState.PHASE_INDENT))
+    scans = int(np.argmax(phase == ExamState.PHASE_SCAN))
+    return float(time[indents[indents < scans][-1]])
 
 
 def loop_of(traces: Sequence[Trace]) -> LoopErrors:
@@ -114,6 +128,8 @@ def loop_of(traces: Sequence[Trace]) -> LoopErrors:
         aside_m=_round(np.sqrt(np.mean([found.aside_m**2 for found, _ in fitted]))),
         offset_m=_normal(surface[:, 0]),
         tilt=_normal(surface[:, 1:3].ravel()),
+        zero_m=_round(np.sqrt(np.mean(np.concatenate([found.zeros_m for found, _ in fitted]) ** 2))),
+        uncertainty_m=_round(np.sqrt(np.mean([np.mean(trace.wrong**2) for trace in traces]))),
         field_m=field_m,
         field_length_m=field_length_m,
         followed=_normal(surface[:, 3]) if breathes else Normal(),
@@ -133,8 +149,11 @@ def _fit(trace: Trace) -> tuple[Drawn, Array]:
     """What stayed the same all over an examination, and what its depths get wrong beside it [m], shape (n,)."""
     columns = np.column_stack((np.ones(len(trace.time)), trace.place, -trace.unseen))
     coefficients = np.linalg.lstsq(columns, trace.wrong, rcond=None)[0]
+    rest = trace.wrong - columns @ coefficients
+    count = np.bincount(trace.stroke)
+    zeros = np.bincount(trace.stroke, rest) / count
     offset, tilt, unseen = float(coefficients[0]), coefficients[1:3], float(coefficients[3])
-    return Drawn(offset, tilt, 1.0 - unseen, trace.aside.mean(axis=0)), trace.wrong - columns @ coefficients
+    return Drawn(offset, tilt, 1.0 - unseen, trace.aside.mean(axis=0), zeros), rest - zeros[trace.stroke]
 
 
 def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, float]:
@@ -225,14 +244,14 @@ def main(
         trace = trace_of(folder)
         groups[tuple(setting_of(trace.scenario).values())].append(trace)
     rows = {_key(row): row for row in studied()} | {_key(row): row for row in map(loop_of, groups.values())}
-    text = yaml.safe_dump({"loops": [rows[key].model_dump() for key in sorted(rows)]}, sort_keys=False, width=130)
+    text = yaml.safe_dump({"loops": [rows[key].model_dump(mode="json") for key in sorted(rows)]}, sort_keys=False, width=130)
     path = Path(str(resources.files("palpate.quick").joinpath("loop.yaml")))
     path.write_text(_HEADER + text, encoding="utf-8")
     print(f"{path}: {len(groups)} of {len(rows)} settings from {len(folders)} runs")
 
 
 def _key(row: LoopErrors) -> tuple[str, ...]:
-    return (row.camera, row.hand_eye, row.registration, row.arm, row.breathing)
+    return (row.camera, row.hand_eye, row.registration, row.arm, row.breathing, row.following)
 
 
 if __name__ == "__main__":
