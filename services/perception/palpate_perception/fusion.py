@@ -13,6 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_models.frames import Array
+
 Image = NDArray[np.float32]
 
 GATE: Final = 6.0
@@ -54,6 +56,13 @@ class DepthFusion:
     def frames(self) -> int:
         """How many frames are in."""
         return len(self._frames)
+
+    def level(self, displacements: Array, per_metre: Image) -> None:
+        """Takes the breath out of the frames: the wall was displaced by `displacements` [m], shape (frames,), in them.
+
+        `per_metre`: by how much depth changes for a displacement of 1 m, of the window's shape.
+        """
+        self._frames = [frame - np.float32(d) * per_metre for frame, d in zip(self._frames, displacements, strict=True)]
 
     def motion(self, depth: Image, pixel: NDArray[np.intp]) -> float:
         """Standard deviation [m] over the frames of their mean offset from `depth` at some pixels.

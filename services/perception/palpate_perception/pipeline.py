@@ -14,32 +14,18 @@ from palpate_models.table import TABLE_TOP_M
 from palpate_perception import cloud, pattern, surface, visibility
 from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
+from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
+from palpate_perception.wall import Mode
 
 MARGIN_M: Final = 0.03
 """The cloud is cropped this much wider than the region, so that the surface at its edge has data on both sides."""
 MESH_MARGIN_M: Final = 0.025
 """The surface mesh reaches this much further than the region."""
 MESH_STEP_M: Final = 0.005
-HEIGHT_M: Final = (-0.16, 0.06)
-"""Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""
-TABLE_CLEARANCE_M: Final = 0.02
-"""Points this near to the table's top are the table."""
 MOTION_M: Final = 5e-4
 """A standard deviation over the frames above this is worth a remark: noise alone gives less than a tenth of it."""
 MIN_COVERAGE: Final = 0.95
 """With less of the region in view there are no targets."""
-
-
-@dataclass(frozen=True, slots=True)
-class Intrinsics:
-    """What camera_info and tf_static say."""
-
-    K: Array
-    """Shape (3, 3), in pixels."""
-    X_WC: Array
-    """Calibrated pose of the optical frame in world, shape (4, 4)."""
-    shape: tuple[int, int]
-    """Height and width of the full image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +55,8 @@ class PerceivedMesh:
     """Outward unit normals, shape (n, 3)."""
     triangles: NDArray[np.uint32]
     """Counter-clockwise from outside, shape (m, 3)."""
+    lifts: Array
+    """The breathing's mode, shape (n,); zero where it is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +91,8 @@ class Pipeline:
         X_CA = inverse(camera.X_WC) @ self._X_WA
         return DepthFusion(cloud.window(self._box, X_CA, camera.K, camera.shape))
 
-    def perceive(self, fusion: DepthFusion, camera: Intrinsics) -> Perceived:
-        """Runs the five steps on the fused frames."""
+    def perceive(self, fusion: DepthFusion, camera: Intrinsics, mode: Mode | None = None) -> Perceived:
+        """Runs the five steps on the fused frames; `mode` is the breathing's, if it is known."""
         fused = fusion.fused()
         origin = (fusion.window[0].start, fusion.window[1].start)
         depth = np.asarray(fused.depth, np.float64)
@@ -133,7 +121,7 @@ class Pipeline:
         motion = self._motion(fusion, fused, points, p_A, camera)
         sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
         message = _remarks(int(np.count_nonzero(~known)), len(nodes), motion)
-        return Perceived(points, self._mesh(field, p_A), targets, sigma, fused.frames, coverage, message)
+        return Perceived(points, self._mesh(field, p_A, mode), targets, sigma, fused.frames, coverage, message)
 
     def _reasons(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> str:
         """Why the region's other cells were not seen."""
@@ -155,7 +143,7 @@ class Pipeline:
         p_A = np.column_stack((xy, field.height(xy[:, 0], xy[:, 1])))
         return apply(self._X_WA, p_A), field.normal(xy[:, 0], xy[:, 1]) @ self._X_WA[:3, :3].T
 
-    def _mesh(self, field: surface.HeightField, p_A: Array) -> PerceivedMesh:
+    def _mesh(self, field: surface.HeightField, p_A: Array, mode: Mode | None) -> PerceivedMesh:
         """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         x = pattern.stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
@@ -168,7 +156,8 @@ class Pipeline:
         triangles = triangles[keep[triangles].all(axis=1)]
         new = np.cumsum(keep) - 1
         p_W, n_W = self._on(field, nodes[keep])
-        return PerceivedMesh(p_W, n_W, new[triangles].astype(np.uint32))
+        lifts = np.zeros(len(p_W)) if mode is None else mode(nodes[keep])
+        return PerceivedMesh(p_W, n_W, new[triangles].astype(np.uint32), lifts)
 
 
 def _remarks(guessed: int, nodes: int, motion: float) -> str:

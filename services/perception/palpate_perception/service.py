@@ -1,4 +1,4 @@
-"""Perception as a service: fuses the frames that follow a trigger and publishes what they show."""
+"""Perception as a service: fuses the frames that follow a trigger, publishes what they show, and follows the wall."""
 
 from __future__ import annotations
 
@@ -10,65 +10,89 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.messages import PalpationTargets, Point, PointCloud2, PointField, SurfaceMesh, Vector3
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
+from palpate_perception import frames
 from palpate_perception.cloud import Cloud
-from palpate_perception.fusion import DepthFusion, Image
-from palpate_perception.pipeline import Intrinsics, Perceived, PerceivedMesh, Pipeline, Targets
+from palpate_perception.follower import Follower
+from palpate_perception.frames import FRAME
+from palpate_perception.fusion import DepthFusion
+from palpate_perception.pipeline import Perceived, PerceivedMesh, Pipeline, Targets
+from palpate_perception.views import Intrinsics
+from palpate_perception.wall import Mode
 
-FRAME: Final = contract().topics["perception/targets"].frame or ""
-"""Frame of all that perception sends."""
+IMAGE: Final = "camera/depth/image_raw"
 PATIENCE_NS: Final = 1 * NS
 """How long after the expected end of a burst perception waits for missing frames."""
 
 
 class PerceptionService(Service):
-    """One burst of depth frames in; one cloud, one surface and one list of targets out."""
+    """One burst of depth frames in; one cloud, one surface and one list of targets out, and how the wall moves all the time."""
 
     role: ClassVar[str] = "perception"
 
     def __init__(self, exam: ExamInput) -> None:
-        self._pipeline = Pipeline(exam.exam, np.array(exam.X_WA))
-        self._period = contract().topics["camera/depth/image_raw"].period
+        X_WA = np.array(exam.X_WA)
+        self._pipeline = Pipeline(exam.exam, X_WA)
+        self._follower = Follower(exam.exam, X_WA, exam.robot)
+        self._period = contract().topics[IMAGE].period
         self._burst: _Burst | None = None
         self._last: Perceived | None = None
         self._bursts = 0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Starts a fusion on a trigger, adds the frames that are younger than it, and publishes once all are in."""
+        """Tells of each small image how the wall moves; starts a look on a trigger, and publishes its answer once all is in."""
         for trigger in inbox.new("planning/camera_trigger"):
             asked = nanoseconds(trigger.header.stamp)
             self._burst = _Burst(asked, int(trigger.frames), t + int(trigger.frames) * self._period + PATIENCE_NS)
+            self._follower.begin(asked)
             self._bursts += 1
-        frames = list(inbox.new("camera/depth/image_raw"))
+        told = self._follower.take(inbox)
+        outbox: dict[str, Message | list[Message]] = {"perception/motion": told} if told else {}
+        return outbox | self._answer(t, inbox)
+
+    def _answer(self, t: int, inbox: Inbox) -> dict[str, Message | list[Message]]:
+        """What the look that is under way shows; nothing until it is over."""
+        images = list(inbox.new(IMAGE))
         burst = self._burst
         if burst is None:
             return {}
-        burst.waiting += [frame for frame in frames if nanoseconds(frame.header.stamp) >= burst.asked]
+        burst.waiting += [image for image in images if nanoseconds(image.header.stamp) >= burst.asked]
         self._fuse(burst, inbox)
-        done = bool(burst.wrong) or (burst.fusion is not None and burst.fusion.frames >= burst.wanted)
-        if not done and t < burst.deadline and not inbox.lost("camera"):
+        full = burst.fusion is not None and burst.fusion.frames >= burst.wanted
+        given_up = bool(burst.wrong) or inbox.lost("camera") or (not full and t >= burst.deadline)
+        if not given_up and not (full and self._follower.watched):
             return {}
         self._burst = None
+        seen = self._follower.end()
         if burst.wrong or burst.fusion is None or burst.camera is None:
             return {"perception/targets": targets(t, _nothing(burst, inbox))}
-        perceived = self._pipeline.perceive(burst.fusion, burst.camera)
+        mode: Mode | None = None
+        if seen is not None:
+            wall, times, d = seen
+            displacements = np.interp(burst.stamps_s, times, d)
+            burst.fusion.level(displacements, wall.depth_per_metre(burst.camera, burst.fusion.window))
+            mode = wall.mode
+        perceived = self._pipeline.perceive(burst.fusion, burst.camera, mode)
         self._last = perceived
-        outbox = {"perception/points": points(t, perceived.cloud.p_W), "perception/targets": targets(t, perceived)}
+        outbox: dict[str, Message | list[Message]] = {
+            "perception/points": points(t, perceived.cloud.p_W),
+            "perception/targets": targets(t, perceived),
+        }
         if perceived.mesh is not None:
             outbox["perception/surface"] = surface(t, perceived.mesh)
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """What the last burst showed."""
+        """What the last burst showed, and how the wall moved."""
+        followed: dict[str, Any] = {"bursts": self._bursts, "followed": self._follower.counts}
         if self._last is None:
-            return {"bursts": self._bursts}
+            return followed
         return {
-            "bursts": self._bursts,
+            **followed,
             "frames_fused": self._last.frames,
             "coverage": self._last.coverage,
             "surface_noise_m": self._last.sigma,
@@ -80,18 +104,16 @@ class PerceptionService(Service):
         if not burst.waiting:
             return
         if burst.camera is None:
-            info, pose = inbox.latest("camera/depth/camera_info"), inbox.latest("tf_static")
-            X_WC = None if pose is None else camera_pose(pose, burst.waiting[0].header.frame_id)
-            if info is None or X_WC is None:
+            burst.camera = frames.intrinsics(inbox, "camera/depth/camera_info", burst.waiting[0])
+            if burst.camera is None:
                 return
-            K = np.array(info.k, np.float64).reshape(3, 3)
-            burst.camera = Intrinsics(K, X_WC, (int(info.height), int(info.width)))
             burst.fusion = self._pipeline.fusion(burst.camera)
         if burst.fusion is not None:
-            for frame in burst.waiting[: burst.wanted - burst.fusion.frames]:
-                burst.wrong = burst.wrong or _disagreement(frame, burst.camera)
+            for image in burst.waiting[: burst.wanted - burst.fusion.frames]:
+                burst.wrong = burst.wrong or _disagreement(image, burst.camera)
                 if not burst.wrong:
-                    burst.fusion.add(depth_in_metres(frame))
+                    burst.fusion.add(frames.depth_in_metres(IMAGE, image))
+                    burst.stamps_s.append(nanoseconds(image.header.stamp) / NS)
             burst.waiting.clear()
 
 
@@ -104,6 +126,8 @@ class _Burst:
         self.waiting: list[Message] = []
         self.camera: Intrinsics | None = None
         self.fusion: DepthFusion | None = None
+        self.stamps_s: list[float] = []
+        """When the fused frames were exposed [s]."""
         self.wrong = ""
         """Why its frames cannot be used; empty while they can."""
 
@@ -137,33 +161,6 @@ def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
     return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, f"nothing seen: {why}")
 
 
-def depth_in_metres(message: Message) -> Image:
-    """Depth [m], shape (height, width), NaN where invalid, of a sensor_msgs/Image of encoding 32FC1 [m] or 16UC1 [mm].
-
-    Raises ValueError for another encoding, or data that does not fit the size.
-    """
-    kinds = {"32FC1": "f4", "16UC1": "u2"}
-    if message.encoding not in kinds:
-        raise ValueError(f"camera/depth/image_raw: encoding = {message.encoding!r}, want one of {sorted(kinds)}")
-    kind = np.dtype((">" if message.is_bigendian else "<") + kinds[message.encoding])
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    data = np.frombuffer(message.data, np.uint8)
-    if step < width * kind.itemsize or data.size != height * step:
-        raise ValueError(f"camera/depth/image_raw: {data.size} bytes for {height} rows of {step}, {width} pixels each")
-    raw = np.ascontiguousarray(data.reshape(height, step)[:, : width * kind.itemsize]).view(kind)
-    depth = raw.astype(np.float32) * np.float32(1.0 if kind.kind == "f" else 1e-3)
-    depth[~(depth > 0)] = np.nan
-    return depth
-
-
-def camera_pose(message: Message, frame: str) -> Array | None:
-    """X_WC, shape (4, 4), of an optical frame from tf_static; None when it is not in there."""
-    for item in message.transforms:
-        if item.child_frame_id == frame and item.header.frame_id == FRAME:
-            return transform_matrix(item.transform)
-    return None
-
-
 def points(t: int, p_W: Array) -> Message:
     """`sensor_msgs/PointCloud2` in world: x y z float32 [m]."""
     fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
@@ -175,7 +172,7 @@ def surface(t: int, mesh: PerceivedMesh) -> Message:
     """`palpation_msgs/SurfaceMesh` in world."""
     vertices, normals = (np.ascontiguousarray(x, np.float32).reshape(-1) for x in (mesh.p_W, mesh.n_W))
     return SurfaceMesh(
-        header(t, FRAME), vertices, normals, np.ascontiguousarray(mesh.triangles).reshape(-1), np.zeros(len(mesh.p_W), np.float32)
+        header(t, FRAME), vertices, normals, np.ascontiguousarray(mesh.triangles).reshape(-1), mesh.lifts.astype(np.float32)
     )
 
 

@@ -93,19 +93,21 @@ class HeightField:
         )
 
 
-def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, float]) -> HeightField:
+def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, float], cutoff_m: float = CUTOFF_M) -> HeightField:
     """Fits points in A, shape (n, 3), of standard deviation `sigma` [m], shape (n,), over the rectangle low to high.
+
+    A wave of the length `cutoff_m` passes with half its amplitude.
 
     Raises ValueError when there are fewer than ten points.
     """
     if len(p) < 10:
         raise ValueError(f"surface fit: {len(p)} points, want at least 10")
-    x, y = (KnotAxis(a, b, CUTOFF_M / KNOTS_PER_CUTOFF) for a, b in zip(low, high, strict=True))
+    x, y = (KnotAxis(a, b, cutoff_m / KNOTS_PER_CUTOFF) for a, b in zip(low, high, strict=True))
     rows = _rows(x, y, p)
     width = DEGREE * (y.size + 1)  # half band width of the normal matrix: neighbours in x are y.size apart
     weight = 1 / sigma**2
     area = (high[0] - low[0]) * (high[1] - low[1])
-    penalty = _band(_energy(x, y), width) * (CUTOFF_M / (2 * np.pi)) ** 6 / area
+    penalty = _band(_energy(x, y), width) * (cutoff_m / (2 * np.pi)) ** 6 / area
     level = float(np.median(p[:, 2]))
     scale, robust = 1.0, np.ones(len(p))
     for _ in range(ROUNDS):

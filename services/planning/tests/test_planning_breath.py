@@ -69,13 +69,13 @@ def test_a_spoiled_wall_is_left_alone_until_it_has_been_calm() -> None:
 
 def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
     watch = WallWatch(Breath(), Following.FOLLOW, DT)
-    losses = 0
+    losses = steps = 0
     while not watch.ended:
-        for _ in range(round(LOST_S / DT) + 1):
-            watch.step(0, adrift=True)
+        watch.step(0, adrift=True)
         losses += watch.spoiled
-        watch.step(0, adrift=False)
+        steps += 1
     assert losses == LOST_MAX
+    assert steps * DT == pytest.approx(LOST_MAX * LOST_S, rel=0.05)
 
 
 def test_gated_samples_are_those_of_the_end_of_expiration() -> None:

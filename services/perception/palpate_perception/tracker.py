@@ -1,0 +1,160 @@
+"""Follows the wall from one small depth image to the next.
+
+Of each image the outward displacements of the wall's pixels, y = (z - z_ref) / g, are explained by the breath and by how a body
+moves that lies on a table, shifts along it by s_x, s_y and turns about its long axis by theta:
+
+    y_i = m_i d + n_i . (s_x, s_y, 0) + theta n_i . (e_y x p_i) + noise
+
+First d alone, robustly, for the breath filter; then what is left, over some images, by all four with a prior of each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from palpate_bus.messages import SurfaceMotion
+from palpate_models.frames import Array
+from palpate_perception.breath_filter import BreathFilter
+from palpate_perception.wall import Wall
+
+FORECAST_S: Final = np.arange(SurfaceMotion.FORECASTS) * SurfaceMotion.FORECAST_STEP_MS * 1e-3
+SHARED_M: Final = 1.5e-4
+"""What an image's displacement errs by besides its pixels' own noise: errors that neighbours and successive images share."""
+REACH_M: Final = 0.06
+"""What is farther from where the wall is expected is something else."""
+TUKEY: Final = 5.0
+"""Tukey's biweight, in standard deviations of a pixel."""
+LEAST_SHARE: Final = 0.1
+"""With less of the wall in view, by what it tells of the displacement, it is lost."""
+SURPRISE: Final = 5.0
+"""A displacement so many standard deviations from what the filter expects is none of its breaths ..."""
+SURPRISE_M: Final = 2.5e-3
+"""... if it is as far off as this, too."""
+DEEP: Final = 2.2
+"""A breath so many times as deep as usual is a deep one."""
+CALM_S: Final = 0.6
+"""So long after the last surprise the wall is as expected again."""
+PRIOR: Final = (0.010, 0.015, 0.015, 0.05)
+"""Standard deviations of what is left of the breath [m], s_x, s_y [m] and theta [rad]."""
+KEPT: Final = 0.7
+"""Part of what was left over that counts on at the next image. Over the six images that count so, white noise falls to what
+neighbours and successive images share, which does not fall: their mean is about as certain as one image's white noise says."""
+MOVED_M: Final = 0.0035
+"""A region that moved by more than this, root mean square over its corners, a rise of them all apart, has been moved ..."""
+MOVED_IMAGES: Final = 3
+"""... if so many images in a row say so."""
+
+
+class State(IntEnum):
+    """See SurfaceMotion.msg."""
+
+    QUIET = SurfaceMotion.QUIET
+    SPOILED = SurfaceMotion.SPOILED
+    MOVED = SurfaceMotion.MOVED
+    LOST = SurfaceMotion.LOST
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """What one image tells."""
+
+    state: State
+    displacement: float
+    """[m] at the exposure."""
+    forecast: Array
+    """[m] FORECAST_S after it."""
+    sigma: float
+    """Standard deviation of the displacement [m]."""
+    shift: Array
+    """Of the body, in A [m], shape (3,); zero unless MOVED."""
+
+
+NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 1.0, np.zeros(3))
+"""What is told before a wall is known."""
+
+
+class Tracker:
+    """Follows one wall."""
+
+    def __init__(self, wall: Wall, t_s: Array, d: Array, corners: Array) -> None:
+        """A wall displaced by `d` [m] at times `t_s` [s], shape (n,) each; `corners` of the region in A, shape (m, 3)."""
+        self.wall = wall
+        self._filter = BreathFilter(t_s, d)
+        middle = corners.mean(axis=0)
+        arm = wall.p_A - middle
+        turn = arm[:, 2] * wall.n_A[:, 0] - arm[:, 0] * wall.n_A[:, 2]  # n . (e_y x p)
+        self._reasons = np.column_stack((wall.lifts, wall.n_A[:, :2], turn))
+        self._corners = corners - middle
+        self._certainty = (wall.gain / wall.sigma) ** 2
+        self._whole = float(self._certainty @ wall.lifts**2)
+        self._precision = np.zeros((4, 4))
+        self._pull = np.zeros(4)
+        self._prior = np.diag(np.array(PRIOR) ** -2.0)
+        self._calm_s = float(t_s[-1])
+        self._votes = 0
+        self._moved = False
+
+    def follow(self, t_s: float, depth: Array, hidden: Array) -> Followed:
+        """Takes the wall's pixels of an image exposed at `t_s` [s]: depth [m], and whether the arm may hide it, (n,) each."""
+        expected, spread = self._filter.forward(t_s)
+        y = (depth - self.wall.depth) / self.wall.gain
+        use = np.isfinite(depth) & ~hidden & (np.abs(y - self.wall.lifts * expected) < REACH_M)
+        y = np.where(use, y, 0.0)
+        weight = np.where(use, self._certainty, 0.0)
+        if float(weight @ self.wall.lifts**2) < LEAST_SHARE * self._whole:
+            return self._told(State.MOVED if self._moved else State.LOST, expected)
+        d, weight = self._displacement(y, weight, expected)
+        noise = float(np.hypot(1 / np.sqrt(weight @ self.wall.lifts**2), SHARED_M))
+        self._weigh_motion(y - self.wall.lifts * d, weight)
+        surprise = abs(d - expected)
+        if surprise > max(SURPRISE * np.hypot(spread, noise), SURPRISE_M) or d > DEEP * self._filter.depth + SURPRISE_M:
+            self._calm_s = t_s + CALM_S
+        if surprise > SURPRISE * np.hypot(spread, noise) and surprise > SURPRISE_M:
+            self._filter.forget(d)
+        else:
+            self._filter.update(d, noise)
+        self._filter.remember(d)
+        if self._moved:
+            return self._told(State.MOVED, d)
+        return self._told(State.SPOILED if t_s < self._calm_s else State.QUIET, self._filter.forecast(np.zeros(1))[0])
+
+    def _told(self, state: State, d: float) -> Followed:
+        shift = np.append(self._motion[1:3], 0.0) if state is State.MOVED else np.zeros(3)
+        return Followed(state, float(d), self._filter.forecast(FORECAST_S), self._filter.sigma, shift)
+
+    def _displacement(self, y: Array, weight: Array, expected: float) -> tuple[float, Array]:
+        """The breath alone [m], and the weights with which pixels count for it: Tukey's biweight, about the median first."""
+        lifts = self.wall.lifts
+        clear = (weight > 0) & (lifts > 0.3)
+        d = float(np.median(y[clear] / lifts[clear])) if clear.any() else expected
+        robust = weight
+        for _ in range(2):
+            away = (y - lifts * d) ** 2 * self._certainty / TUKEY**2
+            robust = weight * np.clip(1 - away, 0, None) ** 2
+            d = float(robust @ (lifts * y)) / max(float(robust @ lifts**2), 1e-9)
+        return d, robust
+
+    def _weigh_motion(self, left: Array, weight: Array) -> None:
+        """Counts what an image leaves over [m], shape (n,), for the rigid motion."""
+        weighted = weight[:, np.newaxis] * self._reasons
+        self._precision = KEPT * self._precision + (1 - KEPT) * self._reasons.T @ weighted
+        self._pull = KEPT * self._pull + (1 - KEPT) * weighted.T @ left
+        self._votes = self._votes + 1 if self.moved_by > MOVED_M else 0
+        self._moved = self._moved or self._votes >= MOVED_IMAGES
+
+    @property
+    def _motion(self) -> Array:
+        """What is left of d, s_x, s_y and theta, shape (4,)."""
+        return np.asarray(np.linalg.solve(self._precision + self._prior, self._pull))
+
+    @property
+    def moved_by(self) -> float:
+        """How far the region has moved [m], root mean square over its corners, without a rise that they share."""
+        _, s_x, s_y, theta = self._motion
+        moved = np.array((s_x, s_y, 0.0)) + np.cross((0.0, theta, 0.0), self._corners)
+        moved[:, 2] -= moved[:, 2].mean()
+        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))

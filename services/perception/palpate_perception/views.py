@@ -1,0 +1,25 @@
+"""What perception takes for granted of a view: how the camera stands and what of it may be abdomen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from palpate_models.frames import Array
+
+HEIGHT_M: Final = (-0.16, 0.06)
+"""Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""
+TABLE_CLEARANCE_M: Final = 0.02
+"""Points this near to the table's top are the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """What camera_info and tf_static say."""
+
+    K: Array
+    """Shape (3, 3), in pixels."""
+    X_WC: Array
+    """Calibrated pose of the optical frame in world, shape (4, 4)."""
+    shape: tuple[int, int]
+    """Height and width of the full image."""

@@ -1,0 +1,174 @@
+"""What a look of a few breaths tells of the wall: where it is at the end of expiration, and how far each part of it is lifted.
+
+A small depth image z(t) of the wall is, at pixel i with viewing ray r_i (unit z) and outward normal n_i,
+
+    z_i(t) = z_i + g_i m_i d(t) + noise,   g_i = 1 / (n_i . r_i)
+
+with the displacement d and the mode m. The outward displacements (z_i(t) - mean z_i) / g_i are fitted by polynomials in x and y
+of A, frame by frame; the singular value decomposition of their coefficients, whitened by their covariance, gives d(t) and m.
+Errors that are fixed to the image cancel, since only changes of a pixel count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+from scipy.interpolate import griddata
+
+from palpate_models.frames import Array, apply, inverse
+from palpate_models.scenario import Exam
+from palpate_models.table import TABLE_TOP_M
+from palpate_perception import cloud, surface
+from palpate_perception.cloud import RegionBox
+from palpate_perception.fusion import Image
+from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
+
+MARGIN_M: Final = 0.12
+"""The wall is followed this much wider than the region: what lies there tells a shift from a breath."""
+CUTOFF_M: Final = 0.06
+"""Shorter waves of the wall are not seen by pixels 14 mm apart."""
+DEGREE: Final = 4
+"""Total degree of the mode's polynomial."""
+VALID: Final = 0.7
+"""A pixel that was seen in fewer of the frames is left out."""
+STEEP: Final = 0.35
+"""A pixel whose ray meets the wall at a smaller cosine is left out: a little error of its place is a large one of depth."""
+EDGE: Final = 2.5
+"""A pixel with so many times the usual noise lies at an edge, and is left out."""
+STILL_M: Final = 3e-4
+"""A wall that moves by a smaller standard deviation is still: then every part of it is expected to move alike."""
+EXPIRED: Final = 0.1
+"""Share of the time in which the wall is lower than at the end of expiration, for the noise of a frame's displacement."""
+LEAST_PIXELS: Final = 60
+
+
+class UnseenWallError(ValueError):
+    """Too little of the wall was in view to learn anything."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """How far breathing lifts each place, relative to where in the region it lifts most: a polynomial in x and y of A."""
+
+    low: Array
+    """The rectangle in A [m] that it was fitted over: least x and y, shape (2,) ..."""
+    high: Array
+    """... and largest."""
+    coefficients: Array
+    """Of the products of Legendre polynomials that `basis` gives."""
+
+    def __call__(self, p_A: Array) -> Array:
+        """The mode, between 0 and 1, at places in A [m], shape (n, 2 or 3): shape (n,)."""
+        return np.clip(basis(p_A, self.low, self.high) @ self.coefficients, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Wall:
+    """The wall as n pixels of the small image see it."""
+
+    pixel: NDArray[np.intp]
+    """Flat indices, shape (n,)."""
+    depth: Array
+    """At the end of expiration [m], shape (n,)."""
+    gain: Array
+    """g: change of depth by outward displacement, shape (n,), negative."""
+    sigma: Array
+    """Noise of a frame's depth [m], shape (n,)."""
+    p_A: Array
+    """Places [m], shape (n, 3)."""
+    n_A: Array
+    """Outward unit normals, shape (n, 3)."""
+    mode: Mode
+    lifts: Array
+    """The mode at the pixels, shape (n,)."""
+    r_W: Array
+    """Viewing rays of unit z in the camera's frame, shape (n, 3)."""
+    camera: Intrinsics
+    """Of the small image."""
+
+    def depth_per_metre(self, camera: Intrinsics, window: tuple[slice, slice]) -> Image:
+        """By how much depth changes for a displacement of 1 m, g m, in a window (rows, columns) of another of its images."""
+        rows, columns = (np.arange(part.start, part.stop) for part in window)
+        v, u = np.meshgrid(*(to_small(x, i, camera.K, self.camera.K) for x, i in ((rows, 1), (columns, 0))), indexing="ij")
+        places, values = np.column_stack(np.divmod(self.pixel, self.camera.shape[1])), self.gain * self.lifts
+        inside = griddata(places, values, (v, u), method="linear")
+        return np.where(np.isnan(inside), griddata(places, values, (v, u), method="nearest"), inside).astype(np.float32)
+
+
+def to_small(x: Array, axis: int, K: Array, K_small: Array) -> Array:
+    """Coordinates in the small image [px] of those in another of the same camera, along x (axis 0) or y (1)."""
+    return np.asarray((x - K[axis, 2]) / K[axis, axis] * K_small[axis, axis] + K_small[axis, 2])
+
+
+def basis(p_A: Array, low: Array, high: Array) -> Array:
+    """Products of Legendre polynomials of total degree up to DEGREE over a rectangle, at places, shape (n, 2 or 3)."""
+    x, y = (2 * (np.clip(p_A[:, :2], low, high) - low) / (high - low) - 1).T
+    columns = legendre.legvander2d(x, y, [DEGREE, DEGREE]).reshape(len(x), DEGREE + 1, DEGREE + 1)
+    i, j = np.indices((DEGREE + 1, DEGREE + 1))
+    return np.asarray(columns[:, i + j <= DEGREE])
+
+
+def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[Wall, Array]:
+    """The wall, and its displacement [m] in each frame, shape (frames,), from small depth images, shape (frames, height, width).
+
+    NaN where a pixel is invalid or hidden. Raises UnseenWallError when too few pixels show the wall.
+    """
+    pixel, mean, sigma = _steady(frames)
+    X_AC = inverse(X_WA) @ camera.X_WC
+    r_C = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel]
+    p_A = apply(X_AC, mean[:, np.newaxis] * r_C)
+    box = RegionBox.of(exam, MARGIN_M, HEIGHT_M)
+    keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE_TOP_M + TABLE_CLEARANCE_M)
+    keep[keep] &= sigma[keep] < EDGE * np.median(sigma[keep]) if keep.any() else False
+    if np.count_nonzero(keep) < LEAST_PIXELS:
+        raise UnseenWallError(f"{np.count_nonzero(keep)} pixels of the small image show the wall, want {LEAST_PIXELS}")
+    field = surface.fit(p_A[keep], sigma[keep], box.low[:2], box.high[:2], CUTOFF_M)
+    n_A = field.normal(p_A[:, 0], p_A[:, 1])
+    slope = np.einsum("ij,ij->i", n_A, r_C @ X_AC[:3, :3].T)
+    keep &= -slope > STEEP * np.linalg.norm(r_C, axis=1)
+    if np.count_nonzero(keep) < LEAST_PIXELS:
+        raise UnseenWallError(f"{np.count_nonzero(keep)} pixels of the small image see the wall well, want {LEAST_PIXELS}")
+    pixel, mean, sigma, p_A, n_A, gain = (a[keep] for a in (pixel, mean, sigma, p_A, n_A, 1 / slope))
+
+    outward = np.nan_to_num((frames.reshape(len(frames), -1)[:, pixel] - mean) / gain)
+    mode = _mode(outward, np.abs(gain) / sigma, p_A, exam)
+    lifts = mode(p_A)
+    weight = lifts * (gain / sigma) ** 2
+    d = outward @ weight / (weight @ lifts)
+    expired = float(np.quantile(np.convolve(d, np.full(3, 1 / 3), "valid"), EXPIRED)) if len(d) > 2 else float(d.min())
+    depth = mean + gain * lifts * expired
+    r_W = r_C[keep] @ camera.X_WC[:3, :3].T
+    return Wall(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
+
+
+def _steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    """The pixels that were mostly seen (flat), with their mean depth and the noise of a frame [m], shape (n,) each."""
+    flat = frames.reshape(len(frames), -1)
+    pixel = np.flatnonzero(np.isfinite(flat).mean(axis=0) > VALID)
+    seen = flat[:, pixel]
+    step = np.nan_to_num(np.diff(seen, axis=0))
+    sigma = np.sqrt(np.mean(step**2, axis=0) / 2) if len(frames) > 2 else np.full(len(pixel), 2e-3)
+    return pixel, np.nanmean(seen, axis=0), np.maximum(sigma, 1e-4)
+
+
+def _mode(outward: Array, certainty: Array, p_A: Array, exam: Exam) -> Mode:
+    """The mode of outward displacements [m], shape (frames, n), whose noise is 1 / `certainty` [1/m], shape (n,)."""
+    low, high = p_A[:, :2].min(axis=0), p_A[:, :2].max(axis=0)
+    waves = basis(p_A, low, high)
+    Q, R = np.linalg.qr(certainty[:, np.newaxis] * waves)
+    score, size, shape = np.linalg.svd((certainty * outward) @ Q, full_matrices=False)
+    coefficients = np.linalg.solve(R, shape[0])
+    region = RegionBox.of(exam, 0.0, HEIGHT_M)
+    inside = region.holds(p_A)
+    lifts = waves @ coefficients
+    most = lifts[inside if inside.any() else slice(None)]
+    most = most[np.argmax(np.abs(most))]
+    if np.std(score[:, 0]) * size[0] * abs(most) < STILL_M:
+        level = np.zeros(len(coefficients))
+        level[0] = 1.0
+        return Mode(low, high, level)
+    return Mode(low, high, coefficients / most)

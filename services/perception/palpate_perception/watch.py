@@ -1,0 +1,77 @@
+"""Watches the wall for about two breaths after a trigger."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from palpate_models.frames import Array, inverse
+from palpate_models.scenario import Exam
+from palpate_perception import cloud, wall
+from palpate_perception.arm import ArmMask
+from palpate_perception.cloud import RegionBox
+from palpate_perception.fusion import Image
+from palpate_perception.views import HEIGHT_M, Intrinsics
+from palpate_perception.wall import Wall
+
+LONGEST_S: Final = 10.0
+"""A watch lasts no longer."""
+STILL_S: Final = 5.0
+"""A wall that has not moved for so long is still."""
+STILL_M: Final = 0.001
+"""Between its 5th and 95th percentile the mean depth of a still wall differs by less."""
+BREATHS: Final = 2
+
+
+class Watch:
+    """The small images of one look."""
+
+    def __init__(self, camera: Intrinsics, X_WA: Array, exam: Exam) -> None:
+        self.camera = camera
+        """Of the small image."""
+        self._X_WA, self._exam = X_WA, exam
+        X_CA = inverse(camera.X_WC) @ X_WA
+        self.window = cloud.window(RegionBox.of(exam, wall.MARGIN_M, HEIGHT_M), X_CA, camera.K, camera.shape)
+        """Rows and columns of the image that may show the wall."""
+        self._middle = cloud.window(RegionBox.of(exam, 0.0, (-0.05, 0.03)), X_CA, camera.K, camera.shape)
+        self._r_W = (cloud.deproject(np.ones(camera.shape), camera.K) @ camera.X_WC[:3, :3].T)[self.window].reshape(-1, 3)
+        self._times: list[float] = []
+        self._images: list[Image] = []
+
+    def add(self, t_s: float, image: Image, arm: ArmMask, q: Array | None) -> None:
+        """Takes an image [m], exposed at `t_s` [s] with the arm at the joint positions `q` [rad], which are not known if None."""
+        seen = np.full(image.shape, np.nan, np.float32)
+        part = image[self.window].copy()
+        if q is not None:
+            z = np.nan_to_num(part.ravel().astype(float), nan=0.5)
+            part[arm.hides(q, self.camera.X_WC[:3, 3], self._r_W, z).reshape(part.shape)] = np.nan
+        seen[self.window] = part
+        self._times.append(t_s)
+        self._images.append(seen)
+
+    def over(self) -> bool:
+        """Whether enough was seen: two breaths, a wall that is still, or all that there is time for."""
+        lasted = self._times[-1] - self._times[0] if self._times else 0.0
+        if lasted < STILL_S:
+            return False
+        with np.errstate(invalid="ignore"):
+            height = -np.array([np.nanmean(image[self._middle]) for image in self._images])
+        if lasted >= LONGEST_S or not np.isfinite(height).all():
+            return lasted >= LONGEST_S
+        low, high = np.quantile(height, (0.05, 0.95))
+        return bool(high - low < STILL_M or rises(height, low, high) > BREATHS)
+
+    def learn(self) -> tuple[Wall, Array, Array]:
+        """The wall, and its displacements [m] at the times [s] of the images. Raises UnseenWallError."""
+        if not self._images:
+            raise wall.UnseenWallError("no small image has come")
+        found, d = wall.learn(np.array(self._images, np.float64), self.camera, self._X_WA, self._exam)
+        return found, np.array(self._times), d
+
+
+def rises(height: Array, low: float, high: float) -> int:
+    """How often a height goes from the lower third between `low` and `high` to the upper one."""
+    part = (height - low) / (high - low)
+    ends = part[(part < 1 / 3) | (part > 2 / 3)] > 0.5
+    return int(np.count_nonzero(ends[1:] & ~ends[:-1]))
