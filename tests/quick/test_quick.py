@@ -105,7 +105,7 @@ def test_states_are_those_of_the_contract() -> None:
     gathered = collected(examination, examination.run())
     stamps = np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in gathered.exam_states])
     assert np.diff(stamps[:-1]) == pytest.approx(0.010)
-    assert gathered.exam_states[-1].stroke == 5
+    assert gathered.exam_states[-1].stroke == 6  # lines
     assert len(gathered.indentation) == len(gathered.exam_states) - 1
 
 
