@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final
 
-from palpate.quick.errors import Loop, LoopErrors, loop_errors
+from palpate.quick.errors import Drawn, Loop, LoopErrors, loop_errors
 from palpate.quick.examination import Examination
 from palpate.quick.messages import collected
 from palpate.report.results import assemble, truth_of_run
@@ -43,14 +43,14 @@ class QuickCase:
     """The patient pressed for the truth (kept for the next time), and compared."""
 
 
-def run_quick(scenario: Scenario, errors: LoopErrors | None = None) -> QuickCase:
+def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn | None = None) -> QuickCase:
     """Examines the patient of a scenario without arm and bus, with the errors that whole examinations have.
 
-    `errors`: distributions of its loop; None for those of loop.yaml. Raises UnknownLoopError where it has none, NoTissueError
-    for a tissue of which there is no copy, ChoiceError for an assessment that cannot be made.
+    `errors`: distributions of its loop; None for those of loop.yaml. `drawn` as in `Loop`. Raises UnknownLoopError where it has
+    none, NoTissueError for a tissue of which there is no copy, ChoiceError for an assessment that cannot be made.
     """
     begin = perf_counter()
-    examination = Examination(scenario, Loop(scenario, errors or loop_errors(scenario)))
+    examination = Examination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
     gathered = collected(examination, examination.run())
     simulated = perf_counter()
     (service,) = load_services(scenario, ("assessment",))

@@ -4,15 +4,15 @@
 assumed: studies on it say so. With d the depth that the examination measures and d' the true one, against the skin as it
 breathes,
 
-    d - d' = offset + tilt . xy + field(xy) + wander(t) - (1 - followed) (excursion(t) - its mean)
+    d - d' = offset + zero(stroke) + tilt . xy + field(xy) + wander(t) - (1 - followed) (excursion(t) - its mean)
 
-and d is the set-point plus the error of regulation. Force is read by the force/torque sensor of `palpate_robot`, tared once
-before the first stroke. Where the patient lies is what registration got wrong, and needs no distribution.
+and d is the set-point plus the error of regulation. Force is read by the force/torque sensor of `palpate_robot`, tared before
+each stroke. Where the patient lies is what registration got wrong, and needs no distribution.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from math import exp
@@ -31,14 +31,15 @@ from palpate_bus.messages.stamps import NS
 from palpate_models import lbr
 from palpate_models.errors import Level, draw_errors, levels
 from palpate_models.frames import Array
-from palpate_models.scenario import Exam, Scenario
+from palpate_models.scenario import Exam, Following, Scenario
 from palpate_models.section import NonNegative, Positive, Section
 from palpate_models.seeds import generator
-from palpate_planning.exam_sequence import TARE
+from palpate_planning.descent import TARE_S
 from palpate_robot.ft_sensor import FtSensor
 
 LOOP_SECTIONS: Final = ("camera", "hand_eye", "registration", "arm")
 """Sections of the errors that reach an examination through its loop; the force sensor's are simulated as they are."""
+_STROKES: Final = 1024
 _GRID_M: Final = 0.004
 _BEYOND_M: Final = 0.06
 """The field of surface errors reaches this far beyond the examined region."""
@@ -69,6 +70,8 @@ class LoopErrors(Section):
     registration: Level
     arm: Level
     breathing: Breath
+    following: Following
+    """What the examination does about breathing."""
     examinations: Annotated[int, Field(ge=0)]
     """From how many whole examinations these figures are; 0: they are assumed."""
     begin_s: Positive
@@ -79,6 +82,10 @@ class LoopErrors(Section):
     """How much too far outward the perceived surface is, as it is used: after every correction."""
     tilt: Normal
     """The slope of that along x, and along y."""
+    zero_m: NonNegative
+    """What is wrong all over one stroke, since its touch: standard deviation over strokes."""
+    uncertainty_m: NonNegative
+    """RMS of all that is wrong with the depth: the standard deviation that the examination is to state."""
     field_m: NonNegative
     """What else is wrong with it, smooth over the skin: standard deviation."""
     field_length_m: Positive
@@ -93,6 +100,28 @@ class LoopErrors(Section):
     """Measured depth less set-point at depth: standard deviation."""
     regulation_s: Positive
     """Its correlation time, as that of the wander."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """What stays the same all over one examination."""
+        aside = self.aside_m * rng.standard_normal(2)
+        offset, tilt = self.offset_m.draw(rng), np.array((self.tilt.draw(rng), self.tilt.draw(rng)))
+        return Drawn(offset, tilt, self.followed.draw(rng), aside, self.zero_m * rng.standard_normal(_STROKES))
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What one examination gets wrong from beginning to end."""
+
+    offset_m: float
+    """How much too far outward the perceived surface is at the centre of the region."""
+    tilt: Array
+    """Its slope along x and y, shape (2,)."""
+    followed: float
+    """Which part of the breathing excursion is followed."""
+    aside_m: Array
+    """Where the tool truly is less where it is believed to be, xy of A, shape (2,)."""
+    zeros_m: Array
+    """What is wrong with the depths of one stroke after another; from the first again after the last."""
 
 
 @cache
@@ -115,7 +144,7 @@ def setting_of(scenario: Scenario) -> dict[str, str | None]:
         kind = type(given)
         of_level = {"none": kind(), **{level: kind(**fields.get(name, {})) for level, fields in levels().items()}}
         sections[name] = next((level for level, section in of_level.items() if section == given), None)
-    return {**sections, "breathing": scenario.phantom.breathing.kind}
+    return {**sections, "breathing": scenario.phantom.breathing.kind, "following": scenario.exam.breathing.value}
 
 
 def loop_errors(scenario: Scenario) -> LoopErrors:
@@ -137,16 +166,18 @@ def loop_errors(scenario: Scenario) -> LoopErrors:
 class Loop:
     """What one examination gets wrong. Equal scenarios have equal loops."""
 
-    def __init__(self, scenario: Scenario, errors: LoopErrors) -> None:
-        """Drawn from the scenario's seed."""
+    def __init__(self, scenario: Scenario, errors: LoopErrors, drawn: Drawn | None = None) -> None:
+        """Drawn from the scenario's seed; `drawn` takes the place of what stays the same all over the examination."""
         rng = generator(scenario.seed, "loop")
+        mine = errors.draw(rng)
+        self._drawn = drawn or mine
         self.begin_s = errors.begin_s
         """When the first stroke begins [s]."""
-        self.aside_m: Array = errors.aside_m * rng.standard_normal(2)
+        self.aside_m = self._drawn.aside_m
         """Where the tool truly is less where it is believed to be, xy of A [m], shape (2,)."""
-        self._offset = errors.offset_m.draw(rng)
-        self._tilt = np.array((errors.tilt.draw(rng), errors.tilt.draw(rng)))
-        self.followed = errors.followed.draw(rng)
+        self.uncertainty_m = errors.uncertainty_m
+        """The standard deviation of depth that the examination states."""
+        self.followed = self._drawn.followed
         """Which part of the breathing excursion is followed."""
         self._centre = np.array(scenario.exam.centre_m)
         self._field = _field(scenario.exam, errors.field_m, errors.field_length_m, rng)
@@ -156,7 +187,11 @@ class Loop:
 
     def wrong(self, xy: Array) -> Array:
         """How much too far outward the perceived surface is at points [m], shape (p, 2) -> (p,)."""
-        return np.asarray(self._offset + (xy - self._centre) @ self._tilt + self._field.ev(xy[:, 0], xy[:, 1]))
+        return np.asarray(self._drawn.offset_m + (xy - self._centre) @ self._drawn.tilt + self._field.ev(xy[:, 0], xy[:, 1]))
+
+    def zero(self, stroke: int) -> float:
+        """How much too far outward the skin is believed to be in a stroke, counted from 1 [m]."""
+        return float(self._drawn.zeros_m[(stroke - 1) % len(self._drawn.zeros_m)])
 
     def regulation(self, k: int) -> float:
         """Measured depth less set-point in the k-th period [m]."""
@@ -169,6 +204,10 @@ class Loop:
     def gains(self, outward: Array) -> Array:
         """Rows that take a force to the normal force that is read of it, for outward normals, both of shape (p, 3)."""
         return self._sensor.gains(outward)
+
+    def tare(self, k: int) -> None:
+        """Takes what the sensor reads just before the k-th period, in which nothing is touched, for its bias."""
+        self._sensor.tare(k)
 
     def tared(self, k: int) -> float:
         """What the sensor reads in the k-th period without a force, along the outward normal [N]."""
@@ -219,7 +258,7 @@ class _Smooth:
 
 
 class _TaredSensor:
-    """The force sensor of a patient's examination, as it reads normal forces after a tare at the first stroke's beginning.
+    """The force sensor of a patient's examination, as it reads normal forces.
 
     Its z axis is along the inward normal, x near that of A; readings are means over PERIOD_S, as `robot/status` has them.
     """
@@ -232,8 +271,8 @@ class _TaredSensor:
         self._sensor = FtSensor(drawn, generator(scenario.seed, "loop force"), PERIOD_S)
         self._begin = round(begin_s / PERIOD_S)
         self._normal: list[float] = []
-        self._read(self._begin)
-        self._tare = float(np.mean(self._normal[self._begin - round(TARE / NS / PERIOD_S) : self._begin]))
+        self._tare = 0.0
+        self.tare(0)
         reads, lever = drawn.sensitivity[2], lbr.FT_TO_INDENTER_M
         self._row = np.array((reads[0] + lever * reads[4], reads[1] - lever * reads[3], reads[2]))
         """What z reads of a force at the sphere's centre, in the sensor's axes, shape (3,)."""
@@ -249,6 +288,11 @@ class _TaredSensor:
         x /= np.linalg.norm(x, axis=1, keepdims=True)
         axes = np.stack((x, np.cross(z, x), z), axis=1)
         return np.asarray(-np.einsum("i,pij->pj", self._row, axes))
+
+    def tare(self, k: int) -> None:
+        self._read(self._begin + k)
+        now = self._begin + k
+        self._tare = float(np.mean(self._normal[max(now - round(TARE_S / PERIOD_S), 0) : now]))
 
     def tared(self, k: int) -> float:
         self._read(self._begin + k)

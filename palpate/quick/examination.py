@@ -19,34 +19,39 @@ from palpate.quick.patient import PERIOD_S, Patient
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
-from palpate_models.scenario import Mode, Scenario
+from palpate_models.scenario import Following, Mode, Scenario
 from palpate_perception import pattern
 from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
+from palpate_planning.breath import Breath
 from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
 from palpate_planning.coverage import strokes, transfer
+from palpate_planning.descent import ALLOWANCE_M, DESCEND_MPS, PROBE_MPS, REST_S, SIGMAS, TARE_S
 from palpate_planning.palpation import (
     AT_DEPTH,
-    DESCEND_MPS,
     HOLD_S,
     HOP_M,
     LIFT_MPS,
     SETTLE_MAX_S,
     SETTLED_M,
     SETTLED_S,
-    SLOW_M,
     STEADY_FRACTION,
+    STOPPED,
     StrokeStage,
 )
 from palpate_planning.path import Ints, SurfacePath, lay
 from palpate_planning.segments import Segment
-from palpate_planning.stroke_motion import StrokeMotion
-from palpate_planning.surface import PerceivedSurface
+from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
+from palpate_planning.surface import Foot, PerceivedSurface
+from palpate_planning.touch import FELT_N
+from palpate_planning.wall import Wall
+from palpate_planning.wall_watch import GATE_M
 
 _DENSE_M: Final = 0.0003
 """Along a stroke, places are known so far apart: what the indenter travels in a period."""
 _DOWN: Final = np.diag((1.0, -1.0, -1.0))
 """The tool's orientation, with its z axis into the body."""
 _NOWHERE: Final = np.zeros(3)
+_FOOT: Final = Foot(_NOWHERE, _NOWHERE, 0.0, _NOWHERE[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +73,8 @@ class Way:
     """Share of the breathing excursion there, g of them."""
     wrong_m: list[float]
     """How much too far outward the perceived surface is there [m], g of them."""
+    target: list[int]
+    """Index of the target reached last, g of them."""
     gains: Array
     """Rows that take a force in that frame to the normal force that is read of it, shape (g, 3)."""
 
@@ -87,6 +94,10 @@ class Row:
     """[m]"""
     force: float
     """Measured [N]."""
+    followed: float
+    """How far the set-point has followed the skin by the breath [m]."""
+    stroke: int
+    """Number of the latest descent."""
     true_depth: float
     """Against the skin as it breathes [m]."""
     true_force: Array
@@ -94,7 +105,6 @@ class Row:
     touching: bool
     steady: bool
     limited: bool
-    target: int
 
 
 class Examination:
@@ -116,14 +126,19 @@ class Examination:
         """The true skin at rest, in A as registered."""
         self._breathing = self._skin.between(model.breathing)
         self._mean_excursion = self.patient.tissue.breathing.mean_m
-        self._motion = StrokeMotion(self._exam, scenario.limits, self.patient.radius, PERIOD_S)
+        self._believed = PerceivedSurface.from_mesh(*self.perceived, self._X_WA)
+        wall = Wall(self._believed, Breath())
+        self._motion = StrokeMotion(self._exam, scenario.limits, self.patient.radius, PERIOD_S, wall)
+        self._unsure_m = SIGMAS * loop.uncertainty_m
+        self._gated = self._exam.breathing is Following.GATE
+        self._open = True
+        self._zero_m = 0.0
         self._force, self._touching = 0.0, False
         self._depth = -HOP_M
-        self._count = 0
+        self._count = self._stroke_number = 0
 
     def run(self) -> list[Row]:
         """Carries it out: what was measured, and what was true."""
-        perceived = PerceivedSurface.from_mesh(*self.perceived, self._X_WA)
         x, y = pattern.lattice(self._exam)
         order = pattern.order(len(x), len(y), self._exam.pattern)
         xy = pattern.downsample(np.empty((0, 3)), x, y)[0][order]
@@ -133,8 +148,8 @@ class Examination:
         before: Array | None = None
         for stroke in strokes(xy, (order // len(y)).astype(np.int64), usable, exam.pattern, exam.mode, exam.spacing_m):
             if before is not None:
-                rows += self._travel(self._way(perceived, transfer(before, stroke.xy[0]), stroke.targets[:1], contact=False))
-            rows += self._stroke(self._way(perceived, stroke.xy, stroke.targets, stroke.visits))
+                rows += self._travel(self._way(transfer(before, stroke.xy[0]), stroke.targets[:1], contact=False))
+            rows += self._stroke(self._way(stroke.xy, stroke.targets, stroke.visits))
             before = stroke.xy[-1]
         return rows
 
@@ -153,16 +168,24 @@ class Examination:
         p = p + n * self._loop.wrong(p[:, :2])[:, None]
         return apply(self._X_WA, p), n @ self._X_WA[:3, :3].T
 
-    def _way(
-        self, perceived: PerceivedSurface, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True
-    ) -> Way:
-        s, p, n, R = lay(perceived, xy, _DOWN)
+    @property
+    def shares(self) -> Array:
+        """Share of the breathing excursion at each of these points, as it truly is, shape (n,)."""
+        return np.asarray(self._breathing(apply(inverse(self._X_WA), self.perceived[0])[:, :2]))
+
+    @property
+    def uncertainty_m(self) -> float:
+        """Standard deviation of depth that the examination states [m]."""
+        return self._loop.uncertainty_m
+
+    def _way(self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True) -> Way:
+        s, p, n, R = lay(self._believed, xy, _DOWN)
         visited: Ints = np.zeros(len(targets), dtype=np.int64) if visits is None else visits
         path = SurfacePath(s, p, n, R, np.zeros((len(s), 7)), targets, visited)
         count = max(1, round(path.length / _DENSE_M))
         at = np.linspace(0.0, path.length, count + 1)
         dense = np.column_stack([np.interp(at, s, xy[:, k]) for k in (0, 1)])
-        believed, outward = perceived.at(dense)
+        believed, outward = self._believed.at(dense)
         place, normal = self._skin.points(dense + self._loop.aside_m)
         return Way(
             segment=Segment(path, contact=contact),
@@ -173,6 +196,7 @@ class Examination:
             normal=normal @ self._X_AtA[:3, :3].T,
             breathing=self._breathing(dense + self._loop.aside_m).tolist(),
             wrong_m=self._loop.wrong(dense).tolist(),
+            target=targets[np.maximum(np.searchsorted(path.visits, at, side="right") - 1, 0)].tolist(),
             gains=self._loop.gains(outward @ self._R_AtW.T),
         )
 
@@ -181,12 +205,21 @@ class Examination:
     def _stroke(self, way: Way) -> Iterator[Row]:
         motion, exam = self._motion, self._exam
         motion.start(way.segment)
-        while motion.depth.position < -SLOW_M:
-            motion.depth.step(exam.depth_m, DESCEND_MPS)
+        for _ in range(round((REST_S + TARE_S) / PERIOD_S)):
+            motion.depth.step(-HOP_M, LIFT_MPS)
+            yield self._period(way, StrokeStage.REST)
+        self._loop.tare(self._count)
+        self._stroke_number += 1
+        self._zero_m = self._loop.zero(self._stroke_number)
+        while self._force < FELT_N and motion.depth.position < exam.depth_m:
+            braking = motion.depth.velocity**2 / DEPTH_ACCELERATION
+            near = motion.depth.position > -self._unsure_m - ALLOWANCE_M - braking
+            motion.depth.step(self._unsure_m + exam.depth_m, PROBE_MPS if near else DESCEND_MPS)
             yield self._period(way, StrokeStage.DESCEND)
-        there = False
-        while not there:
-            there = motion.deepen() or motion.slowdown(0.7, 1.0, 0.0) < 0.1
+        there, stopped = False, 0.0
+        while not there and stopped <= SETTLED_S:
+            there = motion.deepen()
+            stopped = stopped + PERIOD_S if motion.slowdown(0.7, 1.0, 0.0) < STOPPED else 0.0
             yield self._period(way, StrokeStage.DESCEND)
         settled = waited = 0.0
         while settled < SETTLED_S and waited < SETTLE_MAX_S:
@@ -195,11 +228,15 @@ class Examination:
             settled, waited = settled + PERIOD_S if near else 0.0, waited + PERIOD_S
             yield self._period(way, StrokeStage.SETTLE)
         if exam.mode is Mode.POINT or not way.segment.path.length:
-            for _ in range(round(HOLD_S / PERIOD_S)):
+            held = 0
+            while held < round(HOLD_S / PERIOD_S):
+                held += self._open
                 yield self._period(way, StrokeStage.HOLD)
         else:
-            while not motion.slide():
+            while not (self._open and motion.slide()):
                 motion.deepen()
+                if not self._open:
+                    motion.brake()
                 yield self._period(way, StrokeStage.SLIDE)
         while not motion.depth.step(-HOP_M, LIFT_MPS):
             motion.brake()
@@ -214,21 +251,23 @@ class Examination:
         """The indenter follows the motion for a period, with this examination's errors."""
         motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
         self._count += 1
-        contact = ContactMeasurement(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE, self._depth, self._force, self._touching)
+        measured = (self._depth, self._force, self._touching)
+        contact = ContactMeasurement(_NOWHERE, _NOWHERE, _FOOT, 0.0, 0.0, loop.uncertainty_m, *measured)
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT)
         at = int(motion.along.position * way.per_m + 0.5)
         self._depth = motion.regulation.reference + loop.regulation(k)
         share = way.breathing[at]
         excursion = patient.tissue.excursion(patient.time + PERIOD_S)
         unseen = (1.0 - loop.followed) * share * (excursion - self._mean_excursion)
-        depth = self._depth - way.wrong_m[at] - loop.wander(k) + unseen
+        depth = self._depth - way.wrong_m[at] - self._zero_m - loop.wander(k) + unseen
         height = patient.radius - depth + share * excursion
         force = patient.move(way.place[at] + height * way.normal[at])
         self._force = float(way.gains[at] @ force) + loop.tared(k)
         self._touching = self._force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
+        self._open = not self._gated or abs(loop.followed * excursion) < GATE_M
         limited = motion.regulation.limited or (motion.short_of_depth and stage in AT_DEPTH)
         fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
-        steady = self._touching and (stage is StrokeStage.HOLD or (stage is StrokeStage.SLIDE and fast))
+        steady = self._touching and self._open and (stage is StrokeStage.HOLD or (stage is StrokeStage.SLIDE and fast))
         return Row(
             time=patient.time,
             way=way,
@@ -237,10 +276,11 @@ class Examination:
             depth=self._depth,
             setpoint=motion.regulation.reference,
             force=self._force,
+            followed=loop.followed * share * excursion,
+            stroke=self._stroke_number,
             true_depth=depth,
             true_force=force,
             touching=self._touching,
             steady=steady,
             limited=limited,
-            target=motion.target,
         )

@@ -135,6 +135,10 @@ class ElasticTissue(TissueBackend):
         self.disturbed = self.touching = False
         self.activation = 1.0
 
+    def in_steps_of(self, dt: float) -> TissueBackend:
+        """See `TissueBackend`. Its steps are implicit already."""
+        return ElasticTissue(self.model, self.compliance, self._stiffness, self.breathing, dt)
+
     def press(self, places: Array, normals: Array, radius: float) -> Array:
         """See `TissueBackend`. In steps of PRESS_STEP_S: the step is implicit, and what is read is the end of the hold."""
         if self.dt >= PRESS_STEP_S:

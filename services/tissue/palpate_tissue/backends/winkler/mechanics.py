@@ -51,8 +51,8 @@ class Mechanics:
         return count
 
 
-def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
-    """The matrices of a phantom.
+def stiffness_matrix(model: PhantomModel, stiffness: Stiffness) -> sparse.csr_array:
+    """K of a phantom.
 
     Pasternak's G = k_w l^2 varies with k_w. An edge between two vertices carries the harmonic mean of their G, as
     between cells of a finite-volume scheme: the same shear flows through both halves. It also keeps the bound low at
@@ -77,9 +77,15 @@ def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
         shape=(n, n),
     )
     matrix.sort_indices()
+    return matrix
+
+
+def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
+    """The matrices of a phantom."""
+    matrix = stiffness_matrix(model, stiffness)
     damping = stiffness.dashpot_s * model.stiffness * model.areas
     beside = wall.largest_slope(model.stiffening, model.tension)
-    hardest = matrix + sparse.diags_array(np.where(free, model.stiffness * model.areas * beside, 0.0))
+    hardest = matrix + sparse.diags_array(np.where(~model.fixed, model.stiffness * model.areas * beside, 0.0))
     return Mechanics(matrix, damping, _largest_rate(hardest, damping), _gershgorin(hardest, damping))
 
 

@@ -25,6 +25,7 @@ from palpate_models.phantom import PhantomModel
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler import kernel
+from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.kernel import Patch, Wall
 from palpate_tissue.backends.winkler.mechanics import assemble
 from palpate_tissue.near import Near, Search
@@ -61,6 +62,7 @@ class WinklerTissue(TissueBackend):
         """y_k = g_k z_k [m]: what has relaxed, a row (n,) for each Prony branch."""
         self.disturbed = False
         """Whether anything has ever moved; until then the field is left at its exact rest."""
+        self._stiffness = stiffness
         self._prony_g, self._length_m = stiffness.prony_g, stiffness.length_m
         self._wall = self._wall_of(stiffness, h)
         self._gain = self.mechanics.damping / h
@@ -112,6 +114,10 @@ class WinklerTissue(TissueBackend):
         self._near, self._patch = None, self._nothing
         self.disturbed = self.touching = False
         self.activation = 1.0
+
+    def in_steps_of(self, dt: float) -> TissueBackend:
+        """See `TissueBackend`. Implicit steps."""
+        return ImplicitTissue(self.model, self._stiffness, self.breathing, dt)
 
     def press(self, places: Array, normals: Array, radius: float) -> Array:
         """See `TissueBackend`. Each goes into the part of the wall that it reaches, cut out and held at its rim."""

@@ -1,0 +1,258 @@
+"""What whole examinations get wrong, fitted: `python -m palpate.quick.study RUN...` writes loop.yaml from the folders of runs.
+
+`python -m palpate.quick.study --examine 20 --level typical --breathing quiet -o DIR` makes such runs first: persons, every second
+one with a lump, seeds 0 to 999. Rows of loop.yaml whose setting is not among the runs stay as they are.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import typer
+import yaml
+from scipy.optimize import curve_fit
+
+from palpate.quick.errors import Drawn, LoopErrors, Normal, setting_of, studied
+from palpate.quick.patient import PERIOD_S
+from palpate.report.archive import read_evidence
+from palpate.truth.surface import TrueBody, TrueSurface
+from palpate_bus.messages import ExamState
+from palpate_bus.messages.stamps import NS
+from palpate_models.breathing import BreathingCurve
+from palpate_models.frames import Array, apply, matrix
+from palpate_models.load import exam_input, load_scenario, true_pose
+from palpate_models.phantom import build_phantom
+from palpate_models.scenario import Scenario
+
+APART_S: Final = 3.0
+"""Measurements that lie further apart in time share nothing but the surface's own error."""
+_LONGEST: Final = 100
+"""Lags of the covariances in time, of PERIOD_S each."""
+_PAIRS: Final = 400_000
+"""Pairs of measurements of a run from which its covariance in space is taken."""
+_HALF: Final = 1.678
+"""(1 + x) exp(-x) is one half here."""
+_HEADER: Final = """\
+# What whole examinations get wrong, by setting of the errors and kind of breathing: see palpate/quick/errors.py for the fields.
+# Made by `python -m palpate.quick.study` from whole examinations; never edited by hand.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One whole examination where it measured at depth; n instants."""
+
+    scenario: Scenario
+    begin_s: float
+    """When the first stroke that presses began [s]."""
+    stroke: Array
+    """In which stroke, from 0 on, shape (n,)."""
+    time: Array
+    """[s], shape (n,)."""
+    place: Array
+    """Where it believed to be, xy of A as registered, from the centre of the region [m], shape (n, 2)."""
+    aside: Array
+    """Where it was less that [m], xy, shape (n, 2)."""
+    wrong: Array
+    """Measured less true depth [m], shape (n,)."""
+    unseen: Array
+    """How far breathing lifted the skin there above its mean [m], shape (n,)."""
+    regulation: Array
+    """Measured depth less set-point [m], shape (n,)."""
+
+
+def trace_of(folder: Path) -> Trace:
+    """The trace of a run. Raises EvidenceError or ScenarioError for a folder that is none."""
+    scenario, evidence = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder)
+    stamps, true_stamps = (np.round(a * NS).astype(np.int64) for a in (evidence.time, evidence.true_time))
+    there = evidence.steady & np.isin(stamps, true_stamps)
+    time = evidence.time[there]
+    true_depth = evidence.true_depth[np.searchsorted(true_stamps, stamps[there])]
+    descents = np.cumsum(
+        np.diff(evidence.phase == ExamState.PHASE_INDENT, prepend=False) & (evidence.phase == ExamState.PHASE_INDENT)
+    )
+    strokes = np.unique(descents[there], return_inverse=True)[1]
+    X_WA, X_WT = np.array(exam_input(scenario).X_WA), matrix(true_pose(scenario))
+    touched = evidence.touched
+    off_W = apply(X_WT, touched.true) - apply(X_WA, touched.believed)
+    model = build_phantom(scenario.phantom, scenario.seed)
+    skin = TrueSurface(TrueBody(model.vertices, model.triangles, X_WT))
+    curve = BreathingCurve(scenario.phantom.breathing, scenario.seed)
+    excursion = np.array([curve.excursion(t) for t in time.tolist()])
+    return Trace(
+        scenario=scenario,
+        begin_s=_began(evidence.time, evidence.phase),
+        stroke=strokes,
+        time=time,
+        place=touched.believed[:, :2] - scenario.exam.centre_m,
+        aside=(off_W @ X_WA[:3, :3])[:, :2],
+        wrong=evidence.depth[there] - true_depth,
+        unseen=skin.between(model.breathing)(touched.true[:, :2]) * (excursion - curve.mean_m),
+        regulation=evidence.depth[there] - evidence.setpoint[there],
+    )
+
+
+def _began(time: Array, phase: Array) -> float:
+    """When the descent began that led to the first state in phase SCAN [s]."""
+    indents = np.flatnonzero(np.diff(phase == ExamState.PHASE_INDENT, prepend=False) & (phase == ExamState.PHASE_INDENT))
+    scans = int(np.argmax(phase == ExamState.PHASE_SCAN))
+    return float(time[indents[indents < scans][-1]])
+
+
+def loop_of(traces: Sequence[Trace]) -> LoopErrors:
+    """The distributions behind examinations of one setting."""
+    fitted = [_fit(trace) for trace in traces]
+    surface = np.array([[found.offset_m, *found.tilt, found.followed] for found, _ in fitted])
+    rests = [rest for _, rest in fitted]
+    field_m, field_length_m = _field(traces, rests)
+    variance = float(np.mean([rest.var() for rest in rests]))
+    in_time = _in_time([t.time for t in traces], rests)
+    travelled = 0.5 * traces[0].scenario.exam.speed_mps * PERIOD_S * np.arange(len(in_time))
+    wander = in_time - field_m**2 * np.exp(-0.5 * (travelled / field_length_m) ** 2)
+    regulated = _in_time([t.time for t in traces], [t.regulation for t in traces])
+    breathes = traces[0].scenario.phantom.breathing.kind != "none"
+    return LoopErrors(
+        **setting_of(traces[0].scenario),  # type: ignore[arg-type]  # a setting of no level is refused there
+        examinations=len(traces),
+        begin_s=_round(np.mean([trace.begin_s for trace in traces])),
+        aside_m=_round(np.sqrt(np.mean([found.aside_m**2 for found, _ in fitted]))),
+        offset_m=_normal(surface[:, 0]),
+        tilt=_normal(surface[:, 1:3].ravel()),
+        zero_m=_round(np.sqrt(np.mean(np.concatenate([found.zeros_m for found, _ in fitted]) ** 2))),
+        uncertainty_m=_round(np.sqrt(np.mean([np.mean(trace.wrong**2) for trace in traces]))),
+        field_m=field_m,
+        field_length_m=field_length_m,
+        followed=_normal(surface[:, 3]) if breathes else Normal(),
+        wander_m=_round(np.sqrt(max(variance - field_m**2, 0.0))),
+        wander_s=_time(wander),
+        regulation_m=_round(np.sqrt(np.mean([np.mean(trace.regulation**2) for trace in traces]))),
+        regulation_s=_time(regulated),
+    )
+
+
+def drawn_of(trace: Trace) -> Drawn:
+    """What stayed the same all over one examination."""
+    return _fit(trace)[0]
+
+
+def _fit(trace: Trace) -> tuple[Drawn, Array]:
+    """What stayed the same all over an examination, and what its depths get wrong beside it [m], shape (n,)."""
+    columns = np.column_stack((np.ones(len(trace.time)), trace.place, -trace.unseen))
+    coefficients = np.linalg.lstsq(columns, trace.wrong, rcond=None)[0]
+    rest = trace.wrong - columns @ coefficients
+    count = np.bincount(trace.stroke)
+    zeros = np.bincount(trace.stroke, rest) / count
+    offset, tilt, unseen = float(coefficients[0]), coefficients[1:3], float(coefficients[3])
+    return Drawn(offset, tilt, 1.0 - unseen, trace.aside.mean(axis=0), zeros), rest - zeros[trace.stroke]
+
+
+def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, float]:
+    """Standard deviation and correlation length [m] of what measurements share that are near in space but not in time."""
+    products, distances = [], []
+    for number, (trace, rest) in enumerate(zip(traces, rests, strict=True)):
+        rng = np.random.Generator(np.random.PCG64(number))
+        i, j = rng.integers(0, len(rest), (2, _PAIRS))
+        apart = np.abs(trace.time[i] - trace.time[j]) > APART_S
+        i, j = i[apart], j[apart]
+        distances.append(np.linalg.norm(trace.place[i] - trace.place[j], axis=1))
+        products.append(rest[i] * rest[j])
+    distance, product = np.concatenate(distances), np.concatenate(products)
+    edges = np.linspace(0.0, 0.05, 26)
+    inside = [(distance >= a) & (distance < b) for a, b in pairwise(edges)]
+    known = [k for k, rows in enumerate(inside) if rows.sum() > 200]
+    at = 0.5 * (edges[:-1] + edges[1:])[known]
+    covariance = np.array([product[inside[k]].mean() for k in known])
+    largest = float(np.mean([rest.var() for rest in rests]))
+    (variance, length), _ = curve_fit(
+        lambda r, variance, length: variance * np.exp(-0.5 * (r / length) ** 2),
+        at,
+        covariance / largest,
+        p0=(0.5, 0.015),
+        bounds=((0.0, 0.005), (1.0, 0.06)),
+    )
+    return _round(np.sqrt(variance * largest)), _round(length)
+
+
+def _in_time(times: Sequence[Array], values: Sequence[Array]) -> Array:
+    """Mean covariance of neighbours in time by lag, shape (_LONGEST,) [of values squared]."""
+    total, count = np.zeros(_LONGEST), np.zeros(_LONGEST)
+    for time, value in zip(times, values, strict=True):
+        tick = np.round(time / PERIOD_S).astype(np.int64)
+        for lag in range(_LONGEST):
+            together = tick[lag:] - tick[: len(tick) - lag] == lag
+            total[lag] += float((value[lag:] * value[: len(value) - lag])[together].sum())
+            count[lag] += int(together.sum())
+    return np.asarray(total / np.maximum(count, 1))
+
+
+def _time(covariance: Array) -> float:
+    """T of the covariance (1 + t / T) exp(-t / T) that falls to its half where this one does [s]."""
+    below = np.flatnonzero(covariance < 0.5 * covariance[0])
+    lag = int(below[0]) if len(below) else len(covariance)
+    return _round(max(lag, 1) * PERIOD_S / _HALF)
+
+
+def _normal(values: Array) -> Normal:
+    return Normal(mean=_round(values.mean()), sd=_round(values.std(ddof=1)) if len(values) > 1 else 0.0)
+
+
+def _round(value: Any) -> float:
+    """To three digits."""
+    return float(f"{float(value):.3g}")
+
+
+def examine(number: int, level: str, breathing: str, out: Path, settings: Sequence[str], workers: int) -> list[Path]:
+    """Runs whole examinations of persons, every second one with a lump; returns their folders. Those that are there stay."""
+
+    def one(seed: int) -> Path:
+        folder = out / f"{level}-{breathing}-{seed}"
+        if not (folder / "evidence.npz").is_file():
+            lumps = "phantom.draw.lumps=[1, 1]" if seed % 2 else "phantom.draw.lumps=[0, 0]"
+            words = [f"errors={level}", f"phantom.breathing.kind={breathing}", lumps, *settings]
+            options = [word for setting in words for word in ("--set", setting)]
+            command = [sys.executable, "-m", "palpate", "run", "person", "--composed", "--no-record", "-q"]
+            subprocess.run([*command, "--seed", str(seed), "--out", str(folder), *options], check=True)
+        return folder
+
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(one, range(number)))
+
+
+def main(
+    runs: Annotated[list[Path] | None, typer.Argument(help="Folders of completed runs.")] = None,
+    examinations: Annotated[int, typer.Option("--examine", min=0, help="Make so many whole examinations first.")] = 0,
+    level: Annotated[str, typer.Option(help="With --examine: errors, none, typical or poor.")] = "typical",
+    breathing: Annotated[str, typer.Option(help="With --examine: none, quiet, deep or held.")] = "quiet",
+    settings: Annotated[list[str] | None, typer.Option("--set", help="With --examine: as of palpate run.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="With --examine: so many at a time.")] = 1,
+    out: Annotated[Path, typer.Option("-o", "--out", help="With --examine: where the runs go.")] = Path("out/loop"),
+) -> None:
+    """Fit what whole examinations get wrong, and write it to palpate/quick/loop.yaml."""
+    folders = [*(runs or ()), *examine(examinations, level, breathing, out, settings or (), workers)]
+    groups: dict[tuple[Any, ...], list[Trace]] = defaultdict(list)
+    for folder in folders:
+        trace = trace_of(folder)
+        groups[tuple(setting_of(trace.scenario).values())].append(trace)
+    rows = {_key(row): row for row in studied()} | {_key(row): row for row in map(loop_of, groups.values())}
+    text = yaml.safe_dump({"loops": [rows[key].model_dump(mode="json") for key in sorted(rows)]}, sort_keys=False, width=130)
+    path = Path(str(resources.files("palpate.quick").joinpath("loop.yaml")))
+    path.write_text(_HEADER + text, encoding="utf-8")
+    print(f"{path}: {len(groups)} of {len(rows)} settings from {len(folders)} runs")
+
+
+def _key(row: LoopErrors) -> tuple[str, ...]:
+    return (row.camera, row.hand_eye, row.registration, row.arm, row.breathing, row.following)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,147 @@
+"""The quick tier: the same case gives the same result in any order, in any process; errors reach what is measured."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from palpate.quick.case import QuickCase, run_quick
+from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, loop_errors, studied
+from palpate.quick.examination import Examination
+from palpate.quick.messages import collected
+from palpate.quick.patient import NoTissueError, Patient
+from palpate_models.load import load_scenario
+from palpate_models.scenario import Scenario
+
+SMALL = ("exam.region_m=[0.06, 0.05]", "exam.centre_m=[-0.05, -0.05]")
+ALONE = """
+import sys
+from palpate.quick.case import run_quick
+from palpate_models.load import load_scenario
+print(run_quick(load_scenario("lump", sys.argv[1:], 3)).report.run_hash)
+"""
+CLEAN = (*SMALL, "errors=none", "phantom.breathing.kind=none")
+
+
+def scenario(seed: int, name: str = "lump", settings: tuple[str, ...] = CLEAN) -> Scenario:
+    return load_scenario(name, settings, seed)
+
+
+def hash_of(seed: int) -> str | None:
+    return run_quick(scenario(seed, settings=SMALL)).report.run_hash
+
+
+@pytest.fixture(scope="module")
+def clean() -> QuickCase:
+    return run_quick(scenario(1))
+
+
+def test_the_lump_is_found_where_it_is(clean: QuickCase) -> None:
+    scores = clean.report.scores
+    assert scores is not None
+    assert (scores.matched, scores.missed) == (1, 0)
+    assert clean.report.runtime == "quick"
+    assert clean.report.samples == len(clean.collected.samples) > 50
+
+
+def test_any_order_and_any_process_gives_the_same() -> None:
+    seeds = (1, 2, 3)
+    forwards = {seed: hash_of(seed) for seed in seeds}
+    backwards = {seed: hash_of(seed) for seed in reversed(seeds)}
+    words = [sys.executable, "-c", ALONE, *SMALL]
+    alone = subprocess.run(words, capture_output=True, text=True, check=True, timeout=250).stdout.strip()
+    assert len(set(forwards.values())) == 3
+    assert forwards == backwards
+    assert alone == forwards[3]
+
+
+def test_depth_is_wrong_by_what_was_drawn() -> None:
+    chosen = scenario(4, settings=SMALL)
+    errors = loop_errors(chosen)
+    loop = Loop(chosen, errors)
+    rows = [row for row in Examination(chosen, loop).run() if row.steady]
+    wrong = np.array([row.depth - row.true_depth for row in rows])
+    curve = Patient(chosen).tissue.breathing
+    unseen = np.array([(curve.excursion(row.time) - curve.mean_m) * row.way.breathing[row.at] for row in rows])
+    drawn = np.array([row.way.wrong_m[row.at] + loop.zero(row.stroke) for row in rows])
+    assert np.abs(wrong - drawn + (1 - loop.followed) * unseen).max() < 6 * errors.wander_m + 1e-9
+    assert wrong.std() > 1e-4
+
+
+def test_a_tare_takes_the_bias_away() -> None:
+    chosen = scenario(2, settings=SMALL)
+    loop = Loop(chosen, loop_errors(chosen))
+    loop.tare(100)
+    assert abs(np.mean([loop.tared(k) for k in range(75, 100)])) < 1e-9
+    assert 0.0 < np.std([loop.tared(k) for k in range(100, 400)]) < 0.2
+
+
+@pytest.mark.parametrize(("name", "time"), [("regulation_m", "regulation_s"), ("wander_m", "wander_s")])
+def test_smooth_errors_are_as_large_and_as_slow_as_they_are_said_to_be(name: str, time: str) -> None:
+    given: LoopErrors = studied()[0].model_copy(update={name: 1e-3, time: 0.1})
+    loop = Loop(scenario(5), given)
+    draw = loop.regulation if name == "regulation_m" else loop.wander
+    values = np.array([draw(k) for k in range(60_000)])
+    assert values.std() == pytest.approx(1e-3, rel=0.05)
+    lag = round(1.678 * 0.1 / 0.01)
+    assert np.corrcoef(values[lag:], values[:-lag])[0, 1] == pytest.approx(0.5, abs=0.06)
+
+
+def test_what_was_not_studied_is_refused_by_name() -> None:
+    with pytest.raises(UnknownLoopError, match=r"errors\.camera is of no level"):
+        loop_errors(scenario(1, settings=(*SMALL, "errors.camera.offset_m=0.05")))
+
+
+def test_the_force_sensor_may_be_of_any_kind() -> None:
+    assert loop_errors(scenario(1, settings=(*SMALL, "errors.force.noise_n=0.7"))) is loop_errors(scenario(1, settings=SMALL))
+
+
+def test_states_are_those_of_the_contract() -> None:
+    chosen = scenario(3)
+    examination = Examination(chosen, Loop(chosen, loop_errors(chosen)))
+    gathered = collected(examination, examination.run())
+    stamps = np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in gathered.exam_states])
+    assert np.diff(stamps[:-1]) == pytest.approx(0.010)
+    assert gathered.exam_states[-1].stroke == 6  # lines
+    assert len(gathered.indentation) == len(gathered.exam_states) - 1
+
+
+def test_a_press_and_a_slide_feel_the_lump() -> None:
+    patient = Patient(scenario(1))
+    over, beside = (patient.press(xy, depth=0.010, speed=0.02, hold=0.5) for xy in ((-0.055, -0.055), (0.05, 0.05)))
+    assert over.force[-1] > 2 * beside.force[-1]
+    assert over.depth[-1] == pytest.approx(0.010)
+    assert over.force[-1] < over.force.max()
+    assert beside.time[0] > over.time[-1]
+    slide = patient.slide(((0.0, -0.055), (-0.055, -0.055)), depth=0.008, speed=0.03)
+    assert len(slide.time) == len(slide.force) == len(slide.position)
+    assert slide.force[-1] > 1.5 * slide.force[len(slide.force) // 3]
+    with pytest.raises(ValueError, match="off the body"):
+        patient.press((3.0, 0.0), depth=0.01, speed=0.02, hold=0.1)
+
+
+def test_it_remembers_and_forgets() -> None:
+    patient, other = Patient(scenario(1)), Patient(scenario(1))
+    first = patient.press((0.03, 0.03), depth=0.010, speed=0.02, hold=0.5).force[-1]
+    again = patient.press((0.03, 0.03), depth=0.010, speed=0.02, hold=0.5).force[-1]
+    assert again < 0.99 * first
+    other.press((0.03, 0.03), depth=0.010, speed=0.02, hold=0.5)
+    other.rest(60.0)
+    assert again < other.press((0.03, 0.03), depth=0.010, speed=0.02, hold=0.5).force[-1] < first
+
+
+def test_breathing_is_felt() -> None:
+    forces = [
+        Patient(scenario(1, settings=("errors=none", f"phantom.breathing.kind={kind}"))).press((0.0, 0.0), 0.008, 0.02, 5.0).force
+        for kind in ("none", "quiet")
+    ]
+    assert np.ptp(forces[0][60:]) < 0.5 * np.ptp(forces[1][60:])
+
+
+def test_a_tissue_without_a_copy_is_refused() -> None:
+    real = scenario(1).model_copy(update={"services": scenario(1).services.model_copy(update={"tissue": "none"})})
+    with pytest.raises(NoTissueError, match=r"services\.tissue"):
+        Patient(real)
