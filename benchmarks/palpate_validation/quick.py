@@ -17,6 +17,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 import typer
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from scipy import stats
 
 from palpate.quick.case import run_quick
@@ -57,7 +58,7 @@ class Tier:
     """By the names of MARGINS; NaN where it has none."""
     apparent: Array
     """Of the map [N], shape (n,)."""
-    scanned: Array
+    scanned: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

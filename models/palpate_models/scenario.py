@@ -56,13 +56,13 @@ class Exam(Section):
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Pattern = Pattern.LINES
-    """`lines`: there and back, lifted at each line's end; `raster`: every line from the feet to the head; `snake`: there and back, line ends
-    joined in contact."""
+    """`lines`: there and back, lifted at each line's end; `raster`: every line from the feet to the head; `snake`: there and
+    back, line ends joined in contact."""
     mode: Mode = Mode.CONTINUOUS
     """`continuous`: slides at depth; `point`: presses, holds and lifts at each point."""
     breathing: Following = Following.FOLLOW
-    """`follow`: the indenter follows the wall; `gate`: it follows, and samples are taken at the end of expiration alone; `ignore`: it does
-    not follow, as if the patient did not breathe."""
+    """`follow`: the indenter follows the wall; `gate`: it follows, and samples are taken at the end of expiration alone;
+    `ignore`: it does not follow, as if the patient did not breathe."""
     depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
     """Indentation along the inward normal from where the skin is touched."""
     spacing_m: Annotated[float, Field(ge=0.004, le=0.05)] = 0.0125

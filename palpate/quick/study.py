@@ -20,9 +20,10 @@ from typing import Annotated, Any, Final
 import numpy as np
 import typer
 import yaml
+from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
-from palpate.quick.errors import Drawn, LoopErrors, Normal, setting_of, studied
+from palpate.quick.errors import Drawn, LoopErrors, Normal, known_loops, setting_of
 from palpate.quick.patient import PERIOD_S
 from palpate.report.archive import read_evidence
 from palpate.truth.surface import TrueBody, TrueSurface
@@ -55,7 +56,7 @@ class Trace:
     scenario: Scenario
     begin_s: float
     """When the first stroke that presses began [s]."""
-    stroke: Array
+    stroke: NDArray[np.int64]
     """In which stroke, from 0 on, shape (n,)."""
     time: Array
     """[s], shape (n,)."""
@@ -102,7 +103,7 @@ def trace_of(folder: Path) -> Trace:
     )
 
 
-def _began(time: Array, phase: Array) -> float:
+def _began(time: Array, phase: NDArray[np.uint8]) -> float:
     """When the descent began that led to the first state in phase SCAN [s]."""
     indents = np.flatnonzero(np.diff(phase == ExamState.PHASE_INDENT, prepend=False) & (phase == ExamState.PHASE_INDENT))
     scans = int(np.argmax(phase == ExamState.PHASE_SCAN))
@@ -148,10 +149,10 @@ def drawn_of(trace: Trace) -> Drawn:
 def _fit(trace: Trace) -> tuple[Drawn, Array]:
     """What stayed the same all over an examination, and what its depths get wrong beside it [m], shape (n,)."""
     columns = np.column_stack((np.ones(len(trace.time)), trace.place, -trace.unseen))
-    coefficients = np.linalg.lstsq(columns, trace.wrong, rcond=None)[0]
+    coefficients: Array = np.asarray(np.linalg.lstsq(columns, trace.wrong, rcond=None)[0], dtype=np.float64)
     rest = trace.wrong - columns @ coefficients
     count = np.bincount(trace.stroke)
-    zeros = np.bincount(trace.stroke, rest) / count
+    zeros: Array = np.bincount(trace.stroke, rest) / count
     offset, tilt, unseen = float(coefficients[0]), coefficients[1:3], float(coefficients[3])
     return Drawn(offset, tilt, 1.0 - unseen, trace.aside.mean(axis=0), zeros), rest - zeros[trace.stroke]
 
@@ -243,7 +244,7 @@ def main(
     for folder in folders:
         trace = trace_of(folder)
         groups[tuple(setting_of(trace.scenario).values())].append(trace)
-    rows = {_key(row): row for row in studied()} | {_key(row): row for row in map(loop_of, groups.values())}
+    rows = {_key(row): row for row in known_loops()} | {_key(row): row for row in map(loop_of, groups.values())}
     text = yaml.safe_dump({"loops": [rows[key].model_dump(mode="json") for key in sorted(rows)]}, sort_keys=False, width=130)
     path = Path(str(resources.files("palpate.quick").joinpath("loop.yaml")))
     path.write_text(_HEADER + text, encoding="utf-8")

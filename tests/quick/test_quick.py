@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from palpate.quick.case import QuickCase, run_quick
-from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, loop_errors, studied
+from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops, loop_errors
 from palpate.quick.examination import Examination
 from palpate.quick.messages import collected
 from palpate.quick.patient import NoTissueError, Patient
@@ -81,7 +81,7 @@ def test_a_tare_takes_the_bias_away() -> None:
 
 @pytest.mark.parametrize(("name", "time"), [("regulation_m", "regulation_s"), ("wander_m", "wander_s")])
 def test_smooth_errors_are_as_large_and_as_slow_as_they_are_said_to_be(name: str, time: str) -> None:
-    given: LoopErrors = studied()[0].model_copy(update={name: 1e-3, time: 0.1})
+    given: LoopErrors = known_loops()[0].model_copy(update={name: 1e-3, time: 0.1})
     loop = Loop(scenario(5), given)
     draw = loop.regulation if name == "regulation_m" else loop.wander
     values = np.array([draw(k) for k in range(60_000)])

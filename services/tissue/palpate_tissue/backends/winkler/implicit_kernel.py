@@ -143,7 +143,7 @@ def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: f
 def unbalanced(wall: ImplicitWall, i: int, before: float, activation: float) -> float:
     """The force that nothing balances at a vertex that was at `before` [m] a step ago [N], inward."""
     at = wall.u[i]
-    force = wall.table[i, DRAG] * (before - at)
+    force: float = wall.table[i, DRAG] * (before - at)
     for j in range(wall.indptr[i], wall.indptr[i + 1]):
         force -= wall.K[j] * wall.s[wall.indices[j]]
     if at > 0.0:
