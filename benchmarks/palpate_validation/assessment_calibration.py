@@ -22,7 +22,7 @@ from scipy.special import expit
 
 import palpate_assessment
 from palpate_assessment.calibration import Calibration, learned
-from palpate_assessment.detection import FEATURES, detect
+from palpate_assessment.detection import FEATURES, FELT, detect
 from palpate_assessment.observations import observe
 from palpate_models.draw import Draw
 from palpate_models.frames import Array
@@ -30,8 +30,6 @@ from palpate_models.patient import Phantom
 from palpate_models.seeds import generator
 from palpate_validation.felt_scans import FeltPatient, ScanErrors, felt_patient, felt_samples
 
-FELT: Final = 1.3
-"""Felt contrast from which an area counts as a lump."""
 _TAIL: Final = 0.25
 """Part of the healthy examinations that the tail is fitted to."""
 _RIDGE: Final = 0.5

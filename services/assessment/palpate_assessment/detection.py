@@ -35,8 +35,12 @@ _TOO_NEAR = 0.7
 _BORDER_M = 0.010
 """Centres lie at most so far beyond the samples."""
 
-FEATURES = ("strength", "log-contrast", "log-radius", "softer")
-"""What a candidate's probability depends on."""
+FELT = 1.3
+"""Felt contrast from which an area counts as a lump."""
+FEATURES = ("strength", "beyond", "log-radius", "softer")
+"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, sign."""
+_SURE = 4.0
+"""Standard deviations beyond which the contrast's distance from FELT tells no more."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,10 @@ class Candidate:
     @property
     def features(self) -> Array:
         """The FEATURES, shape (f,)."""
+        strength, contrast = abs(self.t), abs(self.log_contrast)
+        beyond = (contrast - np.log(FELT)) * strength / max(contrast, 1e-9)
         size = np.log(self.bump.radius / RADII_M[2])
-        return np.array((abs(self.t), min(abs(self.log_contrast), 1.0), size, float(self.log_contrast < 0)))
+        return np.array((strength, np.clip(beyond, -_SURE, _SURE), size, float(self.log_contrast < 0)))
 
 
 def matched(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array]:

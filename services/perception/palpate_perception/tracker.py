@@ -29,7 +29,7 @@ REACH_M: Final = 0.06
 """What is farther from where the wall is expected is something else."""
 TUKEY: Final = 5.0
 """Tukey's biweight, in standard deviations of a pixel."""
-LEAST_SHARE: Final = 0.1
+LEAST_SHARE: Final = 0.015
 """With less of the wall in view, by what it tells of the displacement, it is lost."""
 SURPRISE: Final = 5.0
 """A displacement so many standard deviations from what the filter expects is none of its breaths ..."""
@@ -78,7 +78,7 @@ class Followed:
     """Of the body, in A [m], shape (3,); zero unless MOVED."""
 
 
-NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 1.0, np.zeros(3))
+NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 0.1, np.zeros(3))
 """What is told before a wall is known."""
 
 

@@ -49,6 +49,7 @@ class ContactMeasurement(NamedTuple):
     force: float
     """Normal force [N], positive when the tissue is pressed."""
     touching: bool
+    """Whether the tissue is felt; before the first tare the sensor's bias would pass for it, and nothing is."""
 
 
 class ContactSensing:
@@ -72,7 +73,7 @@ class ContactSensing:
         acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
         self._velocity = velocity
         force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ foot.n_W)
-        self._touching = force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
+        self._touching = self.weight.tared and force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
         return ContactMeasurement(
             X_WI,
             R_WS,

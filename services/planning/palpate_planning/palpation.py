@@ -202,7 +202,8 @@ class Palpation:
         if self._watch.ended:
             self.leave(self._watch.ended)
         elif self._watch.spoiled and self.stage in PRESSING:
-            self._recovery.resume_at = max(self._motion.along.position - (REPEAT_M if sliding else 0.0), 0.0)
+            back = REPEAT_M if sliding else 0.0
+            self._recovery.repeat(self._motion.segment.path, self._motion.along.position, back, "the wall could not be followed")
             self._enter(StrokeStage.LIFT)
 
     def _enter(self, stage: StrokeStage) -> None:

@@ -16,6 +16,10 @@ from palpate_planning.timing import JerkLimitedAxis
 
 SOFT_STOPS_MAX = 3
 """With this many soft stops the examination is given up."""
+REPEATS_MAX = 3
+"""So often a stroke is taken up again after it was spoiled at one place; then the rest of it is passed over."""
+NEAR_M = 0.010
+"""Less far from each other, two places of a stroke are one."""
 MOVED_M = 0.02
 """An arm that was pushed further aside than this while it was held does not go on where it was."""
 CLEAR_M = 0.003
@@ -57,13 +61,14 @@ class Recovery:
     def __init__(self, exam: Exam, limits: Limits, period_s: float) -> None:
         self._exam, self._limits, self._period_s = exam, limits, period_s
         self._soft_stops = 0
+        self._spoiled_at, self._repeats = 0.0, 0
         self.paused = False
         """Whether the arm waits above the surface."""
         self.resume_at: float | None = None
         """Path length [m] at which the stroke is taken up again once the arm has lifted; None: it goes on to the next segment."""
         self.displacement: Displacement | None = None
         self.skipped: dict[int, str] = {}
-        """Targets that a soft stop passes over, with the reason."""
+        """Targets that are passed over, with the reason."""
         self.failed = ""
         """Why the strokes are given up; empty if they are not."""
 
@@ -82,6 +87,15 @@ class Recovery:
         self.resume_at = float(ahead[0]) if len(ahead) else None
         if self._soft_stops >= SOFT_STOPS_MAX:
             self.failed = f"{why}, {self._soft_stops} times"
+
+    def repeat(self, path: SurfacePath, s: float, back: float, why: str) -> None:
+        """Takes the stroke up again `back` [m] before path length s, where it was spoiled; or passes over its rest, for `why`."""
+        again = self._repeats > 0 and s < self._spoiled_at + NEAR_M
+        self._spoiled_at, self._repeats = s, self._repeats + 1 if again else 1
+        self.resume_at = max(s - back, 0.0)
+        if self._repeats > REPEATS_MAX:
+            self.skipped |= dict.fromkeys((int(i) for i in path.targets[path.visits > s - 1e-6]), why)
+            self.resume_at, self._repeats = None, 0
 
     def measure_displacement(self, contact: ContactMeasurement, point: PathPoint, radius: float) -> float:
         """How far [m] the arm stands beside its path point, across the normal; the way back starts from there.

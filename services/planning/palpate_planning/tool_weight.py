@@ -24,6 +24,8 @@ class ToolWeight:
         """[N], world axes, shape (3,)."""
         self.bias = np.zeros(3)
         """Force [N] that the sensor reads where there is none, in its axes, shape (3,)."""
+        self.tared = False
+        """Whether the bias has been measured at all."""
         self._sum = np.zeros(3)
         self._count = 0
 
@@ -45,6 +47,7 @@ class ToolWeight:
         """Takes a reading in free air, force and torque, shape (6,), into the bias."""
         self._sum += wrench_S[:3] - self.force(R_WS)
         self._count += 1
+        self.tared = True
         self.bias = self._sum / self._count
 
     @property
