@@ -34,6 +34,8 @@ GROWING_SAMPLES = 200
 GROWING_EVERY = 6 * NS
 GROWING_FIRST = 40
 """Samples before the first growing map."""
+NOTICED_S = 1.0
+"""A patient who moves is noticed within this time."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
 FINISHED = frozenset({ExamState.PHASE_ASSESS, ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
 
@@ -50,6 +52,8 @@ class AssessmentService(Service):
         self._reach = float(np.clip(0.8 * exam.exam.spacing_m, 0.006, 0.020))
         self._sampler = Sampler()
         self._samples: list[ForceSample] = []
+        self._moved_at: float | None = None
+        """When the patient was seen to have moved [s]."""
         self._surface: Array | None = None
         self._coarse: MapGrid | None = None
         self._last_map = 0
@@ -65,6 +69,9 @@ class AssessmentService(Service):
         phase = None
         for state in inbox.new("exam/state"):
             phase = int(state.phase)
+            if state.patient_moved:
+                self._forget_motion(nanoseconds(state.header.stamp) / NS)
+                continue
             sample = self._sampler.add(self._state(state))
             if sample is not None:
                 new.append(sample)
@@ -114,6 +121,12 @@ class AssessmentService(Service):
             stroke=int(message.stroke),
             depth_uncertainty=float(message.depth_uncertainty),
         )
+
+    def _forget_motion(self, t: float) -> None:
+        """The patient was seen to have moved at `t` [s]: what was felt just before, and is felt from now on, lies elsewhere."""
+        if self._moved_at is None:
+            self._moved_at = t
+            self._samples = [sample for sample in self._samples if sample.time < t - NOTICED_S]
 
     def _due(self, t: int) -> bool:
         grown = len(self._samples) >= max(GROWING_FIRST, self._mapped + 10)

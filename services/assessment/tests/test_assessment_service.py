@@ -14,6 +14,7 @@ from palpate_assessment.service import AssessmentService, create
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.codec import encode
+from palpate_bus.messages.stamps import nanoseconds
 from palpate_models.load import exam_input
 from palpate_models.patient import Lesion, Phantom
 from palpate_models.scenario import Exam, Scenario
@@ -131,6 +132,23 @@ def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> No
     outbox = service.step(60_000_000_000, FakeInbox({"exam/state": [aborted]}))
     assert outbox["assessment/findings"].final
     assert 0.2 < outbox["assessment/map"].scanned.mean() < 0.8
+
+
+def test_what_was_felt_while_a_patient_moved_is_forgotten(small: Scan) -> None:
+    service = AssessmentService(exam_input(small.scenario))
+    for state in small.states[: len(small.states) // 2]:
+        service.step(nanoseconds(state.header.stamp), FakeInbox({"exam/state": [state], "perception/surface": []}))
+    before = service.finish()["samples"]
+    last = small.states[len(small.states) // 2]
+    moved = ExamState(**{**vars(last), "patient_moved": True})
+    for _ in range(2):
+        service.step(nanoseconds(last.header.stamp), FakeInbox({"exam/state": [moved]}))
+    after = service.finish()["samples"]
+    assert 0 < after < before
+    for state in small.states[len(small.states) // 2 :]:
+        still = ExamState(**{**vars(state), "patient_moved": True})
+        service.step(nanoseconds(state.header.stamp), FakeInbox({"exam/state": [still]}))
+    assert service.finish()["samples"] == after
 
 
 def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
