@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Examine and look
 #
-# `palpate.run` is a whole examination: the camera looks, perception finds the skin, planning moves the arm over it, the assessment
-# draws a map. It is what `palpate run` does, with the same run hash. Settings are keywords, each section of the scenario a mapping.
+# `palpate.run` is a whole examination: the camera looks, perception finds the skin, planning moves the arm over it, the
+# assessment draws a map. It is what `palpate run` does, with the same run hash. Settings are keywords, each section of the
+# scenario a mapping.
 
 # %%
 import matplotlib.pyplot as plt
@@ -48,6 +49,7 @@ examination.findings
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
 examination.map.plot(left)
 examination.map.plot(right, values=100 * examination.map.uncertainty, label="half width of the 90 % band [%]", cmap="cividis")
+plt.show()
 
 # %%
 examination.map.frame.query("scanned").describe().round(3)
@@ -55,7 +57,8 @@ examination.map.frame.query("scanned").describe().round(3)
 # %% [markdown]
 # ## What was felt
 #
-# `samples` are what the assessment worked with, `states` what was measured over time.
+# `samples` are what the assessment worked with, `states` what was measured over time. The force before the first contact is the
+# sensor's bias: it is tared just before the arm goes down.
 
 # %%
 examination.samples.head()
@@ -68,7 +71,8 @@ force.set_ylabel("force [N]")
 depth.plot(states.time, 1e3 * states.setpoint.clip(lower=-0.01), lw=0.8, label="set-point")
 depth.plot(states.time, 1e3 * states.depth.clip(lower=-0.01), lw=0.8, label="measured")
 depth.set(xlabel="time [s]", ylabel="depth [mm]")
-depth.legend();
+depth.legend()
+plt.show()
 
 # %% [markdown]
 # ## How good it was

@@ -41,9 +41,10 @@ for touch, words in ((on_lump, "on the lump"), (beside, "beside it")):
 left.set(xlabel="time [s]", ylabel="force [N]", title="pressed, and held")
 right.set(xlabel="depth [mm]", ylabel="force [N]", title="on the way down")
 left.legend()
+plt.show()
 
 # %% [markdown]
-# Two things to see. The force rises faster than the depth: the sphere touches more and more skin. And while the depth is held the
+# The force rises faster than the depth: the sphere touches more and more skin. And while the depth is held the
 # force sinks: the wall relaxes.
 
 # %%
@@ -53,8 +54,8 @@ print(f"after 3 s it is {100 * beside.force[-1] / beside.force.max():.0f} % of t
 # %% [markdown]
 # ## Faster is harder
 #
-# How much force there is depends on how fast the wall is pressed. He remembers what was pressed before, so each press is at rest
-# first.
+# How much force there is depends on how fast the wall is pressed. He remembers what was pressed before, so he has a minute
+# of rest before each press.
 
 # %%
 speeds = [0.005, 0.02, 0.08]
@@ -64,7 +65,8 @@ for speed in speeds:
     plt.plot(1e3 * touch.depth, touch.force, label=f"{1e3 * speed:.0f} mm/s")
 plt.xlabel("depth [mm]")
 plt.ylabel("force [N]")
-plt.legend();
+plt.legend()
+plt.show()
 
 # %% [markdown]
 # ## Slide
@@ -76,7 +78,8 @@ slide = patient.slide([(-0.10, -0.055), (0.0, -0.055)], depth=0.010, speed=0.03)
 at_depth = slide.steady
 plt.plot(1e3 * slide.position[at_depth, 0], slide.force[at_depth])
 plt.xlabel("x, to the patient's left [mm]")
-plt.ylabel("force [N]");
+plt.ylabel("force [N]")
+plt.show()
 
 # %% [markdown]
 # ## What is true
@@ -97,4 +100,5 @@ lines = axes.contour(1e3 * x, 1e3 * y, 1e3 * height, colors="white", linewidths=
 axes.clabel(lines, fmt="%.0f mm")
 axes.plot(1e3 * slide.position[:, 0], 1e3 * slide.position[:, 1], "c--", label="the slide")
 axes.legend()
-axes.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]");
+axes.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]")
+plt.show()

@@ -43,8 +43,7 @@ found
 
 # %% [markdown]
 # `palpate.assess` is the assessment of the system, given what it is given there: the skin as it is seen, and force and depth over
-# time. It is not given the patient. That there is a lump it says after nine presses, since one of them was on it; where it ends,
-# it cannot know.
+# time. It is not given the patient.
 
 # %% [markdown]
 # ## Search
@@ -69,7 +68,7 @@ while len(touches) < 25:
 # %% [markdown]
 # ## Look at it
 #
-# Dots are presses, the newest is the largest. The search goes to the lump's edge and to the corners, where it knows least.
+# Dots are presses, the newest has a ring. The search goes where it knows least: to the corners, and about whatever stands out.
 
 # %%
 figure, rows = plt.subplots(2, 3, figsize=(13, 7.5), layout="constrained")
@@ -82,11 +81,13 @@ for axes, k in zip(rows.T, (0, 8, 16), strict=True):
         panel.plot(*places.T, "o", ms=3, color="white")
         panel.plot(*places[-1], "o", ms=7, mfc="none", mec="white")
     axes[0].set_title(f"{9 + k} presses")
+plt.show()
 
 # %% [markdown]
 # ## Against the truth
 #
-# The patient knows. The area that the search calls a lump, over the true stiffness of the wall:
+# The patient knows. Here is what was found, over the true stiffness of the wall. Only a place within reach of a press can belong
+# to a finding, so that few presses leave gaps.
 
 # %%
 final = history[-1]
@@ -99,6 +100,7 @@ nodes = final.map.frame.query("finding >= 0")
 axes.plot(1e3 * nodes.x_m, 1e3 * nodes.y_m, "s", ms=3, color="cyan", label="found")
 axes.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]")
 axes.legend()
+plt.show()
 final.findings
 
 # %% [markdown]
