@@ -3,7 +3,8 @@
     python docs/site.py out/site-pages && mkdocs build --strict
 
 So links between pages hold as they stand in the repository. A link to a folder leads to its README. A link to a file that the
-site does not have, such as source code, becomes the words alone.
+site does not have, such as source code, becomes the words alone. The notebooks of docs/notebooks are carried out, and become
+pages with what they printed and drew.
 """
 
 from __future__ import annotations
@@ -12,9 +13,16 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
+import jupytext
+from nbclient import NotebookClient
+from nbconvert import MarkdownExporter
+from nbconvert.writers import FilesWriter
+
 ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = Path("docs/notebooks")
 PICTURES = {".png", ".gif", ".svg", ".mp4"}
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")
 
@@ -35,6 +43,18 @@ def gather(into: Path) -> None:
                 target.write_text(within_the_site(file, pages), encoding="utf-8")
             else:
                 shutil.copy(ROOT / file, target)
+        elif file.parent == NOTEBOOKS:
+            carry_out(file, into / NOTEBOOKS)
+
+
+def carry_out(notebook: Path, into: Path) -> None:
+    """Carries a notebook out, and writes it into the folder as a page with its pictures. Raises CellExecutionError."""
+    cells = jupytext.read(ROOT / notebook)
+    with tempfile.TemporaryDirectory(prefix="palpate-notebook-") as place:
+        NotebookClient(cells, timeout=1800, kernel_name="python3", resources={"metadata": {"path": place}}).execute()
+    pictures = {"unique_key": notebook.stem, "output_files_dir": f"{notebook.stem}_files"}
+    text, resources = MarkdownExporter().from_notebook_node(cells, resources=pictures)
+    FilesWriter(build_directory=str(into)).write(text, resources, notebook_name=notebook.stem)
 
 
 def within_the_site(page: Path, pages: set[Path]) -> str:
@@ -49,6 +69,8 @@ def within_the_site(page: Path, pages: set[Path]) -> str:
             return f"[{words}]({where.rstrip('/')}/README.md{anchor})"
         if target == Path("README.md"):
             return f"[{words}]({Path(where).parent / 'index.md'}{anchor})"
+        if target.parent == NOTEBOOKS:
+            return f"[{words}]({Path(where).with_suffix('.md')}{anchor})"
         return found[0] if target in pages else words
 
     return LINK.sub(link, (ROOT / page).read_text(encoding="utf-8"))

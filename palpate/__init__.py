@@ -1,1 +1,92 @@
-"""Palpate: the command line and the Python interface."""
+"""Palpate: the command line and the Python interface.
+
+    >>> import palpate
+    >>> patient = palpate.Patient("clean", seed=1)
+    >>> touch = patient.press((-0.055, -0.055), depth=0.010, speed=0.02, hold=0.5)
+    >>> round(float(touch.depth.max()), 3)
+    0.01
+
+Nothing is imported before it is used, so that `import palpate` takes no time.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from palpate.library.assessment import Assessment, StiffnessMap, assess
+    from palpate.library.examination import Examination, run
+    from palpate.library.scenarios import scenario
+    from palpate.library.studies import StudyResult, study
+    from palpate.quick.patient import Patient, Touch
+    from palpate_models.load import ScenarioError
+    from palpate_models.scenario import Scenario
+
+__all__ = [
+    "Assessment",
+    "Examination",
+    "Patient",
+    "Scenario",
+    "ScenarioError",
+    "StiffnessMap",
+    "StudyResult",
+    "Touch",
+    "assess",
+    "run",
+    "scenario",
+    "study",
+]
+
+_HOMES = {
+    "Assessment": "palpate.library.assessment",
+    "Examination": "palpate.library.examination",
+    "Patient": "palpate.quick.patient",
+    "Scenario": "palpate_models.scenario",
+    "ScenarioError": "palpate_models.load",
+    "StiffnessMap": "palpate.library.assessment",
+    "StudyResult": "palpate.library.studies",
+    "Touch": "palpate.quick.patient",
+    "assess": "palpate.library.assessment",
+    "run": "palpate.library.examination",
+    "scenario": "palpate.library.scenarios",
+    "study": "palpate.library.studies",
+}
+"""The module of each name of the interface."""
+
+
+def __getattr__(name: str) -> Any:
+    """The interface, imported when it is first asked for (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'palpate' has no attribute {name!r}")
+    try:
+        value = getattr(import_module(_HOMES[name]), name)
+    except ModuleNotFoundError as error:
+        if (error.name or "palpate").startswith("palpate"):
+            raise
+        raise ModuleNotFoundError(
+            f"palpate.{name} needs the module {error.name}: pip install 'palpate[library]'", name=error.name
+        ) from error
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """The package keeps `palpate.run` and `palpate.study` for the functions.
+
+    Python binds each package to its name in the one above it when it is imported, and `palpate.run` and `palpate.study` are
+    packages, too: they are imported by their full names, which this leaves as it is.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -23,6 +23,9 @@ BARE = ""
 
 EXTRA_OF = {
     "palpate": "run",
+    "palpate.__init__": "study",  # names of the interface, which are imported when they are asked for
+    "palpate.library": "library",
+    "palpate.library.studies": "study",
     "palpate.fmu": "fmu",
     "palpate.fuzz": "fuzz",
     "palpate.study": "study",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -131,6 +132,31 @@ def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = 
         return Scenario.model_validate(raw)
     except ValidationError as error:
         raise ScenarioError(explain(name, text, settings, Scenario, error)) from error
+
+
+def as_settings(fields: Mapping[str, Any]) -> list[str]:
+    """Overrides `a.b=c` of fields by their path, each with its value: what `load_scenario` takes.
+
+    Raises ScenarioError for a value that no scenario can have.
+    """
+    try:
+        return [f"{path}={json.dumps(value)}" for path, value in fields.items()]
+    except (TypeError, ValueError) as error:
+        raise ScenarioError(f"{', '.join(fields)}: want numbers, words, lists and mappings: {error}") from error
+
+
+def whole_scenario(source: str | Path | Scenario, seed: int | None = None) -> Scenario:
+    """A scenario by name or YAML file, or one that is there already, which has a seed of its own.
+
+    Raises ScenarioError as `load_scenario` does, and for a seed that is given with a scenario of another.
+    """
+    if not isinstance(source, Scenario):
+        return load_scenario(str(source), seed=seed)
+    if seed not in (None, source.seed):
+        raise ScenarioError(
+            f"{source.name}: seed = {seed}: this scenario was drawn from seed {source.seed}; give the seed with its name or file"
+        )
+    return source
 
 
 def view_of(role: str) -> View:

@@ -15,13 +15,12 @@ from typing import Final
 import numpy as np
 
 from palpate.quick.errors import Loop
-from palpate.quick.patient import PERIOD_S, Patient
+from palpate.quick.patient import PERIOD_S, Patient, seen_lattice
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.scenario import Following, Mode, Scenario
 from palpate_perception import pattern
-from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
 from palpate_planning.breath import Breath
 from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
 from palpate_planning.coverage import strokes, transfer
@@ -115,7 +114,7 @@ class Examination:
         self._scenario, self._loop = scenario, loop
         self._exam = scenario.exam
         self._X_WA = np.array(exam_input(scenario).X_WA)
-        self.patient = Patient(scenario, loop.begin_s)
+        self.patient = Patient(scenario, time=loop.begin_s)
         """Who is examined."""
         self._R_AtW = self.patient.X_WA[:3, :3].T
         model = self.patient.tissue.model
@@ -158,11 +157,7 @@ class Examination:
     @cached_property
     def perceived(self) -> tuple[Array, Array]:
         """The perceived surface as perception's mesh: points [m] and outward unit normals in world, shape (n, 3)."""
-        (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
-        x = pattern.stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
-        y = pattern.stations(cy, height + 2 * MESH_MARGIN_M, MESH_STEP_M)
-        xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-        p, n = self._skin.points(xy)
+        p, n = self._skin.points(seen_lattice(self._exam))
         seen = np.isfinite(p).all(axis=1)
         p, n = p[seen], n[seen]
         p = p + n * self._loop.wrong(p[:, :2])[:, None]

@@ -1,8 +1,9 @@
 """A patient under the hand: the true tissue of a scenario, and an indenter that is moved through it without an arm.
 
-    patient = Patient(load_scenario("person", seed=7))
-    touch = patient.press((0.03, -0.02), depth=0.010, speed=0.02, hold=0.5)
-    touch.force.max()
+    >>> patient = Patient("person", seed=7)
+    >>> touch = patient.press((0.03, -0.02), depth=0.010, speed=0.02, hold=0.5)
+    >>> touch.force.shape, bool(touch.force.max() > 1.0)
+    ((100,), True)
 
 Everything is in the abdomen frame A: x to the patient's left, y to the head, z outward, from the umbilicus, where the patient
 truly lies. He breathes, guards and moves as the scenario says, and remembers what was pressed before.
@@ -13,24 +14,41 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.tissue import true_tissue
 from palpate_models.frames import Array, inverse, matrix
-from palpate_models.load import true_pose
+from palpate_models.load import seen, true_pose, whole_scenario
 from palpate_models.motion import BodyMotion
-from palpate_models.scenario import Scenario
+from palpate_models.scenario import Exam, Scenario
+from palpate_perception import pattern
+from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
 
 PERIOD_S: Final = 0.010
 """Between two readings of the force, as of an examination's states."""
 _LIFT_MPS: Final = 0.12
+_LONGEST_HOLD_S: Final = 60.0
 
 
 class NoTissueError(ValueError):
     """A scenario of whose tissue there is no copy. Names the field and what is allowed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What an examiner has of a patient before the first touch, and nothing of the truth within."""
+
+    scenario: Scenario
+    """As the examination's own roles are given it: without the patient, his seed and the errors of the equipment."""
+    places: Array
+    """Points of the skin at rest over the examined region [m], shape (n, 3), in A."""
+    normals: Array
+    """Outward unit normals there, shape (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,20 +59,28 @@ class Touch:
     """Since the patient was first there [s], shape (n,)."""
     position: Array
     """Points of the skin at rest under the indenter [m], shape (n, 3), in A."""
+    normal: Array
+    """Outward unit normals there, shape (n, 3)."""
     depth: Array
     """How far the indenter's lowest point is below the skin at rest, at the end of expiration [m], shape (n,)."""
     force: Array
     """Along the outward normal [N], shape (n,)."""
+    steady: NDArray[np.bool_]
+    """Whether the indenter is held, or slides, at the depth that was asked for, shape (n,)."""
+    seen: Seen
+    """Who is touched, as he is seen."""
 
 
 class Patient:
     """A patient and an indenter. Equal scenarios and equal motions give equal forces."""
 
-    def __init__(self, scenario: Scenario, time: float = 0.0) -> None:
-        """The patient of a scenario at `time` [s] of his breathing, untouched.
+    def __init__(self, scenario: str | Path | Scenario, seed: int | None = None, *, time: float = 0.0) -> None:
+        """The patient of a scenario, given by name, YAML file or as it is, at `time` [s] of his breathing, untouched.
 
-        Raises NoTissueError where there is no copy of his tissue.
+        `seed` is that of the scenario unless it is given with a name or file. Raises ScenarioError for a scenario that cannot be
+        used, MeshError for a body that cannot be made, NoTissueError where there is no copy of his tissue.
         """
+        scenario = whole_scenario(scenario, seed)
         tissue = true_tissue(scenario)
         if tissue is None:
             raise NoTissueError(
@@ -81,6 +107,13 @@ class Patient:
         model = self.tissue.model
         return TrueSurface(TrueBody(model.vertices, model.triangles, self.X_WA))
 
+    @cached_property
+    def seen(self) -> Seen:
+        """What an examiner has of him before the first touch: his skin at rest, as it is."""
+        places, normals = self.surface.points(seen_lattice(self.scenario.exam))
+        there = np.isfinite(places).all(axis=1)
+        return Seen(seen(self.scenario, "exam"), places[there], normals[there])
+
     def stiffness(self, xy: Array) -> Array:
         """True foundation modulus k_w [N/m^3] at points [m], shape (p, 2) -> (p,); NaN off the body."""
         return np.asarray(self.surface.between(self.tissue.model.stiffness)(xy))
@@ -88,25 +121,30 @@ class Patient:
     def press(self, xy: Sequence[float] | Array, depth: float, speed: float, hold: float) -> Touch:
         """Presses at a place, along the inward normal, to `depth` [m] at `speed` [m/s], holds for `hold` [s], and lets go.
 
-        Returns what was felt from the touch to the end of the hold. Raises ValueError for a place off the body.
+        `xy`: metres from the umbilicus, shape (2,). Returns what was felt from the touch to the end of the hold. Raises
+        ValueError for a place off the body, and for a depth or speed beyond the scenario's `limits`.
         """
+        self._within_limits(depth, speed)
+        if not 0 <= hold <= _LONGEST_HOLD_S:
+            raise ValueError(f"hold = {hold} s: want 0 to {_LONGEST_HOLD_S:g} s")
         down = _ramp(0.0, depth, speed)
         depths = np.concatenate((down, np.full(round(hold / PERIOD_S), depth)))
-        return self._touch(np.tile(np.asarray(xy, dtype=float), (len(depths), 1)), depths)
+        return self._touch(np.tile(_corners([xy], "xy"), (len(depths), 1)), depths, len(down))
 
     def slide(self, path: Sequence[Sequence[float]] | Array, depth: float, speed: float) -> Touch:
         """Presses at the start of a path as `press` does, slides along it at `depth` [m], and lets go at its end.
 
         `path`: corners [m], shape (k, 2), joined by straight lines, followed at `speed` [m/s] over the xy plane. Returns what
-        was felt from the touch to the end of the path. Raises ValueError for a path that leaves the body.
+        was felt from the touch to the end of the path. Raises ValueError as `press` does, and for a path that leaves the body.
         """
-        corners = np.asarray(path, dtype=float).reshape(-1, 2)
+        self._within_limits(depth, speed)
+        corners = _corners(path, "path")
         length = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))))
         down = _ramp(0.0, depth, speed)
         along = _ramp(0.0, float(length[-1]), speed)
         way = np.concatenate((np.zeros(len(down)), along))
         depths = np.concatenate((down, np.full(len(along), depth)))
-        return self._touch(np.column_stack([np.interp(way, length, corners[:, k]) for k in (0, 1)]), depths)
+        return self._touch(np.column_stack([np.interp(way, length, corners[:, k]) for k in (0, 1)]), depths, len(down))
 
     def rest(self, duration: float) -> None:
         """Nobody touches him for `duration` [s]."""
@@ -146,7 +184,14 @@ class Patient:
         moved = self._motion.moves and self.time > self._motion.at_s
         return np.asarray(self._motion.pose(self.time)[:3, :3] @ force) if moved else force
 
-    def _touch(self, xy: Array, depths: Array) -> Touch:
+    def _within_limits(self, depth: float, speed: float) -> None:
+        limits = self.scenario.limits
+        for name, value, most, unit in (("depth", depth, limits.depth_m, "m"), ("speed", speed, limits.contact_speed_mps, "m/s")):
+            if not 0 < value <= most:
+                raise ValueError(f"{name} = {value} {unit}: want more than 0 and at most {most:g} {unit} (the scenario's limits)")
+
+    def _touch(self, xy: Array, depths: Array, descent: int) -> Touch:
+        """`descent`: how many of the instants are on the way down."""
         places, normals = self.surface.points(xy)
         off = ~np.isfinite(places).all(axis=1)
         if off.any():
@@ -158,7 +203,24 @@ class Patient:
         for height in _ramp(-float(depths[-1]), 0.0, _LIFT_MPS):
             self.move(places[-1] + (self.radius + height) * normals[-1])
         self._p = None
-        return Touch(times, places, depths, force)
+        return Touch(times, places, normals, depths, force, np.arange(len(depths)) >= descent, self.seen)
+
+
+def seen_lattice(exam: Exam) -> Array:
+    """Where the skin is seen: points over the region and a margin, as perception lays them [m], shape (n, 2)."""
+    x, y = (
+        pattern.stations(centre, size + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        for centre, size in zip(exam.centre_m, exam.region_m, strict=True)
+    )
+    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _corners(path: Sequence[Sequence[float] | Array] | Array, name: str) -> Array:
+    """Places [m], shape (k, 2), k at least 1."""
+    corners = np.asarray(path, dtype=float)
+    if corners.ndim != 2 or corners.shape[1:] != (2,) or not np.isfinite(corners).all() or not len(corners):
+        raise ValueError(f"{name} = {path}: want x and y [m] in the abdomen frame for each place")
+    return corners
 
 
 def _ramp(begin: float, end: float, speed: float) -> Array:

@@ -33,7 +33,7 @@ from palpate.truth.pressed import press_patient
 from palpate.truth.surface import TrueBody
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunResult
-from palpate_models.frames import apply, inverse
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.motion import BodyMotion
 from palpate_models.phantom import quadrant
@@ -101,8 +101,8 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         depth=depth,
         surface_rms_error_m=_surface(scenario, c.surface, known.body),
         assessed=final is not None and found is not None,
-        findings=[_finding(f) for f in ([] if final is None else final.findings)],
-        candidates=[_finding(f) for f in ([] if final is None else final.candidates)],
+        findings=[finding_row(f) for f in ([] if final is None else final.findings)],
+        candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
         unassessed_m2={} if c.stiffness_map is None else unassessed_of(c.stiffness_map),
         truth=None if known.body is None else _truth(known.felt),
         scores=scores,
@@ -126,24 +126,32 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report
     return report
 
 
+def sample_columns(samples: Samples) -> dict[str, Array]:
+    """The columns of samples.csv by name, in the abdomen frame, each of shape (m,)."""
+    x, y, z = samples.position.T
+    nx, ny, nz = samples.normal.T
+    return {
+        "time_s": samples.time,
+        "x_m": x,
+        "y_m": y,
+        "z_m": z,
+        "nx": nx,
+        "ny": ny,
+        "nz": nz,
+        "depth_m": samples.depth,
+        "normal_force_N": samples.force,
+        "speed_mps": samples.speed,
+        "time_in_contact_s": samples.time_in_contact,
+    }
+
+
 def write_samples(path: Path, samples: Samples) -> None:
     """samples.csv: one row a sample, in the abdomen frame."""
-    names = ("time_s", "x_m", "y_m", "z_m", "nx", "ny", "nz", "depth_m", "normal_force_N", "speed_mps", "time_in_contact_s")
-    columns = np.column_stack(
-        (
-            samples.time,
-            samples.position,
-            samples.normal,
-            samples.depth,
-            samples.force,
-            samples.speed,
-            samples.time_in_contact,
-        )
-    )
+    columns = sample_columns(samples)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow((*names, "force_limited"))
-        for row, limited in zip(columns, samples.force_limited, strict=True):
+        writer.writerow((*columns, "force_limited"))
+        for row, limited in zip(np.column_stack(tuple(columns.values())), samples.force_limited, strict=True):
             writer.writerow((*(f"{value:.6g}" for value in row), int(limited)))
 
 
@@ -189,7 +197,8 @@ def in_words(s: scoring.Scores) -> str:
     return ", ".join(parts)
 
 
-def _finding(f: Any) -> FindingRow:
+def finding_row(f: Any) -> FindingRow:
+    """`palpation_msgs/Finding`."""
     return FindingRow(
         centroid_m=(f.centroid.x, f.centroid.y, f.centroid.z),
         quadrant=f.quadrant,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +16,7 @@ from palpate.report.page import write_page
 from palpate.report.results import print_findings, write_results
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import FolderError, results_folder
+from palpate.run.folder import FolderError, results_folder, usual_folder
 from palpate.run.inputs import Settings, usable
 from palpate.run.placement import PlacementError, placement
 from palpate.run.places import Absent, PlaceError
@@ -122,7 +121,7 @@ def run(  # noqa: PLR0913 - the options of a command
         groups = placement((*workers(chosen), *observers), group or (), processes)
     except (PlaceError, PlacementError) as error:
         refuse(error)
-    folder = out or Path("out") / f"{chosen.name}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = out or usual_folder(chosen.name)
     if not quiet:
         console.print(f"[bold]{chosen.name}[/] seed {chosen.seed}, results in {folder}", highlight=False)
         if not composed:

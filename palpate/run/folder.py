@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 
 LOCK = "run.lock"
@@ -17,6 +18,11 @@ OURS = frozenset({LOCK, "scenario.yaml"})
 
 class FolderError(ValueError):
     """The folder cannot take the results of this run. Says why and what to do."""
+
+
+def usual_folder(scenario: str) -> Path:
+    """Where the results of a scenario of this name go unless it is said where."""
+    return Path("out") / f"{scenario}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 @contextmanager

@@ -31,9 +31,16 @@ def usable(
     are not looked for here.
     """
     try:
-        scenario = load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed)
-        if scenario.services.tissue != NONE:
-            build_phantom(scenario.phantom, scenario.seed)
-        return scenario if elsewhere else checked(scenario)
+        return examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
     except (ScenarioError, MeshError, ChoiceError) as error:
         refuse(error)
+
+
+def examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
+    """The scenario, after its phantom could be made and its services were found, unless they run `elsewhere`.
+
+    Raises MeshError for a phantom that cannot be made, ChoiceError for a service that there is not.
+    """
+    if scenario.services.tissue != NONE:
+        build_phantom(scenario.phantom, scenario.seed)
+    return scenario if elsewhere else checked(scenario)

@@ -17,12 +17,12 @@ from palpate.command_line import EXIT_FAILED, fail, output_folder, refuse
 from palpate.run.inputs import Settings
 from palpate.run.roles import ServiceChoices, settings_of
 from palpate.study.digest import RunRecord, Session
-from palpate.study.folder import Manifest, add_session, conclude, manifest_of, open_folder
+from palpate.study.folder import Manifest, add_session, conclude, usual_folder
 from palpate.study.manifest import Case, Request, cases_of, secret_of
 from palpate.study.outcome import Outcome
-from palpate.study.runner import StudyStopped, failures, missing, of_other_code, run_cases
+from palpate.study.runner import StudyStopped, failures, missing, opened, run_cases
 from palpate.study.shards import Shard, merge
-from palpate.study.spec import Method, Study, StudyError, checked_study, load_study, study_names
+from palpate.study.spec import Method, Study, StudyError, checked_study, load_study, study_names, with_methods
 from palpate.study.statistics.reading import TablesError
 from palpate.study.workers import Workers, WorkersError, cluster, cores, threads
 from palpate_bus.implementations import ChoiceError
@@ -104,13 +104,8 @@ def run(  # noqa: PLR0913 - the options of a command
         request = Request("tune" if split == "tune" else "test", number, settings or (), secret)
         part = Shard.parse(shard) if shard else None
         cases = cases_of(study, request)
-        manifest = manifest_of(study.name, cases)
-        folder = out or Path("out") / "study" / f"{study.name}-{split}"
-        open_folder(folder, manifest)
-        if not keep and (old := of_other_code(folder, cases)):
-            raise StudyError(
-                f"{folder}: {len(old)} of its cases were made by other code: give another folder with -o, or --keep them"
-            )
+        folder = out or usual_folder(study.name, split)
+        manifest = opened(folder, study.name, cases, keep)
     except (StudyError, ChoiceError, OSError) as error:
         refuse(error)
     own = part.part(cases) if part else cases
@@ -144,10 +139,7 @@ def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | 
         settings_of(services)
         roles = dict(option.split("=", 1) for option in services)
         methods[Path(next(iter(roles.values()))).stem.lower()] = Method(services=roles).model_dump(mode="json")
-    if wrong := [name for name in only or () if name not in methods]:
-        raise StudyError(f"--method {wrong[0]}: {study.name} has {', '.join(methods)}")
-    kept = {name: method for name, method in methods.items() if not only or name in only}
-    return checked_study({**study.model_dump(mode="json"), "methods": kept}, study.name, Path())
+    return with_methods(checked_study({**study.model_dump(mode="json"), "methods": methods}, study.name, Path()), only)
 
 
 def _examine(console: Console, folder: Path, cases: Sequence[Case], hands: AbstractContextManager[Workers], quiet: bool) -> None:

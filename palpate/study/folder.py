@@ -21,6 +21,11 @@ MANIFEST: Final = "manifest.json"
 SESSIONS: Final = "sessions.jsonl"
 
 
+def usual_folder(study: str, split: str) -> Path:
+    """Where the results of a study go unless it is said where."""
+    return Path("out") / "study" / f"{study}-{split}"
+
+
 class ManifestRow(BaseModel):
     """A case, without its scenario."""
 

@@ -17,7 +17,7 @@ from palpate.run.roles import checked
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
 from palpate_bus.implementations import ChoiceError, is_file
 from palpate_models.errors import Errors
-from palpate_models.load import ScenarioError, load_scenario
+from palpate_models.load import ScenarioError, as_settings, load_scenario
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.scenario import Scenario, Services
 from palpate_models.section import Section
@@ -166,9 +166,8 @@ def _scenario(
         changes["errors"] = wrong.model_dump(mode="json")
     changes |= method.settings
     changes |= {f"services.{role}": name for role, name in method.services.items()}
-    words = [f"{path}={json.dumps(value)}" for path, value in changes.items()]
     try:
-        return load_scenario(population.scenario, [*words, *settings], seed)
+        return load_scenario(population.scenario, [*as_settings(changes), *settings], seed)
     except ScenarioError as error:
         raise StudyError(f"{where}: {error}") from error
 

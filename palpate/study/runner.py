@@ -24,8 +24,10 @@ from palpate.report.files import write_text
 from palpate.study.case import Attempt
 from palpate.study.child import run_batch
 from palpate.study.code import code_digest
+from palpate.study.folder import Manifest, manifest_of, open_folder
 from palpate.study.manifest import Case
 from palpate.study.outcome import ATTEMPTS, Outcome, case_file, read_outcome, write_outcome
+from palpate.study.spec import StudyError
 from palpate.study.workers import Workers
 
 BATCH: Final = {"whole": 1, "quick": 8}
@@ -51,6 +53,20 @@ def of_other_code(folder: Path, cases: Iterable[Case]) -> list[Case]:
     """The cases whose outcome in the folder was made by other code than this."""
     found = ((case, read_outcome(folder, case.case_id)) for case in cases)
     return [case for case, outcome in found if outcome is not None and outcome.code not in ("", code_digest())]
+
+
+def opened(folder: Path, study: str, cases: Sequence[Case], keep: bool = False) -> Manifest:
+    """Makes the folder of a study of these cases, or goes on in it. Returns its manifest.
+
+    `keep`: cases that other code has made count. Raises StudyError for them otherwise, and for a folder of another study.
+    """
+    manifest = manifest_of(study, cases)
+    open_folder(folder, manifest)
+    if not keep and (old := of_other_code(folder, cases)):
+        raise StudyError(
+            f"{folder}: {len(old)} of its cases were made by other code: give another folder with -o, or --keep them"
+        )
+    return manifest
 
 
 def run_cases(folder: Path, cases: Sequence[Case], workers: Workers, tell: Tell) -> None:

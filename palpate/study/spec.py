@@ -11,7 +11,7 @@ Every patient of every population is examined with every entry of `errors` by ev
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -189,6 +189,13 @@ def load_study(source: str) -> Study:
     if not isinstance(raw, Mapping):
         raise StudyError(f"{source}: want a mapping of fields, not {type(raw).__name__}")
     return checked_study({"name": path.stem, **raw}, source, path.parent, text)
+
+
+def with_methods(study: Study, only: Sequence[str] | None) -> Study:
+    """The study with these of its methods, or with all. Raises StudyError for one that it does not have."""
+    if wrong := [name for name in only or () if name not in study.methods]:
+        raise StudyError(f"{study.name}: there is no method {wrong[0]!r}: want one of {', '.join(study.methods)}")
+    return study.model_copy(update={"methods": {name: own for name, own in study.methods.items() if not only or name in only}})
 
 
 def checked_study(raw: Mapping[str, Any], name: str, folder: Path, text: str = "") -> Study:

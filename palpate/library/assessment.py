@@ -1,0 +1,255 @@
+"""What touches of a patient say of him: the assessment's own service, without a bus."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from palpate.quick.case import assess as have_assessed
+from palpate.quick.patient import PERIOD_S, Seen, Touch
+from palpate.report.evidence import map_of, samples_of
+from palpate.report.results import finding_row, sample_columns
+from palpate.report.rows import FindingRow
+from palpate.report.scoring import Map
+from palpate.run.composed import load_services
+from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
+from palpate_bus.messages.stamps import NS, header
+from palpate_conductor.collector import Collected
+from palpate_models.band import half_width
+from palpate_models.frames import Array, apply
+from palpate_models.load import exam_input
+from palpate_planning.contact import CONTACT_ON_N
+
+_NO_TRIANGLES = np.empty(0, np.uint32)
+_NO_SHARES = np.empty(0, np.float32)
+
+KNOWN_M = 0.0003
+"""Standard deviation of depth that is stated: indenter and skin are known exactly, but for the mesh between its points [A]."""
+
+
+@dataclass(frozen=True, eq=False)
+class StiffnessMap(Map):
+    """Apparent stiffness over the skin with its 90 % band; n nodes, in the abdomen frame as the examination has it."""
+
+    triangles: NDArray[np.int64]
+    """Nodes of each triangle, shape (m, 3), counter-clockwise seen from outside."""
+    background: float
+    """Level of the unremarkable tissue's apparent stiffness [N]."""
+
+    @classmethod
+    def of(cls, message: Any) -> StiffnessMap:
+        """The map of a `palpation_msgs/StiffnessMap`."""
+        triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
+        return cls(**vars(map_of(message)), triangles=triangles, background=float(message.background))
+
+    @property
+    def uncertainty(self) -> Array:
+        """Half width of the 90 % band [1], shape (n,): the factor from the middle to either end, less one."""
+        return half_width(self.lower, self.upper)
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """A row for each node."""
+        x, y, z = self.vertices.T
+        columns = {"x_m": x, "y_m": y, "z_m": z, "apparent_N": self.apparent, "lower_N": self.lower, "upper_N": self.upper}
+        return pd.DataFrame({**columns, "scanned": self.scanned, "finding": self.finding})
+
+    def plot(self, axes: Axes | None = None, values: Array | None = None, label: str = "", cmap: str = "inferno") -> Axes:
+        """Draws the map seen from the front, in millimetres.
+
+        Parameters
+        ----------
+        axes
+            Where to draw; new axes by default.
+        values
+            At the nodes, shape (n,); by default the apparent stiffness [N].
+        label, cmap
+            Of the colour bar.
+
+        Returns
+        -------
+        Axes
+            Those drawn on.
+        """
+        if axes is None:
+            from matplotlib import pyplot  # noqa: PLC0415 - who has axes needs no windows
+
+            axes = pyplot.subplots()[1]
+        shown, words = (self.apparent, "apparent stiffness [N]") if values is None else (values, "")
+        mesh = Triangulation(1e3 * self.vertices[:, 0], 1e3 * self.vertices[:, 1], self.triangles)
+        image = axes.tripcolor(mesh, shown, cmap=cmap, shading="gouraud")
+        figure = axes.get_figure()
+        assert figure is not None
+        figure.colorbar(image, ax=axes, label=label or words)
+        axes.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]")
+        return axes
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """What the assessment makes of touches."""
+
+    samples: pd.DataFrame
+    """What it thinned them to, with the columns of samples.csv."""
+    map: StiffnessMap | None
+    """None while there are too few samples."""
+    findings: pd.DataFrame
+    """A row for each stiff area."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """What the assessment says of itself."""
+
+    def __repr__(self) -> str:
+        return f"Assessment({len(self.samples)} samples, {len(self.findings)} findings{'' if self.map else ', no map yet'})"
+
+    def _repr_html_(self) -> str:
+        picture = "" if self.map is None else html_of(drawn(self.map, self.samples))
+        return f"<p>{len(self.samples)} samples</p>{findings_html(self.findings)}{picture}"
+
+
+def assess(touches: Touch | Iterable[Touch]) -> Assessment:
+    """Has the assessment of the scenario make map and findings of touches, as it does in an examination.
+
+    It is given what it is given there: the skin as it is seen, and force and depth over time; nothing of the truth.
+
+    Parameters
+    ----------
+    touches
+        What `Patient.press` and `Patient.slide` returned, all of one patient, in any order. Of each, what was felt at depth
+        counts: a press that is not held says nothing.
+
+    Returns
+    -------
+    Assessment
+        Samples, map and findings. Without map and findings while there are too few samples.
+
+    Raises
+    ------
+    ValueError
+        There are no touches, or they are of several patients.
+    ChoiceError
+        The scenario's assessment cannot be made.
+
+    Examples
+    --------
+    >>> import palpate
+    >>> patient = palpate.Patient(palpate.scenario("clean", exam={"region_m": [0.1, 0.1], "centre_m": [-0.05, -0.05]}))
+    >>> lines = [[(-0.10, y), (0.0, y)] for y in (-0.10, -0.0875, -0.075, -0.0625, -0.05, -0.0375, -0.025, -0.0125, 0.0)]
+    >>> found = palpate.assess(patient.slide(line, depth=0.010, speed=0.03) for line in lines)
+    >>> found.findings.quadrant.tolist()
+    ['RLQ']
+    >>> bool(found.findings.ratio[0] > 1.8)
+    True
+    """
+    felt = sorted([touches] if isinstance(touches, Touch) else touches, key=lambda touch: float(touch.time[0]))
+    if not felt:
+        raise ValueError("touches: there are none; want what Patient.press and Patient.slide return")
+    seen = felt[0].seen
+    if any(touch.seen is not seen for touch in felt):
+        raise ValueError("touches: they are of several patients; want those of one")
+    gathered = _gathered(seen, felt)
+    (service,) = load_services(seen.scenario, ("assessment",))
+    with threadpool_limits(1):  # a result is not to depend on how many threads there are
+        facts = have_assessed(service, gathered)
+    return Assessment(
+        samples=samples_frame(gathered.samples),
+        map=None if gathered.stiffness_map is None else StiffnessMap.of(gathered.stiffness_map),
+        findings=findings_frame([finding_row(f) for f in ([] if gathered.findings is None else gathered.findings.findings)]),
+        facts=facts,
+    )
+
+
+def _gathered(seen: Seen, touches: Sequence[Touch]) -> Collected:
+    """Touches as the messages of an examination whose states they were, in world as the patient is registered."""
+    X_WA = np.array(exam_input(seen.scenario).X_WA)
+    R_WA = X_WA[:3, :3]
+    states = list(chain.from_iterable(_states(touch, X_WA, stroke) for stroke, touch in enumerate(touches, start=1)))
+    over = round((float(touches[-1].time[-1]) + 2 * PERIOD_S) * NS)
+    states.append(_state(over, ExamState.PHASE_ASSESS, X_WA[:3, 3], R_WA[:, 2], len(touches)))
+    places, normals = ((a.astype(np.float32).ravel()) for a in (apply(X_WA, seen.places), seen.normals @ R_WA.T))
+    return Collected(exam_states=states, surface=SurfaceMesh(header(0, "world"), places, normals, _NO_TRIANGLES, _NO_SHARES))
+
+
+def _states(touch: Touch, X_WA: Array, stroke: int) -> list[Any]:
+    """`exam/state` at each instant of a touch, which is the n-th stroke, and one after it, out of contact."""
+    places, normals = apply(X_WA, touch.position), touch.normal @ X_WA[:3, :3].T
+    rows = zip(touch.time, places, normals, touch.depth, touch.force, touch.steady, strict=True)
+    states = [
+        _state(round(t * NS), ExamState.PHASE_SCAN, p, n, stroke, (float(depth), float(force)), bool(steady))
+        for t, p, n, depth, force, steady in rows
+    ]
+    return [*states, _state(round((touch.time[-1] + PERIOD_S) * NS), ExamState.PHASE_RETRACT, places[-1], normals[-1], stroke)]
+
+
+def _state(
+    t: int, phase: int, p_W: Array, n_W: Array, stroke: int, felt: tuple[float, float] = (0.0, 0.0), steady: bool = False
+) -> Any:
+    """`exam/state` at time `t` [ns], with depth [m] and force [N] as they are felt."""
+    depth, force = felt
+    touching = force > CONTACT_ON_N
+    return ExamState(
+        header=header(t, "world"),
+        phase=phase,
+        message="",
+        target_index=0,
+        target_count=0,
+        targets_skipped=0,
+        in_contact=touching,
+        steady=steady and touching,
+        force_limited=False,
+        view_blocked=False,
+        depth_setpoint=depth,
+        depth=depth,
+        normal_force=force,
+        surface_point=Point(*p_W.tolist()),
+        surface_normal=Vector3(*n_W.tolist()),
+        end_tick=-1,
+        depth_uncertainty=KNOWN_M,
+        wall_displacement=0.0,
+        stroke=stroke,
+        patient_moved=False,
+    )
+
+
+def samples_frame(messages: list[Any]) -> pd.DataFrame:
+    """`palpation_msgs/PalpationSample`, a row each, with the columns of samples.csv."""
+    samples = samples_of(messages)
+    return pd.DataFrame({**sample_columns(samples), "force_limited": samples.force_limited})
+
+
+def findings_frame(rows: Iterable[FindingRow]) -> pd.DataFrame:
+    """Findings, a row each: where [m], area [m^2], apparent stiffness over that of the surroundings with its 90 % band."""
+    columns = ("quadrant", "x_m", "y_m", "z_m", "area_m2", "ratio", "ratio_lower", "ratio_upper", "confidence")
+    values = [(f.quadrant, *f.centroid_m, f.area_m2, f.ratio, *f.ratio_90, f.confidence) for f in rows]
+    return pd.DataFrame(values, columns=list(columns))
+
+
+def findings_html(findings: pd.DataFrame) -> str:
+    """The findings as a table of HTML, or that there are none."""
+    return str(findings.to_html(index=False, float_format="{:.3g}".format)) if len(findings) else "<p>no finding</p>"
+
+
+def drawn(found: StiffnessMap, samples: pd.DataFrame) -> bytes:
+    """The map and where samples were taken, as PNG."""
+    figure = Figure(figsize=(5.2, 4.2), dpi=110, layout="constrained")
+    axes = found.plot(figure.add_subplot())
+    axes.plot(1e3 * samples.x_m, 1e3 * samples.y_m, ".", ms=2, color="white", alpha=0.6)
+    file = BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()
+
+
+def html_of(png: bytes, width: str = "auto") -> str:
+    """A picture that is part of the page."""
+    return f'<img style="width: {width}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'

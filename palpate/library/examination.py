@@ -1,0 +1,205 @@
+"""Whole examinations for the library: `palpate run` in a process of its own, and what it left as arrays, tables and pictures."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from palpate.command_line import EXIT_FAILED
+from palpate.environment import FIXED
+from palpate.library.assessment import StiffnessMap, findings_frame, findings_html, html_of
+from palpate.library.scenarios import scenario as scenario_of
+from palpate.report.archive import Evidence, read_evidence
+from palpate.report.page import FILE as PAGE
+from palpate.report.page import read_report
+from palpate.report.results import clean_words, in_words
+from palpate.report.rows import Report
+from palpate.run.folder import usual_folder
+from palpate_models.load import dump_scenario
+from palpate_models.scenario import Scenario
+
+_SEEN_FRAMES: Final = ("time", "phase", "depth", "setpoint", "force", "in_contact", "steady", "force_limited")
+
+
+class ExaminationError(RuntimeError):
+    """An examination that left no results. Says why, in the words of the command line."""
+
+
+class Examination:
+    """The results folder of an examination, read when something of it is asked for.
+
+    >>> import palpate
+    >>> examination = palpate.Examination("out/clean-20260101-120000")  # doctest: +SKIP
+    >>> examination.findings  # doctest: +SKIP
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Of a run that was made before, by `palpate.run` or on the command line. Raises EvidenceError for any other folder."""
+        self.folder = Path(folder)
+        """Where the results are."""
+        self.report: Report = read_report(self.folder)
+        """What report.json says: findings, scores against the truth, where the time went."""
+
+    @property
+    def failure(self) -> str | None:
+        """Why the examination did not come to its end, None where it did."""
+        return self.report.failure
+
+    @property
+    def findings(self) -> pd.DataFrame:
+        """The stiff areas that it found, a row each: quadrant, place [m], area [m^2], ratio with its 90 % band, confidence."""
+        return findings_frame(self.report.findings)
+
+    @cached_property
+    def samples(self) -> pd.DataFrame:
+        """Forces at depth, a row for each few millimetres of travel: samples.csv."""
+        return pd.read_csv(self.folder / "samples.csv").astype({"force_limited": bool})
+
+    @cached_property
+    def states(self) -> pd.DataFrame:
+        """What it measured over time, a row for each state: time [s], phase, depth and set-point [m], force [N], flags."""
+        return pd.DataFrame({name: getattr(self._evidence, name) for name in _SEEN_FRAMES})
+
+    @cached_property
+    def map(self) -> StiffnessMap | None:
+        """The stiffness map, None where the examination came to none."""
+        message = self._evidence.stiffness_map
+        return None if message is None else StiffnessMap.of(message)
+
+    @property
+    def recording(self) -> Path | None:
+        """The drawing of the run for the dashboard, recording.rrd; None where nothing was recorded."""
+        return self._file("recording.rrd")
+
+    @property
+    def mcap(self) -> Path | None:
+        """Every message of the run, a rosbag2 folder; None where nothing was recorded."""
+        return self._file("recording_mcap")
+
+    @property
+    def page(self) -> Path:
+        """The report to read, report.html."""
+        return self.folder / PAGE
+
+    @cached_property
+    def _evidence(self) -> Evidence:
+        return read_evidence(self.folder)
+
+    def _file(self, name: str) -> Path | None:
+        path = self.folder / name
+        return path if path.exists() else None
+
+    def __repr__(self) -> str:
+        ended = self.failure or f"{len(self.report.findings)} findings"
+        return f"Examination({str(self.folder)!r}): {self.report.scenario}, seed {self.report.seed}: {ended}"
+
+    def _repr_html_(self) -> str:
+        report = self.report
+        what = f"seed {report.seed}, {report.sim_time_s:.0f} s, {report.samples} samples"
+        parts = [f"<p><b>{escape(report.scenario)}</b>, {what}</p>"]
+        parts += [f"<p>the examination failed: {escape(report.failure)}</p>"] if report.failure else []
+        parts += [findings_html(self.findings)] if report.assessed else ["<p>not assessed</p>"]
+        if report.scores is not None:
+            parts.append(f"<p>against the truth{clean_words(report)}: {escape(in_words(report.scores))}</p>")
+        if picture := self._file("map.png"):
+            parts.append(html_of(picture.read_bytes(), "100%"))
+        return "".join(parts)
+
+
+def run(
+    scenario: str | Path | Scenario = "clean",
+    /,
+    *,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    record: bool = True,
+    quiet: bool = False,
+    **settings: Any,
+) -> Examination:
+    """Runs a whole examination: arm, camera, perception, planning, control and assessment, as `palpate run --composed` does.
+
+    It has a process of its own, in an environment that makes results repeatable: the run hash is that of the command line.
+
+    Parameters
+    ----------
+    scenario, seed, **settings
+        As for `palpate.scenario`.
+    out
+        Folder for the results; by default out/<scenario>-<time>.
+    overwrite
+        Remove the results of an earlier run from the folder.
+    record
+        Write recording.rrd and the MCAP recording.
+    quiet
+        Do not tell on stderr how the examination goes on.
+
+    Returns
+    -------
+    Examination
+        Also of an examination that was given up, such as one that the supervisor stopped: `failure` says why, and a warning.
+
+    Raises
+    ------
+    ScenarioError, MeshError, ChoiceError
+        As `palpate.scenario` does, before anything starts.
+    ExaminationError
+        There are no results: the folder cannot take them, for instance.
+
+    Examples
+    --------
+    >>> import palpate
+    >>> small = {"region_m": [0.06, 0.06], "centre_m": [-0.055, -0.055]}
+    >>> examination = palpate.run("clean", exam=small, record=False)  # doctest: +SKIP
+    >>> examination.findings.quadrant.tolist()  # doctest: +SKIP
+    ['RLQ']
+    """
+    chosen = scenario_of(scenario, seed=seed, **settings)
+    folder = usual_folder(chosen.name) if out is None else Path(out)
+    with tempfile.TemporaryDirectory(prefix="palpate-run-") as place:
+        file = Path(place) / f"{chosen.name}.yaml"
+        file.write_text(dump_scenario(chosen), encoding="utf-8")
+        flags = {"--overwrite": overwrite, "--no-record": not record, "--quiet": quiet}
+        words = [str(file), "--out", str(folder), "--composed", *(flag for flag, wanted in flags.items() if wanted)]
+        status, said = _palpate("run", *words, quiet=quiet)
+    if status not in (0, EXIT_FAILED) or not (folder / "report.json").is_file():
+        raise ExaminationError(said[-1] if said else f"{folder}: there are no results (status {status})")
+    examination = Examination(folder)
+    if examination.failure:
+        warnings.warn(f"{folder}: the examination failed: {examination.failure}", stacklevel=2)
+    return examination
+
+
+def _palpate(*words: str, quiet: bool) -> tuple[int, list[str]]:
+    """Runs a command of `palpate`, which passes an interruption on to it. Returns its status and what it said on stderr."""
+    command = [sys.executable, "-m", "palpate", *words]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **FIXED},
+        start_new_session=True,  # so that it is interrupted once, by us
+    ) as process:
+        assert process.stderr is not None
+        said = []
+        try:
+            for line in process.stderr:
+                said.append(line.rstrip())
+                if not quiet:
+                    print(said[-1], file=sys.stderr)
+        except KeyboardInterrupt:
+            process.send_signal(signal.SIGINT)
+            process.communicate()
+            raise
+        return process.wait(), said

@@ -1,0 +1,68 @@
+"""Scenarios for the library: by name or file, with settings as keywords."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from palpate.run.inputs import examinable
+from palpate_models.load import ScenarioError, as_settings, load_scenario, whole_scenario
+from palpate_models.scenario import Scenario
+
+
+def scenario(source: str | Path | Scenario = "clean", /, *, seed: int | None = None, **settings: Any) -> Scenario:
+    """A scenario that can be examined, checked as the command line checks it.
+
+    Parameters
+    ----------
+    source
+        Name of a scenario (`palpate scenarios` lists them) or path of a YAML file. A scenario that is there already is taken as
+        it is, and has no settings.
+    seed
+        The seed that patient and equipment are drawn from; by default the scenario's own.
+    **settings
+        Fields of a scenario, each section a mapping: `exam={"pattern": "raster", "depth_m": 0.008}`. What is not mentioned stays
+        as it is. A field may also be given by its path: `**{"exam.depth_m": 0.008}`.
+
+    Returns
+    -------
+    Scenario
+        Frozen, with the person drawn where the scenario leaves him to the seed.
+
+    Raises
+    ------
+    ScenarioError
+        Names file, field, value and what is allowed.
+    MeshError
+        The phantom cannot be made.
+    ChoiceError
+        There is no such service.
+
+    Examples
+    --------
+    >>> import palpate
+    >>> chosen = palpate.scenario("lump", seed=3, exam={"pattern": "raster", "region_m": [0.1, 0.1]})
+    >>> chosen.exam.pattern.value, chosen.exam.region_m, chosen.seed
+    ('raster', (0.1, 0.1), 3)
+    >>> palpate.scenario("lump", exam={"dept_m": 0.008})
+    Traceback (most recent call last):
+        ...
+    palpate_models.load.ScenarioError: --set exam.dept_m: exam.dept_m = 0.008: there is no such field. Did you mean depth_m?
+    """
+    words = as_settings(dict(paths(settings)))
+    if isinstance(source, Scenario):
+        if words:
+            raise ScenarioError(f"{source.name}: {words[0]}: settings go with the name or file of a scenario, not with one")
+        return examinable(whole_scenario(source, seed))
+    return examinable(load_scenario(str(source), words, seed))
+
+
+def paths(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Path and value of each field of nested mappings."""
+    for name, value in settings.items():
+        path = f"{above}{name}"
+        if isinstance(value, Mapping) and value:
+            yield from paths(value, f"{path}.")
+        else:
+            yield path, value

@@ -1,0 +1,278 @@
+"""`import palpate`: its examples hold, its patients are the system's tissue, its examinations are those of the command line."""
+
+from __future__ import annotations
+
+import doctest
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from examination import GATE, Finished
+
+import palpate
+from palpate.library.examination import ExaminationError
+from palpate.quick.patient import Touch
+from palpate.truth.tissue import true_tissue
+from palpate_models import press
+from palpate_models.load import ScenarioError, dump_scenario, load_scenario
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.py"))
+SMALL = {"region_m": [0.04, 0.04], "centre_m": [-0.055, -0.055]}
+LAZY = """
+import sys
+import palpate
+heavy = {"numpy", "pandas", "matplotlib", "scipy", "numba", "pydantic", "palpate.library"} & set(sys.modules)
+assert not heavy, heavy
+assert set(palpate.__all__) <= set(dir(palpate))
+import palpate.run.folder
+import palpate.study.folder
+from palpate.run import folder
+assert folder.usual_folder("x").parent.name == "out"
+assert palpate.run.__module__ == "palpate.library.examination", palpate.run
+assert palpate.study.__module__ == "palpate.library.studies", palpate.study
+"""
+
+
+@pytest.fixture(scope="module")
+def patient() -> palpate.Patient:
+    return palpate.Patient(palpate.scenario("clean", exam=SMALL))
+
+
+# --- names ---------------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_imported_before_it_is_used_and_packages_do_not_hide_functions() -> None:
+    subprocess.run([sys.executable, "-c", LAZY], check=True, timeout=120)
+
+
+@pytest.mark.parametrize("name", palpate.__all__)
+def test_every_name_is_there(name: str) -> None:
+    assert callable(getattr(palpate, name))
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="nosuch"):
+        palpate.nosuch  # type: ignore[attr-defined]  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "palpate",
+        "palpate.quick.patient",
+        "palpate.library.scenarios",
+        "palpate.library.assessment",
+        "palpate.library.examination",
+    ],
+)
+def test_the_examples_hold(module: str) -> None:
+    failed, tried = doctest.testmod(import_module(module))
+    assert tried > 0
+    assert failed == 0
+
+
+# --- settings ------------------------------------------------------------------------------------------------------------
+
+
+def test_keywords_are_what_set_is_on_the_command_line() -> None:
+    by_keywords = palpate.scenario(
+        "clean", seed=3, exam={"depth_m": 0.008, "pattern": "raster"}, **{"phantom.breathing.kind": "deep"}
+    )
+    words = ["exam.depth_m=0.008", "exam.pattern=raster", "phantom.breathing.kind=deep"]
+    assert dump_scenario(by_keywords) == dump_scenario(load_scenario("clean", words, 3))
+
+
+def test_a_whole_section_may_be_given_by_a_word() -> None:
+    assert palpate.scenario("clean", errors="typical").errors == load_scenario("clean", ["errors=typical"]).errors
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"exam": {"dept_m": 0.008}}, "exam.dept_m"),
+        ({"exam": {"depth_m": 8}}, "exam.depth_m"),
+        ({"sead": 3}, "sead"),
+        ({"exam": {"depth_m": {1, 2}}}, "exam.depth_m"),
+        ({"services": {"assessment": "nosuch"}}, "services.assessment"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_its_name(settings: dict[str, object], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        palpate.scenario("clean", **settings)
+
+
+def test_a_scenario_is_whole_and_takes_neither_settings_nor_another_seed() -> None:
+    chosen = palpate.scenario("person", seed=4)
+    assert palpate.scenario(chosen) == chosen
+    with pytest.raises(ScenarioError, match=r"exam\.depth_m"):
+        palpate.scenario(chosen, exam={"depth_m": 0.008})
+    with pytest.raises(ScenarioError, match="seed = 5"):
+        palpate.Patient(chosen, 5)
+
+
+# --- patients ------------------------------------------------------------------------------------------------------------
+
+
+def felt(seed: int) -> Touch:
+    return palpate.Patient("person", seed).press((0.0, 0.04), depth=0.008, speed=0.02, hold=0.1)
+
+
+def test_a_patient_is_his_seed() -> None:
+    once, again, other = felt(7), felt(7), felt(8)
+    assert np.array_equal(once.force, again.force)
+    assert not np.allclose(once.force, other.force, rtol=0.02)
+
+
+def test_a_press_feels_what_the_tissue_of_the_system_feels(patient: palpate.Patient) -> None:
+    """The standard press by hand, against the one that scores an examination, in steps ten times as fine."""
+    xy = np.array([(-0.055, -0.055), (-0.02, -0.055)])
+    places, normals = patient.surface.points(xy)
+    tissue = true_tissue(patient.scenario)
+    assert tissue is not None
+    known, _ = press.apparent_stiffness(tissue.press(places, normals, patient.radius))
+    for place, force in zip(xy, known, strict=True):
+        patient.rest(120.0)
+        touch = patient.press(place, press.DEPTH_M, press.SPEED_MPS, press.HOLD_S)
+        assert touch.force[touch.time > touch.time[-1] - press.READ_S].mean() == pytest.approx(force, rel=0.02)
+
+
+def test_a_slide_is_at_depth_along_its_path(patient: palpate.Patient) -> None:
+    touch = patient.slide([(-0.08, -0.055), (-0.05, -0.055), (-0.05, -0.045)], depth=0.006, speed=0.02)
+    along = touch.position[touch.steady]
+    assert np.allclose(touch.depth[touch.steady], 0.006)
+    assert np.allclose(along[-1, :2], (-0.05, -0.045))
+    assert np.linalg.norm(np.diff(along[:, :2], axis=0), axis=1).max() <= 0.02 * 0.010 + 1e-9
+    assert len(along) == 200
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"depth": 10.0}, "depth = 10.0 m"),
+        ({"depth": float("nan")}, "depth = nan m"),
+        ({"speed": 0.0}, "speed = 0.0 m/s"),
+        ({"hold": -1.0}, "hold = -1.0 s"),
+        ({"xy": (5.0, 0.0)}, "off the body"),
+        ({"xy": (0.0, 0.0, 0.0)}, "want x and y"),
+    ],
+)
+def test_a_press_that_nobody_means_is_refused(patient: palpate.Patient, given: dict[str, object], named: str) -> None:
+    usual = {"xy": (-0.055, -0.055), "depth": 0.01, "speed": 0.02, "hold": 0.1}
+    with pytest.raises(ValueError, match=named):
+        patient.press(**{**usual, **given})  # type: ignore[arg-type]
+
+
+# --- assessments ---------------------------------------------------------------------------------------------------------
+
+
+def presses(patient: palpate.Patient, count: int) -> list[Touch]:
+    places = [(x, y) for x in (-0.075, -0.055, -0.035) for y in (-0.075, -0.055, -0.035)]
+    return [patient.press(xy, depth=0.010, speed=0.05, hold=0.5) for xy in places[:count]]
+
+
+def test_what_is_assessed_knows_nothing_of_the_patient() -> None:
+    lump = {"centre_m": [-0.055, -0.055], "radii_m": [0.03, 0.03], "contrast": 6.0}
+    with_lump = palpate.scenario("person", seed=3, exam=SMALL, phantom={"lesions": [lump]})
+    scenarios = [palpate.scenario("clean", exam=SMALL), with_lump]
+    assert len({dump_scenario(palpate.Patient(s).seen.scenario, "exam") for s in scenarios}) == 1
+
+
+def test_an_assessment_is_of_one_patient_and_of_some_touches(patient: palpate.Patient) -> None:
+    other = palpate.Patient(patient.scenario)
+    with pytest.raises(ValueError, match="several patients"):
+        palpate.assess([*presses(patient, 1), *presses(other, 1)])
+    with pytest.raises(ValueError, match="there are none"):
+        palpate.assess([])
+
+
+def test_order_does_not_matter_and_few_touches_say_nothing() -> None:
+    touches = presses(palpate.Patient(palpate.scenario("clean", exam=SMALL)), 9)
+    there, back = palpate.assess(touches), palpate.assess(reversed(touches))
+    assert there.map is not None
+    assert back.map is not None
+    assert np.array_equal(there.map.apparent, back.map.apparent)
+    assert there.samples.equals(back.samples)
+    assert palpate.assess(touches[0]).map is None
+    assert len(palpate.assess(touches[0]).findings) == 0
+
+
+def test_the_assessment_is_the_one_that_the_scenario_names() -> None:
+    own = str(ROOT / "docs/examples/threshold_assessment.py")
+    touches = presses(palpate.Patient(palpate.scenario("clean", exam=SMALL, services={"assessment": own})), 9)
+    usual = presses(palpate.Patient(palpate.scenario("clean", exam=SMALL)), 9)
+    found, known = palpate.assess(touches), palpate.assess(usual)
+    assert found.map is not None
+    assert known.map is not None
+    assert found.map.apparent.shape != known.map.apparent.shape or not np.allclose(found.map.apparent, known.map.apparent)
+
+
+# --- examinations --------------------------------------------------------------------------------------------------------
+
+
+def test_an_examination_is_read_from_its_folder(composed: Finished) -> None:
+    read = palpate.Examination(composed.folder)
+    assert read.failure is None
+    assert read.recording is None
+    assert len(read.samples) == composed.report["samples"]
+    assert read.findings.quadrant.tolist() == [row["quadrant"] for row in composed.report["findings"]]
+    assert read.map is not None
+    assert len(read.map.frame) == len(read.map.apparent) == len(read.map.uncertainty)
+    assert (read.map.uncertainty > 0).all()
+    assert read.states.force.max() <= composed.report["max_force_N"] + 0.5
+    assert "<img" in read._repr_html_()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_an_examination_is_that_of_the_command_line(composed: Finished, tmp_path: Path) -> None:
+    region = {"region_m": [0.1, 0.1], "centre_m": [-0.055, -0.055]}
+    assert (*(f"exam.{name}={value}" for name, value in region.items()), "camera.frames=10") == GATE
+    made = palpate.run("clean", out=tmp_path / "made", record=False, exam=region, camera={"frames": 10}, quiet=True)
+    assert made.report.run_hash == composed.report["run_hash"] is not None
+
+
+def test_a_folder_that_cannot_take_the_results_is_told(tmp_path: Path) -> None:
+    (tmp_path / "somebody's").write_text("", encoding="utf-8")
+    with pytest.raises(ExaminationError, match="somebody's"):
+        palpate.run("clean", out=tmp_path, quiet=True)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_study_gives_its_tables(tmp_path: Path) -> None:
+    file = tmp_path / "toy.yaml"
+    file.write_text("tier: quick\npopulations: {clean: {scenario: clean, number: {test: 2}}}\n", encoding="utf-8")
+    region = {"region_m": [0.03, 0.03]}
+    with pytest.raises(ValueError, match="nosuch"):
+        palpate.study(file, methods=["nosuch"])
+    done = palpate.study(file, number=1, workers=1, out=tmp_path / "done", exam=region)
+    assert done.record.done == 1
+    assert len(done.cases) == 1
+    assert done.page.is_file()
+    again = palpate.study(file, number=1, workers=1, out=tmp_path / "done", exam=region)
+    assert again.record.digest == done.record.digest
+    assert len(again.record.sessions) == 1
+
+
+# --- notebooks -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_can_be_carried_out(notebook: Path, tmp_path: Path) -> None:
+    jupytext = pytest.importorskip("jupytext")
+    nbclient = pytest.importorskip("nbclient")
+    cells = jupytext.read(notebook)
+    nbclient.NotebookClient(cells, timeout=1500, kernel_name="python3", resources={"metadata": {"path": tmp_path}}).execute()
+    outputs = [output for cell in cells.cells for output in cell.get("outputs", ())]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert [output for output in outputs if output.get("name") == "stderr"] == []
+
+
+def test_there_are_notebooks() -> None:
+    assert len(NOTEBOOKS) == 3
