@@ -104,7 +104,7 @@ class Assessment:
     samples: pd.DataFrame
     """What it thinned them to, with the columns of samples.csv."""
     map: StiffnessMap | None
-    """None while there are too few samples."""
+    """None while there are too few samples, and of an assessment that draws none."""
     findings: pd.DataFrame
     """A row for each stiff area."""
     facts: dict[str, Any] = field(default_factory=dict)
