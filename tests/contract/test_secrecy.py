@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from palpate.run import composed
+from palpate.run import composed, processes
 from palpate.run.forks import Forks
 from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
@@ -121,7 +121,7 @@ def leaking_seed(scenario: Scenario, out: Path) -> Any:
 def leaking_folder(scenario: Scenario, out: Path) -> Any:
     """Every process is told the results folder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("palpate.run.processes.OBSERVERS", frozenset(ROLES))
+        patch.setattr(processes, "OBSERVERS", frozenset(ROLES))
         return distributed(scenario, out)
 
 
