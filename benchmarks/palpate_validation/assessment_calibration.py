@@ -1,7 +1,7 @@
 """Fits the probabilities of the assessment's candidates to tuning patients, and its operating point to healthy ones.
 
-    python -m palpate_validation.assessment_calibration --patients 300       writes calibration.yaml anew
-    python -m palpate_validation.assessment_calibration --patients 300 --first-seed 1000 --check
+    python -m palpate_validation.assessment_calibration --patients 1000      writes calibration.yaml anew
+    python -m palpate_validation.assessment_calibration --patients 400 --first-seed 2000 --check
 
 Every second patient is healthy, the others have one lump; persons and scans are those of `felt_scans`. What the regression
 needs of contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over the tissue, and
@@ -131,7 +131,7 @@ def told(cases: list[Case], calibration: Calibration, false_findings: float = 0.
 def main() -> None:
     """Calibrates, or checks the calibration."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--patients", type=int, default=300)
+    parser.add_argument("--patients", type=int, default=1000)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--check", action="store_true", help="print figures of the present calibration, change nothing")
     args = parser.parse_args()
