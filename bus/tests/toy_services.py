@@ -112,7 +112,8 @@ class Tissue(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         h = header(t, "world")
-        x = float(np.cos(inbox.latest("sim/tool_state").pose.position.x))
+        tool = inbox.latest("sim/tool_state")  # by the wall clock a service may step before it comes
+        x = 1.0 if tool is None else float(np.cos(tool.pose.position.x))
         out: dict[str, Any] = {"sim/contact_wrench": WrenchStamped(h, wrench(x))}
         if t % (10 * MS) == 0:
             out["truth/indentation"] = IndentationTruth(h, 0.0, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)

@@ -1,8 +1,8 @@
 """What arm, eye and force sensor get wrong in an examination, as distributions that whole examinations have.
 
-`loop.yaml` holds them, a row for each setting of the errors and kind of breathing. A row that was fitted to no examination is
-assumed: studies on it say so. With d the depth that the examination measures and d' the true one, against the skin as it
-breathes,
+`loop.yaml` holds them, a row for each setting of the errors and kind of breathing. A row that was fitted to fewer than
+LEAST_EXAMINATIONS is assumed: studies on it say so. With d the depth that the examination measures and d' the true one, against
+the skin as it breathes,
 
     d - d' = offset + zero(stroke) + tilt . xy + field(xy) + wander(t) - (1 - followed) (excursion(t) - its mean)
 
@@ -44,6 +44,9 @@ _GRID_M: Final = 0.004
 _BEYOND_M: Final = 0.06
 """The field of surface errors reaches this far beyond the examined region."""
 
+LEAST_EXAMINATIONS: Final = 10
+"""Figures of fewer examinations say nothing about how examinations differ: such a loop counts as assumed."""
+
 Breath = Literal["none", "quiet", "deep", "held"]
 
 
@@ -73,7 +76,7 @@ class LoopErrors(Section):
     following: Following
     """What the examination does about breathing."""
     examinations: Annotated[int, Field(ge=0)]
-    """From how many whole examinations these figures are; 0: they are assumed."""
+    """From how many whole examinations these figures are."""
     begin_s: Positive
     """Mean time at which the first stroke begins."""
     aside_m: NonNegative
@@ -132,8 +135,8 @@ def known_loops() -> tuple[LoopErrors, ...]:
 
 
 def any_assumed() -> bool:
-    """Whether a loop stands for examinations that nobody has carried out."""
-    return not all(row.examinations for row in known_loops())
+    """Whether a loop stands for more examinations than were carried out."""
+    return any(row.examinations < LEAST_EXAMINATIONS for row in known_loops())
 
 
 def setting_of(scenario: Scenario) -> dict[str, str | None]:

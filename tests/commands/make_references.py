@@ -22,11 +22,11 @@ SETTINGS = (
 """A small examination with small messages: a coarse abdomen and a camera of few pixels."""
 CUTS = {
     "robot": (0.0, 0.1),
-    "control": (7.0, 0.1),
-    "tissue": (8.5, 0.1),
+    "control": (29.0, 0.1),
+    "tissue": (29.5, 0.1),
     "planning": (0.0, 3.0),
-    "supervisor": (7.0, 1.0),
-    "assessment": (8.0, 2.0),
+    "supervisor": (28.5, 1.0),
+    "assessment": (28.0, 2.0),
     "camera": (0.0, 1.2),
     "perception": (0.0, 1.5),
 }

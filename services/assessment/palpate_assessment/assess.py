@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,21 @@ from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression, usual_amplitudes
 from palpate_assessment.observations import FEWEST, observe
 from palpate_assessment.sampling import ForceSample
-from palpate_bus.messages import StiffnessMap
 from palpate_models.frames import Array
 
 Mask = NDArray[np.bool_]
 
 _MOST_CONTRADICTED = 0.3
 """When more than this part of the samples contradicts the rest, it is not known which of them is right: all stay in."""
+
+
+class Reason(IntEnum):
+    """Why a place is not assessed, if it is not; numbered as StiffnessMap.msg does."""
+
+    ASSESSED = 0
+    NOT_REACHED = 1
+    CONTRADICTED = 2
+    YIELDED = 3
 
 
 @dataclass(frozen=True)
@@ -37,7 +46,7 @@ class Assessment:
     """Lower end of its 90 % band [N]."""
     upper: Array
     unassessed: NDArray[np.uint8]
-    """Reason codes of `palpation_msgs/StiffnessMap`, shape (n,)."""
+    """Of `Reason`, shape (n,)."""
     background: float
     """Robust level of the unremarkable wall's apparent stiffness [N]."""
     findings: list[Area]
@@ -55,19 +64,19 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
     o = observe(samples, calibration)
     if o is None:
         return None
-    reasons = np.where(o.limited, StiffnessMap.YIELDED, StiffnessMap.ASSESSED)
+    reasons = np.where(o.limited, Reason.YIELDED, Reason.ASSESSED)
     telling = np.flatnonzero(~o.limited)
     if len(telling) < FEWEST:
         return None
     regression, candidates = detect(o.part(telling), calibration)
     wrong = contradicted(regression)
     if 0 < wrong.mean() < _MOST_CONTRADICTED:
-        reasons[telling[wrong]] = StiffnessMap.CONTRADICTED
+        reasons[telling[wrong]] = Reason.CONTRADICTED
         regression, candidates = detect(o.part(telling[~wrong]), calibration)
     apart, nearest = cKDTree(o.xy).query(grid.nodes[:, :2])
     unassessed = reasons[nearest]
-    unassessed[apart > reach] = StiffnessMap.NOT_REACHED
-    weighed = areas(regression, candidates, grid, unassessed == StiffnessMap.ASSESSED)
+    unassessed[apart > reach] = Reason.NOT_REACHED
+    weighed = areas(regression, candidates, grid, unassessed == Reason.ASSESSED)
     threshold = calibration.threshold(false_findings)
     findings = [area for area in weighed if area.logit >= threshold]
     return _assessment(regression, grid, unassessed.astype(np.uint8), findings, weighed[len(findings) :])
@@ -80,7 +89,7 @@ def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> Asse
     if o is None:
         return None
     apart, _ = cKDTree(o.xy).query(grid.nodes[:, :2])
-    unassessed = np.where(apart <= reach, StiffnessMap.ASSESSED, StiffnessMap.NOT_REACHED).astype(np.uint8)
+    unassessed = np.where(apart <= reach, Reason.ASSESSED, Reason.NOT_REACHED).astype(np.uint8)
     return _assessment(Regression(o, calibration, (), usual_amplitudes(o)), grid, unassessed, [], [])
 
 
@@ -89,7 +98,7 @@ def _assessment(
 ) -> Assessment:
     mean, sd = regression.field(grid.nodes[:, :2])
     remarkable = np.any([area.nodes for area in findings], axis=0) if findings else np.zeros(len(mean), dtype=bool)
-    rest = (unassessed == StiffnessMap.ASSESSED) & ~remarkable
+    rest = (unassessed == Reason.ASSESSED) & ~remarkable
     return Assessment(
         grid=grid,
         apparent=np.exp(mean),

@@ -10,9 +10,10 @@ from bench_assessment_scans import FakeInbox, Scan, examine, scan, truth_of
 
 from palpate.report.evidence import found_of, map_of
 from palpate.report.scoring import Truth, score
+from palpate_assessment.assess import Reason
 from palpate_assessment.service import AssessmentService, create
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import ExamState, StiffnessMap
 from palpate_bus.messages.codec import encode
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_models.load import exam_input
@@ -157,3 +158,7 @@ def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
     wrong.header = type(small.surface.header)(small.surface.header.stamp, "camera")
     with pytest.raises(ValueError, match="perception/surface"):
         service.step(0, FakeInbox({"perception/surface": [wrong]}))
+
+
+def test_reasons_have_the_numbers_of_the_message() -> None:
+    assert all(getattr(StiffnessMap, reason.name) == reason for reason in Reason)

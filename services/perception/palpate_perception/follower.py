@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
-from palpate_bus.contract import contract
-from palpate_bus.messages import SurfaceMotion, Vector3
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, header, nanoseconds
-from palpate_bus.service import Inbox
 from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Robot
-from palpate_perception import frames
 from palpate_perception.arm import ArmMask
 from palpate_perception.fusion import Image
 from palpate_perception.tracker import NOTHING, Followed, Tracker
 from palpate_perception.views import Intrinsics
 from palpate_perception.wall import UnseenWallError, Wall
 from palpate_perception.watch import Watch
-
-FRAME: Final = contract().topics["perception/motion"].frame or ""
 
 
 class Follower:
@@ -32,31 +22,23 @@ class Follower:
         self._arm = ArmMask(robot)
         self._watch: Watch | None = None
         self._watching = False
-        self._asked = 0
+        self._asked_s = 0.0
         self._tracker: Tracker | None = None
         self.counts = dict.fromkeys(("quiet", "spoiled", "moved", "lost"), 0)
         """How many images said so."""
 
-    def begin(self, asked: int) -> None:
-        """A look begins with the images from the time `asked` [ns] on."""
-        self._watch, self._watching, self._asked = None, True, asked
+    def begin(self, asked_s: float) -> None:
+        """A look begins with the images from the time `asked_s` [s] on."""
+        self._watch, self._watching, self._asked_s = None, True, asked_s
 
-    def take(self, inbox: Inbox) -> list[Message]:
-        """What each new image tells."""
-        told = []
-        for image in inbox.new("camera/follow/depth"):
-            stamp = nanoseconds(image.header.stamp)
-            status = inbox.latest("robot/status")
-            q = None if status is None else np.asarray(status.position, np.float64)
-            depth = frames.depth_in_metres("camera/follow/depth", image)
-            camera = frames.intrinsics(inbox, "camera/follow/camera_info", image)
-            followed = NOTHING
-            if camera is not None and camera.shape == depth.shape:
-                self._look(stamp, depth, camera, q)
-                followed = self._follow(stamp, depth, q)
-            self.counts[followed.state.name.lower()] += 1
-            told.append(motion(stamp, followed))
-        return told
+    def take(self, t_s: float, depth: Image, camera: Intrinsics | None, q: Array | None) -> Followed:
+        """What a small image tells that was exposed at `t_s` [s]: depth [m], its camera, and the arm's joints [rad] if known."""
+        followed = NOTHING
+        if camera is not None and camera.shape == depth.shape:
+            self._look(t_s, depth, camera, q)
+            followed = self._follow(t_s, depth, q)
+        self.counts[followed.state.name.lower()] += 1
+        return followed
 
     @property
     def watched(self) -> bool:
@@ -80,12 +62,12 @@ class Follower:
         self._tracker = Tracker(wall, times, d, corners)
         return wall, times, d
 
-    def _look(self, stamp: int, depth: Image, camera: Intrinsics, q: Array | None) -> None:
-        if self._watching and stamp >= self._asked:
+    def _look(self, t_s: float, depth: Image, camera: Intrinsics, q: Array | None) -> None:
+        if self._watching and t_s >= self._asked_s:
             self._watch = self._watch or Watch(camera, self._X_WA, self._exam)
-            self._watch.add(stamp / NS, depth, self._arm, q)
+            self._watch.add(t_s, depth, self._arm, q)
 
-    def _follow(self, stamp: int, depth: Image, q: Array | None) -> Followed:
+    def _follow(self, t_s: float, depth: Image, q: Array | None) -> Followed:
         if self._tracker is None:
             return NOTHING
         wall = self._tracker.wall
@@ -94,12 +76,4 @@ class Follower:
         hidden = np.zeros(len(wall.pixel), np.bool_)
         if q is not None:
             hidden = self._arm.hides(q, wall.camera.X_WC[:3, 3], wall.r_W, wall.depth)
-        return self._tracker.follow(stamp / NS, depth.ravel()[wall.pixel].astype(np.float64), hidden)
-
-
-def motion(stamp: int, followed: Followed) -> Message:
-    """`palpation_msgs/SurfaceMotion` of an image exposed at the time `stamp` [ns]."""
-    shift = Vector3(*map(float, followed.shift))
-    return SurfaceMotion(
-        header(stamp, FRAME), int(followed.state), followed.displacement, followed.forecast, followed.sigma, shift
-    )
+        return self._tracker.follow(t_s, depth.ravel()[wall.pixel].astype(np.float64), hidden)

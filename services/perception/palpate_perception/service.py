@@ -15,11 +15,11 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
-from palpate_perception import frames
+from palpate_perception import messages
 from palpate_perception.cloud import Cloud
 from palpate_perception.follower import Follower
-from palpate_perception.frames import FRAME
 from palpate_perception.fusion import DepthFusion
+from palpate_perception.messages import FRAME
 from palpate_perception.pipeline import Perceived, PerceivedMesh, Pipeline, Targets
 from palpate_perception.views import Intrinsics
 from palpate_perception.wall import Mode
@@ -49,11 +49,19 @@ class PerceptionService(Service):
         for trigger in inbox.new("planning/camera_trigger"):
             asked = nanoseconds(trigger.header.stamp)
             self._burst = _Burst(asked, int(trigger.frames), t + int(trigger.frames) * self._period + PATIENCE_NS)
-            self._follower.begin(asked)
+            self._follower.begin(asked / NS)
             self._bursts += 1
-        told = self._follower.take(inbox)
+        told = [self._follow(image, inbox) for image in inbox.new("camera/follow/depth")]
         outbox: dict[str, Message | list[Message]] = {"perception/motion": told} if told else {}
         return outbox | self._answer(t, inbox)
+
+    def _follow(self, image: Message, inbox: Inbox) -> Message:
+        """What a small image tells."""
+        stamp, status = nanoseconds(image.header.stamp), inbox.latest("robot/status")
+        depth = messages.depth_in_metres("camera/follow/depth", image)
+        camera = messages.intrinsics(inbox, "camera/follow/camera_info", image)
+        q = None if status is None else np.asarray(status.position, np.float64)
+        return messages.motion(stamp, self._follower.take(stamp / NS, depth, camera, q))
 
     def _answer(self, t: int, inbox: Inbox) -> dict[str, Message | list[Message]]:
         """What the look that is under way shows; nothing until it is over."""
@@ -106,7 +114,7 @@ class PerceptionService(Service):
         if not burst.waiting:
             return
         if burst.camera is None:
-            burst.camera = frames.intrinsics(inbox, "camera/depth/camera_info", burst.waiting[0])
+            burst.camera = messages.intrinsics(inbox, "camera/depth/camera_info", burst.waiting[0])
             if burst.camera is None:
                 return
             burst.fusion = self._pipeline.fusion(burst.camera)
@@ -114,7 +122,7 @@ class PerceptionService(Service):
             for image in burst.waiting[: burst.wanted - burst.fusion.frames]:
                 burst.wrong = burst.wrong or _disagreement(image, burst.camera)
                 if not burst.wrong:
-                    burst.fusion.add(frames.depth_in_metres(IMAGE, image))
+                    burst.fusion.add(messages.depth_in_metres(IMAGE, image))
                     burst.stamps_s.append(nanoseconds(image.header.stamp) / NS)
             burst.waiting.clear()
 

@@ -11,18 +11,18 @@ First d alone, robustly, for the breath filter; then what is left, over some ima
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, auto
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages import SurfaceMotion
 from palpate_models.frames import Array
 from palpate_perception.breath_filter import BreathFilter
 from palpate_perception.wall import Wall
 
-FORECAST_S: Final[Array] = 1e-3 * SurfaceMotion.FORECAST_STEP_MS * np.arange(SurfaceMotion.FORECASTS, dtype=np.float64)
+FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
+"""How long after an exposure the displacement is forecast for [s]."""
 SHARED_M: Final = 1.5e-4
 """What an image's displacement errs by besides its pixels' own noise: errors that neighbours and successive images share."""
 REACH_M: Final = 0.06
@@ -54,13 +54,13 @@ MOVED_IMAGES: Final = 3
 """... if so many images in a row say so."""
 
 
-class State(IntEnum):
-    """See SurfaceMotion.msg."""
+class State(Enum):
+    """What the wall does; SurfaceMotion.msg explains the names."""
 
-    QUIET = SurfaceMotion.QUIET
-    SPOILED = SurfaceMotion.SPOILED
-    MOVED = SurfaceMotion.MOVED
-    LOST = SurfaceMotion.LOST
+    QUIET = auto()
+    SPOILED = auto()
+    MOVED = auto()
+    LOST = auto()
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,9 @@ from palpate_models.load import exam_input, load_scenario, plant_input, true_pos
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Scenario
 from palpate_perception import cloud, pattern
-from palpate_perception.frames import depth_in_metres
+from palpate_perception.messages import depth_in_metres
 from palpate_perception.service import PerceptionService, create
+from palpate_perception.tracker import FORECAST_S
 
 TICK = 100 * MS
 
@@ -367,3 +368,7 @@ def test_a_strange_image_is_refused_by_name() -> None:
         depth_in_metres("camera", image("rgb8", np.zeros(18, np.uint8), 3, 9))
     with pytest.raises(ValueError, match="18 bytes for 2 rows of 16, 3 pixels each"):
         depth_in_metres("camera", image("32FC1", np.zeros(18, np.uint8), 3, 16))
+
+
+def test_forecasts_are_at_the_times_that_the_message_says() -> None:
+    assert np.allclose(FORECAST_S, 1e-3 * SurfaceMotion.FORECAST_STEP_MS * np.arange(SurfaceMotion.FORECASTS))

@@ -7,9 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_bus.messages import SurfaceMotion
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import nanoseconds
 from palpate_models.frames import Array
 from palpate_planning.periods import MS, SECOND
 
@@ -36,14 +33,6 @@ class Motion(NamedTuple):
     """Whether the wall does what the forecast expects: neither cough nor deep breath, and it is seen."""
     moved: bool = False
     """Whether the patient lies elsewhere than when the surface was perceived."""
-
-
-def motion_of(message: Message) -> Motion:
-    """The motion in a `palpation_msgs/SurfaceMotion`. While the wall is hidden the forecast goes on, as long as it is good."""
-    hidden = message.state == SurfaceMotion.LOST and message.uncertainty < HIDDEN_M
-    calm = message.state == SurfaceMotion.QUIET or hidden
-    moved = bool(message.state == SurfaceMotion.MOVED)
-    return Motion(nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved)
 
 
 class Breath:

@@ -1,14 +1,15 @@
-"""Messages of the examination's status and path from arrays."""
+"""Messages of the examination's status and path from arrays, and the wall's motion from its message."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch, Vector3
+from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.frames import Array
+from palpate_planning.breath import HIDDEN_M, Motion
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.status import ExamStatus
 from palpate_planning.wall import TouchedSkin
@@ -55,3 +56,11 @@ def touch_message(t: int, touched: TouchedSkin) -> Message:
 def path_message(t: int, poses_WI: Array) -> Message:
     """`nav_msgs/Path` of indenter poses, shape (n, 4, 4)."""
     return Path(header(t, "world"), [PoseStamped(header(t, "world"), pose_message(X[:3, :3], X[:3, 3])) for X in poses_WI])
+
+
+def motion_of(message: Message) -> Motion:
+    """The motion in a `palpation_msgs/SurfaceMotion`. While the wall is hidden the forecast goes on, as long as it is good."""
+    hidden = message.state == SurfaceMotion.LOST and message.uncertainty < HIDDEN_M
+    calm = message.state == SurfaceMotion.QUIET or hidden
+    moved = bool(message.state == SurfaceMotion.MOVED)
+    return Motion(nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved)

@@ -19,11 +19,11 @@ from palpate_bus.settings import Settings
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Following, Scenario
 from palpate_planning.background import WORKER
-from palpate_planning.breath import Motion, motion_of
+from palpate_planning.breath import Motion
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
-from palpate_planning.messages import path_message, state_message, touch_message
+from palpate_planning.messages import motion_of, path_message, state_message, touch_message
 from palpate_planning.periods import Periods
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 from palpate_planning.surface import PerceivedSurface

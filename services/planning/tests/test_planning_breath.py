@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from planning_fakes import World, known
 
+from palpate_bus.messages import SurfaceMotion
 from palpate_models.scenario import Following
-from palpate_planning.breath import JOIN_S, Breath, Motion
+from palpate_planning.breath import FORECAST_STEP, JOIN_S, Breath, Motion
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.status import Phase
 from palpate_planning.wall_watch import CALM_S, LOST_MAX, LOST_S, WallWatch
@@ -129,3 +130,7 @@ def test_a_patient_who_moves_is_left_within_a_second() -> None:
     assert status.patient_moved
     assert 0 < status.targets_skipped < status.target_count
     assert "moved" in next(iter(world.exam.skipped.values()))
+
+
+def test_the_forecast_is_read_at_the_times_that_the_message_says() -> None:
+    assert FORECAST_STEP == SurfaceMotion.FORECAST_STEP_MS * MS

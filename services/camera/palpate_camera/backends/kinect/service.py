@@ -13,12 +13,12 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import transform_matrix, transform_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_camera import pictures
+from palpate_camera import messages
 from palpate_camera.backends.kinect import surroundings
 from palpate_camera.backends.kinect.bias import DepthBias
 from palpate_camera.backends.kinect.noise import KinectNoise
 from palpate_camera.backends.kinect.scene import Caster, Image, Mesh, Scene
-from palpate_camera.pictures import FRAME
+from palpate_camera.messages import FRAME
 from palpate_camera.pinhole import Pinhole
 from palpate_models.errors import draw_errors
 from palpate_models.frames import Array, look_at
@@ -41,7 +41,7 @@ class CameraService(Service):
         self._X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
         stream = np.random.SeedSequence([known.seed, crc32(b"camera")])
         noise, wander, small = (np.random.Generator(np.random.PCG64(s)) for s in (stream, *stream.spawn(2)))
-        scale, apart = drawn.camera.given.noise_scale, pictures.apart(camera.width_px)
+        scale, apart = drawn.camera.given.noise_scale, messages.apart(camera.width_px)
         self._bias = DepthBias(self._pinhole, drawn.camera, wander)
         X_WCt, furniture = self._X_WC @ drawn.X_CCt, surroundings.furniture(known.robot)
         self._whole, self._small = (
@@ -70,11 +70,11 @@ class CameraService(Service):
         skin, poses = surface_mesh(surface), inbox.latest("sim/link_poses")
         robot = None if poses is None else surroundings.placed(self._links, link_poses(poses))
         on_s = (t - self._on) / NS
-        outbox = pictures.small(t, self._small.take(on_s, skin, robot, self._bias), self._small.pinhole)
+        outbox = messages.small(t, self._small.take(on_s, skin, robot, self._bias), self._small.pinhole)
         if self._wanted:
             self._wanted -= 1
             self._taken += 1
-            outbox |= pictures.whole(t, self._whole.take(on_s, skin, robot, self._bias), self._pinhole)
+            outbox |= messages.whole(t, self._whole.take(on_s, skin, robot, self._bias), self._pinhole)
         return outbox
 
     def finish(self) -> Mapping[str, Any]:

@@ -19,8 +19,8 @@ from palpate_bus.messages.codec import Message, decode
 from palpate_bus.messages.stamps import time_message
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_camera import pictures
-from palpate_camera.pictures import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
+from palpate_camera import messages
+from palpate_camera.messages import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_models.scenario import Scenario
 
 POSE = "tf_static"
@@ -78,7 +78,7 @@ class ReplayedCamera(Service):
             return self._pair(t, self._small, self._ticks, (SMALL_IMAGE, SMALL_INFO))
         image, info = self._pair(t, self._frames, self._ticks, (IMAGE, INFO)).values()
         depth = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)[:, : 4 * image.width].copy().view("<f4")
-        return pictures.every_few(t, depth, pictures.pinhole_of(info))
+        return messages.every_few(t, depth, messages.pinhole_of(info))
 
     def _pair(self, t: int, pairs: list[_Pair], index: int, topics: tuple[str, str]) -> dict[str, Message]:
         image, info = (self._message(part) for part in pairs[index % len(pairs)])

@@ -16,9 +16,9 @@ from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_camera import pictures
+from palpate_camera import messages
 from palpate_camera.backends.ros.convert import CameraError, Depth, chain, depth_metres
-from palpate_camera.pictures import FRAME
+from palpate_camera.messages import FRAME
 from palpate_camera.pinhole import Pinhole
 from palpate_models.frames import Array
 from palpate_models.scenario import RosCamera, Scenario
@@ -109,11 +109,11 @@ class RosCameraService(Service):
             self._facts["frames_rejected"] += 1
             self._problem = str(error)
             return {}
-        outbox = pictures.every_few(t, depth, pinhole)
+        outbox = messages.every_few(t, depth, pinhole)
         if self._wanted and not triggers:
             self._wanted -= 1
             self._facts["frames"] += 1
-            outbox |= pictures.whole(t, depth, pinhole)
+            outbox |= messages.whole(t, depth, pinhole)
         return outbox
 
     def finish(self) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""Camera messages as arrays."""
+"""Camera messages as arrays, and the wall's motion as a message."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ from typing import Final
 import numpy as np
 
 from palpate_bus.contract import contract
+from palpate_bus.messages import SurfaceMotion, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import transform_matrix
+from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox
 from palpate_models.frames import Array
 from palpate_perception.fusion import Image
+from palpate_perception.tracker import Followed
 from palpate_perception.views import Intrinsics
 
 FRAME: Final = contract().topics["perception/targets"].frame or ""
 """Frame of the surface and the targets."""
+MOTION_FRAME: Final = contract().topics["perception/motion"].frame or ""
 
 
 def intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
@@ -52,3 +56,9 @@ def camera_pose(message: Message, frame: str) -> Array | None:
         if item.child_frame_id == frame and item.header.frame_id == FRAME:
             return transform_matrix(item.transform)
     return None
+
+
+def motion(stamp: int, followed: Followed) -> Message:
+    """`palpation_msgs/SurfaceMotion` of an image exposed at the time `stamp` [ns]."""
+    state, shift = getattr(SurfaceMotion, followed.state.name), Vector3(*map(float, followed.shift))
+    return SurfaceMotion(header(stamp, MOTION_FRAME), state, followed.displacement, followed.forecast, followed.sigma, shift)
