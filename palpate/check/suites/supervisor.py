@@ -105,7 +105,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     _released(rig, arm, report, "and is released after it")
     heard = _press(rig, arm, limits.force_working_n)
     report.expect("a steady force below the limits is not stopped", _level(heard) == SupervisorState.LEVEL_OK, "0", _words(heard))
-    rig.send(SURFACE, arm.surface(rig.t, limits.depth_m + 0.015))
+    rig.send(SURFACE, arm.surface(rig.t, limits.depth_m + 0.035))
     _stops(rig, arm, report, "too deep, pressed", STOPPED, SupervisorState.CAUSE_DEPTH, SOFT_MS)
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
     _released(rig, arm, report, "and is released above the surface")
