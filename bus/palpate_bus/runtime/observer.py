@@ -26,6 +26,8 @@ IDLE_S = 0.005
 RING = 64
 """Messages of a periodic topic kept for an observer that sees the latest: enough for one of its periods at 1 kHz."""
 FIFO = 1 << 17
+OBSERVERS_STAY_S = 8.0
+"""For how long an observer stays at most without a conductor: longer than all whom it observes, see `wallclock`."""
 
 
 class _Feed:
@@ -122,12 +124,26 @@ class ObservedService:
         }
 
 
+class Producers:
+    """The services that an observer observes: without a conductor it stays as long as one of them, and no longer."""
+
+    def __init__(self, member: Member) -> None:
+        self._member = member
+        self._roles = frozenset(role.name for role in member.rules.roles.values() if not role.observer)
+
+    def leave_with_them(self, lost: str) -> None:
+        """Raises RunAborted when the conductor is lost, as `lost` says, and all of them have left."""
+        if lost and not self._member.alive(self._roles):
+            raise RunAborted(lost)
+
+
 class ObserverNode:
     """One observing service in a process of its own."""
 
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
-        self._link = ConductorLink(member)
+        self._link = ConductorLink(member, OBSERVERS_STAY_S)
+        self._producers = Producers(member)
         self._reports = Reports(member)
         self._observed = ObservedService(service, member)
 
@@ -139,6 +155,7 @@ class ObserverNode:
                 busy = observed.drain_and_step()
                 message = self._link.poll()
                 if message is None:
+                    self._producers.leave_with_them(self._link.lost)
                     if not busy:
                         sleep(IDLE_S)
                     self._reports.progress(observed.now)
