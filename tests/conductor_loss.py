@@ -35,6 +35,7 @@ from palpate_conductor.result import RunProgress
 from palpate_conductor.timing import Timing
 from palpate_models.load import load_scenario
 
+Blow = Callable[[psutil.Process], None]
 AT_DEPTH = "the indenter slides at depth"
 ATTEMPTS = 5
 LEAVES_WITHIN_S = 30.0
@@ -69,7 +70,7 @@ class Struck:
         return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
 
 
-def strike_conductor(folder: Path, runtime: str, blow: Callable[[psutil.Process], None]) -> Struck:
+def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
     """Runs a short examination and lets `blow` do the damage to its conductor while the indenter slides at depth.
 
     On a busy machine a wall-clock run may be stopped on its way there; it is then begun anew.
@@ -81,7 +82,7 @@ def strike_conductor(folder: Path, runtime: str, blow: Callable[[psutil.Process]
     raise AssertionError(f"never at depth in {ATTEMPTS} attempts: see {folder}")
 
 
-def _run(folder: Path, runtime: str, blow: Callable[[psutil.Process], None]) -> Struck | None:
+def _run(folder: Path, runtime: str, blow: Blow) -> Struck | None:
     words = [sys.executable, __file__, str(folder), runtime]
     run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env={**os.environ, **FIXED})
     assert run.stdout is not None

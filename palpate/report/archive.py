@@ -162,7 +162,9 @@ def read_evidence(folder: Path) -> Evidence:
         with np.load(path, allow_pickle=False) as stored:
             held = {name: stored[name] for name in stored.files}
     except FileNotFoundError as error:
-        raise EvidenceError(f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover") from error
+        raise EvidenceError(
+            f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
+        ) from error
     except (OSError, ValueError, BadZipFile) as error:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
     try:

@@ -1,7 +1,7 @@
 """Results of a run that lost its conductor, from what its recorder wrote.
 
-The recording is played to the conductor's own collector. Where the run ended before the findings were made, the assessment that the
-scenario names is given the recorded examination once more, and told that it is over: so the findings are those of what was scanned.
+The recording is played to the conductor's own collector. Where the run ended before the findings were made, the assessment that
+the scenario names is given the recorded examination once more, and told that it is over: the findings are of what was scanned.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The conversation with the conductor: control messages and its heartbeat in, reports out.
 
-A conductor that is gone, or whose heart has not been heard for the deadline of the contract, is lost. By the wall clock the services
-then go on for a grace, in which planning lifts the arm; in lockstep no time passes without grants, and they leave at once.
+A conductor that is gone, or whose heart has not been heard for the deadline of the contract, is lost. By the wall clock the
+services then go on for a grace, in which planning lifts the arm; in lockstep no time passes without grants: they leave at once.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CONDUCTOR_AWAITED_S = 120.0
 LOCKSTEP_SILENT_S = 3.0
 """The same in lockstep, where nothing moves while nobody grants time."""
 LONGEST_LOOK_S = 0.1
-"""A node that has not looked for longer counts this much silence: it was itself kept from a core, and so perhaps was everybody."""
+"""A node that has not looked for longer counts this much silence: it was itself kept from a core, and perhaps all were."""
 GONE_S = 0.01
 """How often it is looked whether the conductor's token is still there, and for how long it must be missing: what the conductor
 said last is under way meanwhile."""
@@ -69,7 +69,7 @@ class ConductorLink:
         """Why the conductor counts as lost; empty while it lives."""
 
     def poll(self, timeout: float | None = None) -> Any | None:
-        """The next control message, or None. Raises RunAborted when told so, or when the conductor has been lost for the grace."""
+        """The next control message, or None. Raises RunAborted when told so, or when the conductor was lost for the grace."""
         while (sample := self._control.get(timeout)) is not None:
             try:
                 message = self._decode(sample.payload)

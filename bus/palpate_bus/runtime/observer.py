@@ -16,6 +16,7 @@ from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Received, Stepper
 from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.service import Service
 from palpate_bus.wire.rmw import WireError, unpack
 from palpate_bus.wire.transport import HELLO, decoded
@@ -180,4 +181,4 @@ class ObserverNode:
         for publisher in self._observed.publishers.values():
             publisher.hello()
         self._observed.drain_and_step()
-        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": []})
+        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": [], **whereabouts()})

@@ -6,7 +6,7 @@ import os
 from functools import cache
 from pathlib import Path
 from time import monotonic
-from typing import Final
+from typing import Final, NamedTuple
 
 import psutil
 
@@ -20,7 +20,7 @@ def home() -> str:
     """The boot of this machine and the space in which its process ids count: who has the same can look at our process."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+        return f"{boot} {Path('/proc/self/ns/pid').readlink()}"
     except OSError:
         return ""
 
@@ -28,9 +28,30 @@ def home() -> str:
 def runs(pid: int) -> bool:
     """Whether a process is there and not held: what it does not do then, it has had no core for."""
     try:
-        return psutil.Process(pid).status() not in HELD | OVER
+        status: str = psutil.Process(pid).status()
+        return status not in HELD | OVER
     except psutil.Error:
         return False
+
+
+def whereabouts() -> dict[str, object]:
+    """Where our process is, for others that may look at it."""
+    return {"pid": os.getpid(), "home": home()}
+
+
+class Standstill(NamedTuple):
+    """How a process was found."""
+
+    pid: int
+    status: str
+    """As psutil names it; empty when it could not be looked at."""
+    seconds: float
+    """For how long it has used no processor time and has not waited for a core; 0 when it goes on."""
+
+    @property
+    def held(self) -> bool:
+        """Whether a signal has stopped it. One that a debugger holds counts as going on."""
+        return self.status == str(psutil.STATUS_STOPPED)
 
 
 class Activity:
@@ -42,21 +63,18 @@ class Activity:
         self._used = self._usage()
         self._went_on = monotonic()
 
-    def frozen(self, seconds: float) -> str:
-        """How the process stands still, if it has for `seconds` [s]; empty when it goes on, is over, or a debugger holds it.
-
-        Look often: what it does between two looks counts as done at the second.
-        """
+    def look(self) -> Standstill:
+        """How it is. Look often: what it does between two looks counts as done at the second."""
+        status = ""
         try:
             used, status = self._usage(), self._process.status()
-            if used != self._used or status in OVER or status == psutil.STATUS_TRACING_STOP or self._wants_core():
-                self._used, self._went_on = used, monotonic()
+            goes_on = used != self._used or status in OVER or status == psutil.STATUS_TRACING_STOP or self._wants_core()
+            self._used = used
         except psutil.Error:
-            return ""
-        still = monotonic() - self._went_on
-        if still < seconds:
-            return ""
-        return f"frozen: its process {self._process.pid} is {status} and has used no processor time for {still:.1f} s"
+            goes_on = True
+        if goes_on:
+            self._went_on = monotonic()
+        return Standstill(self._process.pid, status, monotonic() - self._went_on if not goes_on else 0.0)
 
     def _usage(self) -> tuple[float, ...]:
         """Processor time of all threads [s], and how often the first was put on a core."""

@@ -16,6 +16,7 @@ from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborte
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import OBSERVERS_STAY_S, Producers
+from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_bus.service import Service
 
@@ -78,7 +79,7 @@ class RecorderNode:
                 elif message.command == RunControl.HELLO:
                     self._drain()
                     missing = [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.heard]
-                    self._reports.say(ServiceReport.READY, NEVER, detail={"missing": missing})
+                    self._reports.say(ServiceReport.READY, NEVER, detail={"missing": missing, **whereabouts()})
                 elif message.command == RunControl.LOST:
                     self._lost.add(message.role)
                 elif message.command == RunControl.HANDOVER and message.role in self._chunks:

@@ -22,6 +22,7 @@ from palpate_bus.runtime.lockstep import NEVER, Received, Sent, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.priority import by_period, give_way
+from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
@@ -90,7 +91,7 @@ class WallClockNode(Node):
                 missing = [
                     name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
                 ]
-                self._seat.reports.say(ServiceReport.READY, NEVER, detail={"missing": missing})
+                self._seat.reports.say(ServiceReport.READY, NEVER, detail={"missing": missing, **whereabouts()})
             elif message.command == RunControl.GRANT and message.last:
                 raise RunAborted("the run is already ending")
             elif message.command == RunControl.GRANT:

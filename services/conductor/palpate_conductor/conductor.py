@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from time import monotonic, perf_counter, sleep
 from typing import Any
 
@@ -19,6 +19,7 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservedService
 from palpate_conductor.collector import Collector
 from palpate_conductor.contract_watch import ContractWatch
+from palpate_conductor.freezes import FreezeWatch
 from palpate_conductor.grants import Grants
 from palpate_conductor.handover import Places
 from palpate_conductor.heartbeat import Heartbeat
@@ -73,6 +74,7 @@ class Conductor:
         """By role, who shares its process, itself included."""
         self._sequence = 0
         self._heartbeat = Heartbeat(member, rules)
+        self._freezes = FreezeWatch(self._patience)
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = RunOutcome()
         self._contract = ContractWatch(session, rules, domain, timing.wallclock)
@@ -179,6 +181,7 @@ class Conductor:
                     raise RunFailed(f"{role} failed at start: {detail.get('error')}")
                 if message.state != ServiceReport.READY:
                     continue
+                self._freezes.meet(role, detail)
                 self._beside[role] = tuple(detail.get("process", (role,)))
                 ready[role] = [name for name in detail.get("missing", []) if not self._absent(name)]
             if dead := died():
@@ -226,6 +229,7 @@ class Conductor:
             for role, how in self._missing(died).items():
                 if role in self._roles and role not in finished:
                     self._miss(role, how)
+            self._lose_frozen(finished)
             for role, how in self._places.expired().items():
                 self._lose(role, f"{how}; nobody took its place within {self._places.patience_s:.0f} s")
             for complaint in self._member.complaints():
@@ -256,6 +260,15 @@ class Conductor:
             log.warning("no tick for %.0f s: %s", stalled, self.watchdog.culprit(judged)[1])
         self._complained = stalled > self._patience.soft
 
+    def _lose_frozen(self, finished: Container[str]) -> None:
+        """A frozen service is lost as a dead one is. In lockstep nobody can do without it, so nothing is left to react."""
+        for role, how in self._freezes.frozen().items():
+            if role in finished or role in self.outcome.lost:
+                continue
+            self._miss(role, how)
+            if not self._wallclock and not self._rules.roles[role].observer:
+                raise RunFailed(self.outcome.failure or how)
+
     def _missing(self, died: Callable[[], Mapping[str, str]]) -> dict[str, str]:
         """Roles that are not there, with how they went."""
         ended = {role: how for role, how in died().items() if role not in self._places.taken}
@@ -282,7 +295,7 @@ class Conductor:
             self._missed(role, self.watchdog.progress[role].tick, self.outcome.failure or "gone")
 
     def _missed(self, role: str, tick: int, words: str) -> None:
-        """A service has not heard this conductor for the deadline: the examination ends, whatever becomes of the conductor now."""
+        """A service has not heard this conductor for the deadline: the examination ends, whatever becomes of it now."""
         if CONDUCTOR in self.outcome.lost:
             return
         self.outcome.lost[CONDUCTOR] = max(tick, 0)

@@ -1,4 +1,4 @@
-"""The conductor's heartbeat: what tells the services that somebody still watches over the run and would pass on an operator's stop.
+"""The conductor's heartbeat: it tells the services that somebody still watches over the run and would pass on an operator's stop.
 
 A thread of its own sends it, so that no figure that is drawn and no message that is decoded keeps it back. It beats only as long
 as the conductor's own loop turns: a conductor that hangs is no better than none.
