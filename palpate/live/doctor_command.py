@@ -27,7 +27,7 @@ def doctor(
     as_json: AsJson = False,
     seconds: Annotated[float, typer.Option(help="How long to listen.")] = 3.0,
     watch: Annotated[bool, typer.Option("--watch", help="Go on, and print every violation as it comes, until Ctrl-C.")] = False,
-    clean: Annotated[bool, typer.Option("--clean", help="Remove what killed runs left on this machine, and nothing else.")] = False,
+    clean: Annotated[bool, typer.Option("--clean", help="Only remove what killed runs left on this machine.")] = False,
 ) -> None:
     """Examine a live bus: versions, endpoints, shared memory, clocks, who is missing, and every topic against the contract.
 
