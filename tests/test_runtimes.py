@@ -138,9 +138,17 @@ def test_a_frozen_service_ends_the_run_and_is_blamed() -> None:
         if at(running, 0.3, done):
             running.processes["tissue"].send_signal(signal.SIGSTOP)
 
-    outcome = run_toys(freeze, {"TOY_END_S": "30"}, Patience(soft=0.5, hard=2.0))
+    outcome = run_toys(freeze, {"TOY_END_S": "30"}, Patience(soft=0.5, hard=60.0, frozen=1.0))
     assert outcome.failure is not None
-    assert outcome.failure.startswith("tissue blocks the run")
+    assert outcome.failure.startswith("tissue lost at tick")
+    assert "is stopped and has used no processor time" in outcome.failure
+    assert outcome.lost.keys() == {"tissue"}
+
+
+def test_a_service_that_computes_for_long_is_slow_and_not_frozen() -> None:
+    outcome = run_toys(environment={"TOY_CONTROL_COMPUTES_AT": "200"}, patience=Patience(frozen=0.2, asleep=0.5))
+    assert outcome.failure is None
+    assert not outcome.lost
 
 
 def test_garbage_and_strangers_are_counted_and_change_nothing() -> None:

@@ -97,6 +97,10 @@ class Control(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         if os.environ.get("TOY_CONTROL_FAILS_AT") == str(t // MS):
             raise ArithmeticError("toy failure")
+        if os.environ.get("TOY_CONTROL_COMPUTES_AT") == str(t // MS):
+            end = time.monotonic() + 2.0
+            while time.monotonic() < end:
+                pass
         joints, setpoint = inbox.latest("joint_states"), inbox.latest("planning/setpoint")
         torque = np.sin(1.1 * joints.position + 1e-9 * t + (setpoint.joint_position if setpoint else 0.0))
         return {"control/joint_torque": JointTorqueCommand(header(t), torque, duration_message(50 * MS), "")}

@@ -14,6 +14,8 @@ from palpate.live.doctor import POLL_S, Diagnosis, Severity, examine
 from palpate_bus.contract import contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.live import LiveMonitor
+from palpate_bus.runs.announcement import live
+from palpate_bus.runs.run_folder import remove_leftovers
 
 _COLOURS = {Severity.OK: "green", Severity.WARN: "yellow", Severity.BAD: "bold red"}
 
@@ -25,11 +27,17 @@ def doctor(
     as_json: AsJson = False,
     seconds: Annotated[float, typer.Option(help="How long to listen.")] = 3.0,
     watch: Annotated[bool, typer.Option("--watch", help="Go on, and print every violation as it comes, until Ctrl-C.")] = False,
+    clean: Annotated[bool, typer.Option("--clean", help="Only remove what killed runs left on this machine.")] = False,
 ) -> None:
     """Examine a live bus: versions, endpoints, shared memory, clocks, who is missing, and every topic against the contract.
 
     Leaves with status 0 when all is well, 1 when something is in trouble, 2 when there is no bus.
     """
+    if clean:
+        left = remove_leftovers()
+        live()
+        console().print("\n".join(f"removed {path}" for path in left) or "nothing left of killed runs", highlight=False)
+        return
     with command(), joined(connect, run, domain) as bus:
         rules = contract()
         if watch:

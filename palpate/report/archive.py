@@ -24,6 +24,8 @@ from palpate_conductor.collector import Collected
 from palpate_models.frames import Array
 
 FILE: Final = "evidence.npz"
+LOCK: Final = "run.lock"
+"""The file whose lock the run holds; it names the process. The kernel drops the lock when the process ends, however it ends."""
 _MESSAGES: Final = {
     "stiffness_map": "palpation_msgs/msg/StiffnessMap",
     "findings": "palpation_msgs/msg/Findings",
@@ -162,7 +164,9 @@ def read_evidence(folder: Path) -> Evidence:
         with np.load(path, allow_pickle=False) as stored:
             held = {name: stored[name] for name in stored.files}
     except FileNotFoundError as error:
-        raise EvidenceError(f"{path} is not there: give the results folder of a run") from error
+        raise EvidenceError(
+            f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
+        ) from error
     except (OSError, ValueError, BadZipFile) as error:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
     try:

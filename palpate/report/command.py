@@ -16,6 +16,8 @@ from rich.console import Console
 from palpate.command_line import refuse
 from palpate.report.archive import EvidenceError
 from palpate.report.page import write_page
+from palpate.report.recover import recovered
+from palpate.report.results import print_findings, write_results
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PRINT_TIMEOUT_S = 120
@@ -48,6 +50,9 @@ def write_pdf(page: Path) -> Path:
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of a run.")],
     pdf: Annotated[bool, typer.Option("--pdf", help="Also report.pdf, printed by a Chromium browser.")] = False,
+    recover: Annotated[
+        bool, typer.Option("--recover", help="Of a run that lost its conductor: results of what its recorder wrote.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
 ) -> None:
@@ -55,6 +60,9 @@ def report(
     console = Console(stderr=True)
     try:
         with nullcontext() if quiet or as_json else console.status("writing the report"):
+            if recover:
+                found = write_results(folder, *recovered(folder))
+                print_findings(Console(stderr=as_json), found)
             page = write_page(folder)
             paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
     except (EvidenceError, PrintError, OSError) as error:

@@ -43,7 +43,9 @@ def read_report(folder: Path) -> Report:
     try:
         return Report.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise EvidenceError(f"{path} is not there: give the results folder of a run") from error
+        raise EvidenceError(
+            f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
+        ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error
     except ValidationError as error:

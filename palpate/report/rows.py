@@ -77,7 +77,7 @@ class Report(_Row):
     clean_world: bool
     """Whether the patient was still and nothing was set wrong with registration: then figures are not those of the real world."""
     runtime: str
-    """distributed, composed or wallclock."""
+    """distributed, composed or wallclock; recovered where the results were made of a recording alone."""
     platform: dict[str, Any]
     """Operating system, processor, Python and library versions: equal run hashes are promised on one platform only."""
     sim_time_s: float

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from palpate.run.placement import Groups, PlacementError
 from palpate.run.secure import SecureBus
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Announcement, Run
+from palpate_bus.runs.run_folder import RunFolder, remove_leftovers
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import mesh
 from palpate_conductor.timing import Timing
@@ -157,7 +157,9 @@ class LocalProcesses:
         self._given = {"runtime": timing.runtime, "record": record}
         self._forks = forks
         self._out = out
-        self._folder = Path(tempfile.mkdtemp(prefix="palpate-"))
+        remove_leftovers()
+        self._own = RunFolder()
+        self._folder = self._own.path
         self._scenario_files = {
             role: file if view_of(role) == "scenario" else self._apart(file) for role, file in scenario_files.items()
         }
@@ -241,6 +243,7 @@ class LocalProcesses:
             env=environment,
             stdout=log,
             stderr=subprocess.STDOUT,
+            pass_fds=(self._own.lock,),
             process_group=0,  # Ctrl-C is the conductor's to hear: it ends the run, and the recorder closes its files
         )
 
@@ -265,4 +268,4 @@ class LocalProcesses:
         for log in self._logs:
             log.close()
         self._announcement.withdraw()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._own.remove()

@@ -158,8 +158,12 @@ def _fields(topic: Topic) -> list[tuple[str, str, str]]:
 
 
 def _internal(rules: Contract) -> str:
-    rows = [(f"`{row.name}`", f"`{row.type}`", row.producer, row.readers, row.doc) for row in rules.internal.values()]
-    return "## Messages of the runtime\n\n" + _table(("key", "type", "from", "to", "what for"), rows)
+    rows = []
+    for row in rules.internal.values():
+        every = "" if row.period_ms is None else f"{row.period_ms} ms"
+        deadline = "" if row.deadline_ms is None else f"{row.deadline_ms} ms"
+        rows.append((f"`{row.name}`", f"`{row.type}`", row.producer, row.readers, every, deadline, row.doc))
+    return "## Messages of the runtime\n\n" + _table(("key", "type", "from", "to", "every", "deadline", "what for"), rows)
 
 
 def main(arguments: Sequence[str]) -> int:

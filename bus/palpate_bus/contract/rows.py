@@ -105,18 +105,12 @@ class Topic(_Row):
     @property
     def max_age(self) -> int:
         """Age [ns] from which the newest message is stale. Raises ValueError if the contract gives none."""
-        return self._given("max_age_ms") * MS
+        return _given(self, "max_age_ms") * MS
 
     @property
     def expiry(self) -> int:
         """Time [ns] after its stamp at which a message expires. Raises ValueError if the contract gives none."""
-        return self._given("expiry_ms") * MS
-
-    def _given(self, field: str) -> int:
-        value: int | None = getattr(self, field)
-        if value is None:
-            raise ValueError(f"contract.yaml: topic {self.name} has no {field}")
-        return value
+        return _given(self, "expiry_ms") * MS
 
     @property
     def periodic(self) -> bool:
@@ -129,6 +123,13 @@ class Topic(_Row):
         return codec.type_hash(self.type)
 
 
+def _given(row: Topic | Internal, field: str) -> int:
+    value: int | None = getattr(row, field)
+    if value is None:
+        raise ValueError(f"contract.yaml: {row.name} has no {field}")
+    return value
+
+
 class Internal(_Row):
     """A message of the runtime itself."""
 
@@ -136,7 +137,20 @@ class Internal(_Row):
     type: str
     producer: str
     readers: str
+    period_ms: int | None = None
+    deadline_ms: int | None = None
+    """Its sender is lost when none has come for so long, in wall-clock runs."""
     doc: str
+
+    @property
+    def period(self) -> int:
+        """Time [ns] from one message to the next. Raises ValueError if the contract gives none."""
+        return _given(self, "period_ms") * MS
+
+    @property
+    def deadline(self) -> int:
+        """Time [ns] without a message after which its sender is lost. Raises ValueError if the contract gives none."""
+        return _given(self, "deadline_ms") * MS
 
 
 _MAY_KNOW: dict[Visibility, frozenset[str]] = {

@@ -318,6 +318,7 @@ class RunControl:
     ABORT: ClassVar[int]
     END: ClassVar[int]
     HANDOVER: ClassVar[int]
+    HEARTBEAT: ClassVar[int]
     command: int
     tick: int
     last: bool

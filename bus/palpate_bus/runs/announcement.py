@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions
 
@@ -104,7 +105,8 @@ def matching(chosen: str | None) -> list[Run]:
 
 
 def live() -> list[Run]:
-    """The runs of this user on this machine that are on, oldest first. Files that nobody holds any more are removed."""
+    """The runs of this user on this machine that are on, oldest first. What killed runs left is removed."""
+    remove_leftovers()
     runs = []
     for path in folder().glob("*.json"):
         with suppress(OSError, ValueError, TypeError), path.open(encoding="utf-8") as file:

@@ -1,61 +1,137 @@
-"""The conversation with the conductor: control messages in, reports out. A conductor that falls silent ends the run."""
+"""The conversation with the conductor: control messages and its heartbeat in, reports out.
+
+A conductor that is gone, or whose heart has not been heard for the deadline of the contract, is lost. By the wall clock the
+services then go on for a grace, in which planning lifts the arm; in lockstep no time passes without grants: they leave at once.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
 from time import monotonic
-from typing import Any
+from typing import Any, Final
 
 from palpate_bus.messages import RunControl, ServiceReport, codec
+from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.process_state import home, runs
+from palpate_bus.settings import Settings
 
 log = logging.getLogger(__name__)
 
+CONDUCTOR: Final = "conductor"
+HEARTBEAT: Final = "palpate/heartbeat"
+CONTROL_TYPE: Final = "palpation_msgs/msg/RunControl"
 POLL_S = 0.05
 """How often a waiting node looks for messages of the conductor."""
 PROGRESS_S = 0.2
 """How often a node reports its progress, by wall clock."""
 CONDUCTOR_SILENT_S = 10.0
-"""A node leaves after this time without a message from the conductor."""
+"""A conductor is lost after this time without a message while it has not started the run, or when it has no heartbeat."""
 CONDUCTOR_AWAITED_S = 120.0
 """The same before its first message: containers on a busy machine start tens of seconds apart."""
+LOCKSTEP_SILENT_S = 3.0
+"""The same in lockstep, where nothing moves while nobody grants time."""
+LONGEST_LOOK_S = 0.1
+"""A node that has not looked for longer counts this much silence: it was itself kept from a core, and perhaps all were."""
+GONE_S = 0.01
+"""How often it is looked whether the conductor's token is still there, and for how long it must be missing: what the conductor
+said last is under way meanwhile."""
+BUSY_S = 2.0
+"""A silent conductor whose process runs all the same has no core: it is lost only after this time."""
 
 
 class RunAborted(RuntimeError):
-    """The conductor ended the run, or fell silent."""
+    """The conductor ended the run, or is lost."""
 
 
 class ConductorLink:
-    """The way in: control messages, heard once a process."""
+    """The way in: control messages and heartbeats, heard once a process."""
 
-    def __init__(self, member: Member) -> None:
-        self._control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
-        self._decode = codec.decoder("palpation_msgs/msg/RunControl")
-        self._last_heard = monotonic()
-        self._patience = CONDUCTOR_AWAITED_S
+    def __init__(self, member: Member, grace_s: float = 0.0) -> None:
+        """`grace_s` [s] is how long the node goes on without a conductor that is lost."""
+        self._member = member
+        self._control = member.internal_subscription("palpate/control", CONTROL_TYPE)
+        self._beats = member.internal_subscription(HEARTBEAT, CONTROL_TYPE)
+        self._decode = codec.decoder(CONTROL_TYPE)
+        deadline = member.rules.internal[HEARTBEAT].deadline / NS
+        self._deadline_s = deadline if Settings.read().runtime == "wallclock" else LOCKSTEP_SILENT_S
+        self._grace_s = grace_s
+        self._patience_s = CONDUCTOR_AWAITED_S
+        self._granted = self._beating = False
+        self._silent_s = 0.0
+        self._looked = self._sought = self._lost_at = monotonic()
+        self._missed = False
+        """Whether the conductor's token was missing when it was looked for last."""
+        self._pid = 0
+        """The conductor's process, if it is one of this machine that we can look at; else 0."""
+        self.lost = ""
+        """Why the conductor counts as lost; empty while it lives."""
 
     def poll(self, timeout: float | None = None) -> Any | None:
-        """The next control message, or None. Raises RunAborted when told so or when the conductor is silent."""
+        """The next control message, or None. Raises RunAborted when told so, or when the conductor was lost for the grace."""
         while (sample := self._control.get(timeout)) is not None:
-            self._last_heard = monotonic()
-            self._patience = CONDUCTOR_SILENT_S
             try:
                 message = self._decode(sample.payload)
             except codec.CodecError:
                 self._control.garbage += 1
                 continue
+            self._granted = self._granted or message.command == RunControl.GRANT
+            self._heard()
             if message.command == RunControl.ABORT:
                 raise RunAborted(message.reason)
             return message
-        if monotonic() - self._last_heard > self._patience:
-            raise RunAborted(f"no message from the conductor for {self._patience:.0f} s")
+        self._listen()
+        if self.lost and monotonic() - self._lost_at >= self._grace_s:
+            raise RunAborted(self.lost)
         return None
+
+    def _heard(self) -> None:
+        self._silent_s = 0.0
+        self._patience_s = self._deadline_s if self._granted and self._beating else CONDUCTOR_SILENT_S
+        if self.lost:
+            log.warning("the conductor is back")
+            self.lost = ""
+
+    def _listen(self) -> None:
+        """Takes the heartbeats that have come, and counts the silence."""
+        now = monotonic()
+        since, self._looked = min(now - self._looked, LONGEST_LOOK_S), now
+        beat = None
+        while (sample := self._beats.get(0)) is not None:
+            beat = sample
+        if beat is not None:
+            self._take(beat.payload)
+            return
+        self._silent_s += since
+        if self.lost or now - self._sought < GONE_S:
+            return
+        self._sought = now
+        before, self._missed = self._missed, CONDUCTOR in self._member.gone()
+        if before and self._missed:
+            self._lose("the conductor is gone")
+        elif self._silent_s > self._patience_s and (self._silent_s > BUSY_S or not (self._pid and runs(self._pid))):
+            self._lose(f"nothing heard of the conductor for {self._silent_s:.2f} s")
+
+    def _take(self, beat: bytes) -> None:
+        try:
+            message = self._decode(beat)
+        except codec.CodecError:
+            self._beats.garbage += 1
+            return
+        if not self._beating:
+            self._beating = True
+            self._pid = int(message.tick) if message.reason == home() else 0
+        self._heard()
+
+    def _lose(self, why: str) -> None:
+        self.lost, self._lost_at = why, monotonic()
+        log.warning("%s", why)
 
     @property
     def garbage(self) -> int:
         """Undecodable control messages."""
-        return self._control.garbage
+        return self._control.garbage + self._beats.garbage
 
 
 class Reports:
@@ -75,6 +151,10 @@ class Reports:
         text = "" if detail is None else json.dumps(detail)
         message = ServiceReport(state, self._member.role, tick, waiting_for, text)
         self._publisher.put(self._encode(message), self._sequence)
+
+    def miss_conductor(self, tick: int, why: str) -> None:
+        """Says that the conductor is lost, for one that comes back."""
+        self.say(ServiceReport.PROGRESS, tick, CONDUCTOR, {"lost": why})
 
     def progress(self, tick: int, waiting_for: str = "") -> None:
         """Reports progress if the last report is old enough."""

@@ -18,6 +18,7 @@ from palpate_bus.runtime.group import Group
 from palpate_bus.runtime.lockstep import NEVER, Sent
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
+from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.runtime.remote import Advances, RemoteInputs, awaited_elsewhere
 from palpate_bus.service import Service
 
@@ -51,7 +52,11 @@ class LockstepNode(Node):
                     seat.output.hello()
                     if seat in self._advances:
                         self._advances[seat].hello()
-                    detail = {"missing": self._inputs[seat].unheard(), "process": [one.role for one in self._seats]}
+                    detail = {
+                        "missing": self._inputs[seat].unheard(),
+                        "process": [one.role for one in self._seats],
+                        **whereabouts(),
+                    }
                     seat.reports.say(ServiceReport.READY, NEVER, detail=detail)
             elif message is not None:
                 self._obey(message)

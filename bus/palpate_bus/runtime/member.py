@@ -6,6 +6,7 @@ contract with another type or hash never connects with ours. ROS 2 is silent abo
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from time import monotonic
 
 import zenoh
@@ -81,6 +82,11 @@ class Member:
         """Roles that were on the bus and are no more."""
         self._catch_up()
         return self.graph.gone()
+
+    def alive(self, roles: Collection[str]) -> frozenset[str]:
+        """Those of `roles` that are on the bus now."""
+        self._catch_up()
+        return self.graph.roles() & frozenset(roles)
 
     def _catch_up(self) -> None:
         self._changed = bool(self.graph.changes()) or self._changed

@@ -50,10 +50,10 @@ class Seat:
 class Node(ABC):
     """The services of a process on the bus."""
 
-    def __init__(self, seats: Sequence[Seat], member: Member) -> None:
-        """`member` hears the conductor for all of them."""
+    def __init__(self, seats: Sequence[Seat], member: Member, grace_s: float = 0.0) -> None:
+        """`member` hears the conductor for all of them; without it the node goes on for `grace_s` [s]."""
         self._seats = tuple(seats)
-        self._link = ConductorLink(member)
+        self._link = ConductorLink(member, grace_s)
         self._acting = self._seats[0]
         """Whose turn it is."""
 
@@ -73,6 +73,10 @@ class Node(ABC):
             self._await_end()
         except RunAborted:
             for seat in self._seats:
+                with suppress(Exception):
+                    seat.output.flush(seat.tick)  # what others have heard belongs in the recording
+                if self._link.lost:
+                    seat.reports.miss_conductor(seat.tick, self._link.lost)
                 seat.service.finish()
             raise
         except Exception as error:

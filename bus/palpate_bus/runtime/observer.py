@@ -16,6 +16,7 @@ from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Received, Stepper
 from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.service import Service
 from palpate_bus.wire.rmw import WireError, unpack
 from palpate_bus.wire.transport import HELLO, decoded
@@ -26,6 +27,8 @@ IDLE_S = 0.005
 RING = 64
 """Messages of a periodic topic kept for an observer that sees the latest: enough for one of its periods at 1 kHz."""
 FIFO = 1 << 17
+OBSERVERS_STAY_S = 8.0
+"""For how long an observer stays at most without a conductor: longer than all whom it observes, see `wallclock`."""
 
 
 class _Feed:
@@ -122,12 +125,26 @@ class ObservedService:
         }
 
 
+class Producers:
+    """The services that an observer observes: without a conductor it stays as long as one of them, and no longer."""
+
+    def __init__(self, member: Member) -> None:
+        self._member = member
+        self._roles = frozenset(role.name for role in member.rules.roles.values() if not role.observer)
+
+    def leave_with_them(self, lost: str) -> None:
+        """Raises RunAborted when the conductor is lost, as `lost` says, and all of them have left."""
+        if lost and not self._member.alive(self._roles):
+            raise RunAborted(lost)
+
+
 class ObserverNode:
     """One observing service in a process of its own."""
 
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
-        self._link = ConductorLink(member)
+        self._link = ConductorLink(member, OBSERVERS_STAY_S)
+        self._producers = Producers(member)
         self._reports = Reports(member)
         self._observed = ObservedService(service, member)
 
@@ -139,6 +156,7 @@ class ObserverNode:
                 busy = observed.drain_and_step()
                 message = self._link.poll()
                 if message is None:
+                    self._producers.leave_with_them(self._link.lost)
                     if not busy:
                         sleep(IDLE_S)
                     self._reports.progress(observed.now)
@@ -163,4 +181,4 @@ class ObserverNode:
         for publisher in self._observed.publishers.values():
             publisher.hello()
         self._observed.drain_and_step()
-        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": []})
+        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": [], **whereabouts()})

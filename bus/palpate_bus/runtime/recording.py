@@ -15,6 +15,8 @@ from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.observer import OBSERVERS_STAY_S, Producers
+from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_bus.service import Service
 
@@ -43,7 +45,8 @@ class RecorderNode:
         self._service: Service = service
         self._recorder: RawRecorder = service
         self._topics = member.rules.topics
-        self._link = ConductorLink(member)
+        self._link = ConductorLink(member, OBSERVERS_STAY_S)
+        self._producers = Producers(member)
         self._reports = Reports(member)
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
@@ -70,12 +73,13 @@ class RecorderNode:
                 message = self._link.poll()
                 if message is None:
                     if not busy:
+                        self._producers.leave_with_them(self._link.lost)
                         sleep(IDLE_S)
                     self._reports.progress(self.covered)
                 elif message.command == RunControl.HELLO:
                     self._drain()
                     missing = [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.heard]
-                    self._reports.say(ServiceReport.READY, NEVER, detail={"missing": missing})
+                    self._reports.say(ServiceReport.READY, NEVER, detail={"missing": missing, **whereabouts()})
                 elif message.command == RunControl.LOST:
                     self._lost.add(message.role)
                 elif message.command == RunControl.HANDOVER and message.role in self._chunks:

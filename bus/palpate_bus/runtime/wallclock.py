@@ -16,12 +16,13 @@ from typing import Any
 from palpate_bus.contract import MS, Edge, Topic, Visibility
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
-from palpate_bus.runtime.conductor_link import RunAborted
+from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
 from palpate_bus.runtime.latency import LatencyHistogram
 from palpate_bus.runtime.lockstep import NEVER, Received, Sent, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.priority import by_period, give_way
+from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
@@ -29,6 +30,10 @@ log = logging.getLogger(__name__)
 CATCH_UP = 200 * MS
 """Lag [ns] beyond which a critical role gives up catching up."""
 HANDSHAKE_POLL_S = 0.02
+WITHOUT_CONDUCTOR_S = 4.0
+"""For how long services go on without a conductor: planning lifts the arm in this time, and it comes clear of the patient."""
+PHYSICS_STAYS_S = 0.5
+"""A critical role goes on for so much longer: a driver whose commander has left holds before it leaves itself."""
 READ_NS = 100_000
 """Two clocks read within this time [ns] were read at once."""
 
@@ -55,7 +60,8 @@ class WallClockNode(Node):
     def __init__(self, service: Service, member: Member) -> None:
         self._stepper = Stepper(service, member.rules, strict=False)
         self._seat = Seat(self._stepper, member)
-        super().__init__((self._seat,), member)
+        stays = PHYSICS_STAYS_S if self._stepper.role.critical else 0.0
+        super().__init__((self._seat,), member, WITHOUT_CONDUCTOR_S + stays)
         self._now = member.transport.now
         self._data = {
             name: member.subscription(buffer.topic, history=buffer.topic.latched)
@@ -90,7 +96,7 @@ class WallClockNode(Node):
                 missing = [
                     name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
                 ]
-                self._seat.reports.say(ServiceReport.READY, NEVER, detail={"missing": missing})
+                self._seat.reports.say(ServiceReport.READY, NEVER, detail={"missing": missing, **whereabouts()})
             elif message.command == RunControl.GRANT and message.last:
                 raise RunAborted("the run is already ending")
             elif message.command == RunControl.GRANT:
@@ -135,8 +141,16 @@ class WallClockNode(Node):
             self._seat.tick = t
             while (message := self._link.poll()) is not None:
                 self._obey(message)
+            self._note_lost_conductor()
             self._seat.progress()
             t += period
+
+    def _note_lost_conductor(self) -> None:
+        """Tells the service once that the conductor is lost, and the conductor, in case that it comes back."""
+        lost = self._stepper.inbox.lost_roles
+        if self._link.lost and CONDUCTOR not in lost:
+            lost.add(CONDUCTOR)
+            self._seat.reports.miss_conductor(self._seat.tick, self._link.lost)
 
     def _await_inputs(self, epoch: int) -> int:
         """Waits until every input that the first step needs has come once; returns the tick [ns] at which it may step.

@@ -9,6 +9,7 @@ import zenoh
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
+from palpate_bus.runtime.collection import rare_collections
 from palpate_bus.settings import Settings
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
@@ -44,7 +45,8 @@ def conduct(
         tell(RunProgress(t, t / NS / wall, collector.collected, tuple(c.outcome.trouble), c.request))
 
     try:
-        outcome = conductor.run(died, report)
+        with rare_collections():
+            outcome = conductor.run(died, report)
         failure = outcome.failure or given_up(collector.collected)
     except RunFailed as error:
         outcome = conductor.outcome

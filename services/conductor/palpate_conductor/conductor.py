@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from time import monotonic, perf_counter, sleep
 from typing import Any
 
@@ -13,13 +13,16 @@ import zenoh
 from palpate_bus.contract import MS, Contract
 from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import NS, header
+from palpate_bus.runtime.conductor_link import CONDUCTOR
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservedService
 from palpate_conductor.collector import Collector
 from palpate_conductor.contract_watch import ContractWatch
+from palpate_conductor.freezes import FreezeWatch
 from palpate_conductor.grants import Grants
 from palpate_conductor.handover import Places
+from palpate_conductor.heartbeat import Heartbeat
 from palpate_conductor.operator import OperatorDesk
 from palpate_conductor.outcome import Patience, RunFailed, RunOutcome
 from palpate_conductor.service_health import service_statuses
@@ -70,6 +73,8 @@ class Conductor:
         self._beside = {role: (role,) for role in roles}
         """By role, who shares its process, itself included."""
         self._sequence = 0
+        self._heartbeat = Heartbeat(member, rules)
+        self._freezes = FreezeWatch(self._patience)
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = RunOutcome()
         self._contract = ContractWatch(session, rules, domain, timing.wallclock)
@@ -128,6 +133,13 @@ class Conductor:
 
         Raises RunFailed when the run cannot start; later failures are in the outcome, KeyboardInterrupt among them.
         """
+        self._heartbeat.start()
+        try:
+            return self._run(died, tell)
+        finally:
+            self._heartbeat.stop()
+
+    def _run(self, died: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> RunOutcome:
         try:
             self._handshake(died)
         except KeyboardInterrupt:
@@ -145,6 +157,7 @@ class Conductor:
         except (RunFailed, KeyboardInterrupt) as failure:
             self.outcome.interrupted = isinstance(failure, KeyboardInterrupt)
             why = f"interrupted at tick {max(self._observed.now, 0) / NS:.3f} s" if self.outcome.interrupted else str(failure)
+            self._hear_who_missed_us()
             self.outcome.failure = self.outcome.failure or why
             self.outcome.wall_time_s = monotonic() - self._started_at
             self.abort(why)
@@ -160,6 +173,7 @@ class Conductor:
         ours = set(self._roles) - set(self._patience.absent)
         told = False
         while len(ready) < len(self._roles) or any(ready.values()):
+            self._heartbeat.turn()
             self._say(RunControl.HELLO)
             sleep(0.05)
             for role, message, detail in self._heard():
@@ -167,6 +181,7 @@ class Conductor:
                     raise RunFailed(f"{role} failed at start: {detail.get('error')}")
                 if message.state != ServiceReport.READY:
                     continue
+                self._freezes.meet(role, detail)
                 self._beside[role] = tuple(detail.get("process", (role,)))
                 ready[role] = [name for name in detail.get("missing", []) if not self._absent(name)]
             if dead := died():
@@ -198,8 +213,11 @@ class Conductor:
     def _conduct(self, died: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         finished: set[str] = set()
         while not finished >= set(self._workers) - self.outcome.lost.keys():
+            self._heartbeat.turn()
             self._observed.drain_and_step()
             for role, message, detail in self._heard():
+                if message.waiting_for == CONDUCTOR:
+                    self._missed(role, message.tick, detail.get("lost", ""))
                 if self._places.take(role):
                     self.watchdog.progress[role].moved = monotonic()  # the time before is nobody's
                     self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
@@ -211,6 +229,7 @@ class Conductor:
             for role, how in self._missing(died).items():
                 if role in self._roles and role not in finished:
                     self._miss(role, how)
+            self._lose_frozen(finished)
             for role, how in self._places.expired().items():
                 self._lose(role, f"{how}; nobody took its place within {self._places.patience_s:.0f} s")
             for complaint in self._member.complaints():
@@ -241,6 +260,15 @@ class Conductor:
             log.warning("no tick for %.0f s: %s", stalled, self.watchdog.culprit(judged)[1])
         self._complained = stalled > self._patience.soft
 
+    def _lose_frozen(self, finished: Container[str]) -> None:
+        """A frozen service is lost as a dead one is. In lockstep nobody can do without it, so nothing is left to react."""
+        for role, how in self._freezes.frozen().items():
+            if role in finished or role in self.outcome.lost:
+                continue
+            self._miss(role, how)
+            if not self._wallclock and not self._rules.roles[role].observer:
+                raise RunFailed(self.outcome.failure or how)
+
     def _missing(self, died: Callable[[], Mapping[str, str]]) -> dict[str, str]:
         """Roles that are not there, with how they went."""
         ended = {role: how for role, how in died().items() if role not in self._places.taken}
@@ -256,6 +284,25 @@ class Conductor:
             self._tell(f"{role} left at {tick:.3f} s: {how}; its place is kept for {self._places.patience_s:.0f} s")
             self._reports[role].hand_over()
             self._say(RunControl.HANDOVER, role=role, reason=how)
+
+    def _hear_who_missed_us(self) -> None:
+        """Services that left while this conductor stood still are not at fault, whether their word still came or not."""
+        for role, message, detail in self._heard():
+            if message.waiting_for == CONDUCTOR:
+                self._missed(role, message.tick, detail.get("lost", ""))
+        if self._heartbeat.stood_still_s and CONDUCTOR not in self.outcome.lost:
+            role = next(iter(self._workers))
+            self._missed(role, self.watchdog.progress[role].tick, self.outcome.failure or "gone")
+
+    def _missed(self, role: str, tick: int, words: str) -> None:
+        """A service has not heard this conductor for the deadline: the examination ends, whatever becomes of it now."""
+        if CONDUCTOR in self.outcome.lost:
+            return
+        self.outcome.lost[CONDUCTOR] = max(tick, 0)
+        stood = f"; it stood still for {self._heartbeat.stood_still_s:.1f} s" if self._heartbeat.stood_still_s else ""
+        sentence = f"conductor lost at tick {max(tick, 0) / NS:.3f} s: {role} says: {words}{stood}"
+        self._tell(sentence)
+        self.outcome.failure = sentence
 
     def _tell(self, sentence: str) -> None:
         self.outcome.trouble.append(sentence)
@@ -293,6 +340,7 @@ class Conductor:
         begin = monotonic()
         self._say(RunControl.END)
         while waiting and monotonic() - begin < OBSERVERS_FINISH_S:
+            self._heartbeat.turn()
             self._observed.drain_and_step()
             for role, message, detail in self._heard():
                 if message.state == ServiceReport.FINISHED:

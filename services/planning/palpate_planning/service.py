@@ -28,8 +28,8 @@ from palpate_planning.periods import Periods
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 from palpate_planning.surface import PerceivedSurface
 
-NEEDED = ("robot", "assessment", "supervisor")
-"""Roles whose loss ends the exam, whatever its phase."""
+NEEDED = ("robot", "assessment", "supervisor", "conductor")
+"""Roles whose loss ends the exam, whatever its phase. Without the conductor no operator could stop it."""
 NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
 """Roles whose loss ends the exam before there are targets."""
 SEEING = frozenset({Phase.HOME, Phase.LOOK})

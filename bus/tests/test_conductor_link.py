@@ -1,0 +1,142 @@
+"""When a service takes its conductor for lost: by a clock that the test sets."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from palpate_bus.contract import contract
+from palpate_bus.messages import RunControl, codec
+from palpate_bus.runtime import conductor_link
+from palpate_bus.runtime.conductor_link import BUSY_S, CONTROL_TYPE, HEARTBEAT, LOCKSTEP_SILENT_S, ConductorLink, RunAborted
+from palpate_bus.runtime.process_state import home
+from palpate_bus.wire.transport import ReceivedSample
+
+STEP_S = 0.01
+PID = 4711
+DEADLINE_S = contract().internal[HEARTBEAT].deadline / 1e9
+
+
+@dataclass
+class Queue:
+    waiting: deque[bytes] = field(default_factory=deque)
+    garbage: int = 0
+
+    def get(self, timeout: float | None) -> ReceivedSample | None:
+        return ReceivedSample(1, 0, self.waiting.popleft()) if self.waiting else None
+
+
+class Bus:
+    """A member of a bus on which only a conductor speaks, and the time."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, runtime: str) -> None:
+        monkeypatch.setenv("PALPATE_RUNTIME", runtime)
+        monkeypatch.setattr(conductor_link, "monotonic", lambda: self.now)
+        monkeypatch.setattr(conductor_link, "runs", lambda pid: self.runs and pid == PID)
+        self.rules = contract()
+        self.now = 100.0
+        self.runs = False
+        self.token = True
+        self.queues = {"palpate/control": Queue(), HEARTBEAT: Queue()}
+
+    def internal_subscription(self, name: str, type_name: str) -> Queue:
+        assert type_name == CONTROL_TYPE
+        return self.queues[name]
+
+    def gone(self) -> frozenset[str]:
+        return frozenset() if self.token else frozenset({"conductor"})
+
+    def say(self, command: int) -> None:
+        name = HEARTBEAT if command == RunControl.HEARTBEAT else "palpate/control"
+        message = RunControl(command, PID, False, "", home())
+        self.queues[name].waiting.append(codec.encode(message, CONTROL_TYPE))
+
+    def link(self, grace_s: float = 0.0) -> ConductorLink:
+        """A link that has heard the start and a beat."""
+        member: Any = self
+        link = ConductorLink(member, grace_s)
+        self.say(RunControl.GRANT)
+        assert link.poll() is not None
+        self.say(RunControl.HEARTBEAT)
+        link.poll()
+        return link
+
+    def silence(self, link: ConductorLink, seconds: float, step_s: float = STEP_S) -> float:
+        """Lets `seconds` pass; returns after which the conductor was lost, infinity when it was not."""
+        begin = self.now
+        while self.now - begin < seconds:
+            self.now += step_s
+            link.poll()
+            if link.lost:
+                return self.now - begin
+        return float("inf")
+
+
+@pytest.fixture
+def wallclock(monkeypatch: pytest.MonkeyPatch) -> Bus:
+    return Bus(monkeypatch, "wallclock")
+
+
+def test_silence_is_noticed_at_the_contracts_deadline(wallclock: Bus) -> None:
+    lost = wallclock.silence(wallclock.link(grace_s=9.0), 1.0)
+    assert DEADLINE_S < lost <= DEADLINE_S + 3 * STEP_S
+    assert lost < 0.3
+
+
+def test_a_heart_that_beats_is_no_loss(wallclock: Bus) -> None:
+    link = wallclock.link()
+    for _ in range(1000):
+        wallclock.say(RunControl.HEARTBEAT)
+        assert wallclock.silence(link, 0.2) == float("inf")
+
+
+def test_a_conductor_that_runs_but_gets_no_core_is_waited_for(wallclock: Bus) -> None:
+    wallclock.runs = True
+    assert BUSY_S < wallclock.silence(wallclock.link(grace_s=9.0), 10.0) < BUSY_S + 0.1
+
+
+def test_a_service_that_was_itself_kept_from_a_core_does_not_blame_the_conductor(wallclock: Bus) -> None:
+    link = wallclock.link(grace_s=9.0)
+    assert wallclock.silence(link, 0.9, step_s=0.45) == float("inf")
+
+
+def test_a_conductor_whose_token_is_gone_is_lost_at_once(wallclock: Bus) -> None:
+    link = wallclock.link(grace_s=9.0)
+    wallclock.token = False
+    assert wallclock.silence(link, 1.0) <= 5 * STEP_S
+
+
+def test_its_services_stay_for_the_grace_and_then_leave(wallclock: Bus) -> None:
+    link = wallclock.link(grace_s=2.0)
+    assert wallclock.silence(link, 1.0) < 1.0
+    lost_at = wallclock.now
+    with pytest.raises(RunAborted, match="nothing heard of the conductor"):
+        while True:
+            wallclock.now += STEP_S
+            link.poll()
+    assert 2.0 <= wallclock.now - lost_at < 2.1
+
+
+def test_one_that_comes_back_is_not_lost_any_more(wallclock: Bus) -> None:
+    link = wallclock.link(grace_s=2.0)
+    wallclock.silence(link, 1.0)
+    wallclock.say(RunControl.HEARTBEAT)
+    link.poll()
+    assert not link.lost
+
+
+def test_in_lockstep_nothing_moves_and_it_has_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = Bus(monkeypatch, "lockstep")
+    link = bus.link(grace_s=9.0)
+    assert LOCKSTEP_SILENT_S < bus.silence(link, 10.0) < LOCKSTEP_SILENT_S + 0.1
+
+
+def test_one_without_a_heartbeat_is_given_the_time_that_a_start_takes(wallclock: Bus) -> None:
+    member: Any = wallclock
+    link = ConductorLink(member, 9.0)
+    wallclock.say(RunControl.GRANT)
+    link.poll()
+    assert wallclock.silence(link, 9.0) == float("inf")

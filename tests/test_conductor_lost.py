@@ -1,0 +1,86 @@
+"""The conductor of an examination is killed or frozen while the indenter is in contact."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from conductor_loss import Blow, Struck, strike_conductor
+
+from palpate_bus.messages import ExamState, RobotStatus
+
+pytestmark = pytest.mark.slow
+
+MORE_N = 2.0
+CLEAR_M = 0.005
+
+
+def kill(conductor: psutil.Process) -> None:
+    conductor.kill()
+
+
+def freeze(conductor: psutil.Process) -> None:
+    conductor.suspend()
+    time.sleep(10.0)
+    conductor.resume()
+
+
+def kill_with_planning(conductor: psutil.Process) -> None:
+    services = conductor.children(recursive=True)  # forked: they differ in the log that they write alone
+    (planning,) = [child for child in services if any(Path(file.path).name == "planning.log" for file in child.open_files())]
+    for process in (planning, conductor):
+        process.kill()
+
+
+def assert_lifted(struck: Struck) -> None:
+    """Planning lifted the arm clear of the patient before anybody left, and the force rose no more."""
+    states = struck.recorded("exam/state")
+    told = next(stamp for stamp, state in states if "lost conductor" in state.message)
+    before = max(force for stamp, force in struck.forces if stamp <= told)
+    after = max(force for stamp, force in struck.forces if stamp > told)
+    assert 0.5 < before < 15.0
+    assert after <= before + MORE_N
+    assert struck.forces[-1][1] == 0.0
+    assert states[-1][1].depth < -CLEAR_M
+    assert states[-1][1].phase == ExamState.PHASE_ABORTED
+    print(f"before {before:.2f} N, after {after:.2f} N, left after {struck.left_after_s:.1f} s")
+
+
+@pytest.mark.parametrize("blow", [kill, freeze])
+def test_by_the_wall_clock_the_arm_is_lifted_and_the_services_leave(blow: Blow, tmp_path: Path) -> None:
+    struck = strike_conductor(tmp_path, "wallclock", blow)
+    assert_lifted(struck)
+    if blow is freeze:
+        (failure,) = [line for line in struck.said if line.startswith("failure: ")]
+        assert "conductor" in failure
+        assert "stood still for" in failure
+
+
+def test_without_planning_too_the_driver_holds(tmp_path: Path) -> None:
+    struck = strike_conductor(tmp_path, "wallclock", kill_with_planning)
+    statuses = struck.recorded("robot/status")
+    assert statuses[-1][1].mode == RobotStatus.MODE_SAFE_HOLD
+    held = next(stamp for stamp, status in statuses if status.mode == RobotStatus.MODE_SAFE_HOLD)
+    before = max(force for stamp, force in struck.forces if stamp <= held)
+    assert max(force for stamp, force in struck.forces if stamp > held) <= before + MORE_N
+
+
+@pytest.mark.parametrize("blow", [kill, freeze])
+def test_in_lockstep_time_stands_and_what_was_measured_is_recovered(blow: Blow, tmp_path: Path) -> None:
+    struck = strike_conductor(tmp_path, "lockstep", blow)
+    last = struck.forces[-1]
+    assert last[1] <= max(force for _, force in struck.forces[:-1]) + MORE_N
+    command = [str(Path(sys.executable).with_name("palpate")), "report", str(struck.folder), "--recover", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((struck.folder / "report.json").read_text(encoding="utf-8"))
+    assert report["run_hash"] is None
+    assert report["runtime"] == "recovered"
+    assert abs(report["sim_time_s"] - last[0] / 1e9) < 0.2
+    assert report["max_force_N"] == pytest.approx(max(force for _, force in struck.forces), rel=0.05)
+    assert Path(json.loads(done.stdout)["html"]).is_file()
