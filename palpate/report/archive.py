@@ -24,8 +24,6 @@ from palpate_conductor.collector import Collected
 from palpate_models.frames import Array
 
 FILE: Final = "evidence.npz"
-LOCK: Final = "run.lock"
-"""The file whose lock the run holds; it names the process. The kernel drops the lock when the process ends, however it ends."""
 _MESSAGES: Final = {
     "stiffness_map": "palpation_msgs/msg/StiffnessMap",
     "findings": "palpation_msgs/msg/Findings",

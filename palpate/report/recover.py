@@ -6,7 +6,6 @@ the scenario names is given the recorded examination once more, and told that it
 
 from __future__ import annotations
 
-import fcntl
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -14,12 +13,13 @@ from time import sleep, time
 from typing import Final
 
 from palpate.replay.rerun import rerun
-from palpate.report.archive import LOCK, EvidenceError, completed
+from palpate.report.archive import EvidenceError, completed
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create
 from palpate_bus.messages import ExamState, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RUN_FOLDER, RecordedMessage, Recording, RecordingError, open_recording
+from palpate_bus.runs.announcement import live
 from palpate_conductor.collector import Collected, Collector
 from palpate_conductor.result import RunResult, given_up
 from palpate_models.load import ScenarioError, load_scenario, seen, view_of
@@ -37,7 +37,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
 
     Raises EvidenceError for a folder that is in use, is complete, or holds no recording.
     """
-    if _in_use(folder):
+    if any(Path(run.out).resolve() == folder.resolve() for run in live()):
         raise EvidenceError(f"{folder}: its run is still on; stop that first")
     if completed(folder) is not None:
         raise EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
@@ -65,20 +65,6 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
         failure=failure,
         lost={"conductor": recording.last},
     )
-
-
-def _in_use(folder: Path) -> bool:
-    """Whether a run holds the lock of its folder. The lock of one that was killed is removed."""
-    lock = folder / LOCK
-    try:
-        with lock.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            lock.unlink(missing_ok=True)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
 
 
 def _recording(folder: Path) -> Recording:

@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-from palpate.report.archive import LOCK
-
+LOCK = "run.lock"
+"""The file whose lock the run holds; it names the process. The kernel drops the lock when the process ends, however it ends."""
 OURS = frozenset({LOCK, "scenario.yaml"})
 """A folder that has neither of these is no results folder, and is not removed."""
 
