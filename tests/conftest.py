@@ -63,6 +63,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     items.sort(key=lambda item: (not looks_at_examinations(item), item.path.name not in LONG_FILES))
     for item in items:
+        if looks_at_examinations(item) or item.path.name in LONG_FILES:
+            item.add_marker(pytest.mark.timeout(1200))  # whole examinations, on a machine that others load too
         item.add_marker(pytest.mark.xdist_group("examinations" if looks_at_examinations(item) else str(item.path)))
 
 

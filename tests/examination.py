@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SHORT = ("exam.region_m=[0.06, 0.06]", "exam.centre_m=[-0.055, -0.055]", "camera.frames=10")
-"""A small region about the lesion of clean: about 30 s of simulated time."""
+SHORT = ("exam.region_m=[0.06, 0.06]", "exam.centre_m=[-0.055, -0.055]", "exam.spacing_m=0.02", "camera.frames=10")
+"""A small region about the lesion of clean: about 40 s of simulated time."""
 
-GATE = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.055, -0.055]", "camera.frames=10")
-"""A region that holds the whole lesion of clean and tissue around it: about 50 s of simulated time."""
+GATE = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.055, -0.055]", "exam.spacing_m=0.02", "camera.frames=10")
+"""A region that holds the whole lesion of clean and tissue around it: about 60 s of simulated time."""
 
 
 @dataclass
