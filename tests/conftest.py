@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -50,28 +51,37 @@ def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--no-record", settings=GATE)
 
 
-EXAMINATIONS = ("distributed", "composed")
-"""The fixtures that are whole examinations."""
+EXAMINATION_FILES = ("test_gate.py", "test_examination.py", "test_contract_ros_tools.py", "test_library.py")
+"""Files that look at the same examinations: one worker has them all, so that each examination is carried out once."""
+LONG_S = 1200
+"""Time for a test with whole examinations [s], on a machine that others load too."""
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What two workers share out: tests that look at the same examinations go together and first, others file by file."""
-
-    def looks_at_examinations(item: pytest.Item) -> bool:
-        return not set(EXAMINATIONS).isdisjoint(getattr(item, "fixturenames", ()))
-
-    items.sort(key=lambda item: (not looks_at_examinations(item), item.path.name not in LONG_FILES))
+    """What takes long begins first, and has time."""
+    items.sort(key=lambda item: (item.path.name not in EXAMINATION_FILES, item.path.name not in LONG_FILES))
     for item in items:
-        if looks_at_examinations(item) or item.path.name in LONG_FILES:
-            item.add_marker(pytest.mark.timeout(1200))  # whole examinations, on a machine that others load too
-        item.add_marker(pytest.mark.xdist_group("examinations" if looks_at_examinations(item) else str(item.path)))
+        if item.path.name in (*EXAMINATION_FILES, *LONG_FILES):
+            item.add_marker(pytest.mark.timeout(LONG_S))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Workers take whole files; those that look at the same examinations count as one."""
+    from xdist.scheduler import LoadFileScheduling  # pytest-xdist may be left out
+
+    class Files(LoadFileScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return "examinations" if Path(file).name in EXAMINATION_FILES else file
+
+    return Files(config, log)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """A line for each examination of test_gate.py, with its figures, for the summary of `.ci/run`."""
     for outcome in ("passed", "failed", "error"):
         for report in terminalreporter.stats.get(outcome, ()):
-            _, _, name = report.nodeid.partition("@")[0].partition("test_gate.py::test_")  # xdist puts the group behind an @
+            _, _, name = report.nodeid.partition("test_gate.py::test_")
             if name and (report.when == "call" or outcome == "error"):
                 terminalreporter.write_line(f"gate: {name.replace('_', ' ')}: {outcome}  {report.capstdout.strip()}".rstrip())
