@@ -43,7 +43,7 @@ def test_the_lesion_is_found(distributed: Finished) -> None:
 def test_healthy_has_no_finding(tmp_path: Path) -> None:
     finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=(*SHORT, "phantom.lesions=[]"))
     assert finished.status == 0, finished.output
-    assert finished.report["samples"] > 50
+    assert finished.report["samples"] > 30
     assert finished.report["findings"] == []
     assert finished.report["scores"]["false_findings"] == 0
 

@@ -95,7 +95,7 @@ def test_it_forgets_as_slowly() -> None:
             tissue.idle(1.0 + k * tissue.dt)
         left.append(tissue.inward.copy())
     assert left[0].max() > 5e-5
-    assert np.abs(left[1] - left[0]).max() < 0.02 * left[0].max()
+    assert np.abs(left[1] - left[0]).max() < 0.05 * left[0].max()
 
 
 def test_settled_it_is_as_new() -> None:

@@ -26,11 +26,15 @@ from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
 from palpate_tissue.near import Near, Search
 
 SWEEPS: Final = 3
-"""Of over-relaxation in a step."""
+"""Of over-relaxation in a step near the sphere."""
+FAR_SWEEPS: Final = 20
+"""The same in a step of the others."""
 REACHED: Final = 1.5
 """Vertices within so many Pasternak lengths of the sphere are stepped."""
 FAR_S: Final = 0.1
-"""The others follow so often."""
+"""The others follow so often,"""
+SPRING_S: Final = 0.3
+"""and at every step for so long after the sphere has left them: the wall springs back within the dashpot's 0.05 s."""
 _MARGIN_M: Final = 0.010
 """The vertices near the sphere are searched anew when it has moved this far."""
 _APART: Final = 7
@@ -58,7 +62,7 @@ class ImplicitTissue(TissueBackend):
         self._free = np.flatnonzero(~model.fixed)
         self._search = Search(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._tree = cKDTree(model.vertices[self._free])
-        self._steps = 0
+        self._steps = self._sprung = 0
         self._excursion = 0.0
         self._near: Near | None = None
         self._patch: ImplicitPatch | None = None
@@ -96,7 +100,8 @@ class ImplicitTissue(TissueBackend):
         state.u[:] = state.s[:] = 0.0
         state.y[:] = 0.0
         state.clock[:] = 0
-        self._steps, self._excursion = 0, 0.0
+        self._steps = self._sprung = 0
+        self._excursion = 0.0
         self._near = self._patch = None
         self.friction.release()
         self.touching = False
@@ -105,16 +110,17 @@ class ImplicitTissue(TissueBackend):
     def _tick(self, t_s: float) -> None:
         """One step on: now and then, all that is far from the sphere follows."""
         self._excursion = self.excursion(t_s)
-        if self._steps % self._every == 0:
+        if self._steps % self._every == 0 or self._steps < self._sprung:
             if self._patch is not None:
                 self._wall.clock[self._patch.near] = self._steps
-            kernel.follow(self._wall, self._free, self._steps, self.activation)
+            kernel.follow(self._wall, self._free, self._steps, self.activation, FAR_SWEEPS)
         self._steps += 1
 
     def _leave(self) -> None:
         """The sphere is no longer near where it was."""
         if self._patch is not None:
             self._wall.clock[self._patch.near] = self._steps
+            self._sprung = self._steps + round(SPRING_S / self.dt)
         self._near = self._patch = None
 
     def _gather(self, p: list[float], radius: float) -> ImplicitPatch:
@@ -128,7 +134,7 @@ class ImplicitTissue(TissueBackend):
         stepped = np.zeros(len(model.vertices), dtype=bool)
         stepped[vertex] = stepped[self._free[self._tree.query_ball_point(p, 2 * radius + self._reach_m + _MARGIN_M)]] = True
         near = np.concatenate([np.flatnonzero(stepped)[first::_APART] for first in range(_APART)])
-        kernel.follow(self._wall, near, self._steps - 1, self.activation)
+        kernel.follow(self._wall, near, self._steps - 1, self.activation, FAR_SWEEPS)
         table = np.column_stack((model.normals[vertex], model.vertices[vertex], model.breathing[vertex]))
         place = np.empty(len(model.vertices), dtype=np.intp)
         place[near] = np.arange(len(near))

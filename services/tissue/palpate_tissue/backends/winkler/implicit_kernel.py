@@ -3,7 +3,7 @@
     C (u - u0) / h + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f,    f >= 0,  u >= w,  f (u - w) = 0
 
 is solved by projected successive over-relaxation, vertex by vertex, with the springs made straight about where a vertex is.
-Far from the sphere nothing moves fast: there the wall goes on by long steps, a sweep each.
+Far from the sphere nothing moves fast: there the wall goes on by long steps.
 """
 
 from __future__ import annotations
@@ -166,31 +166,40 @@ def relax(wall: ImplicitWall, near: NDArray[np.intp]) -> None:
 
 
 @compiled
-def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation: float) -> None:
+def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation: float, sweeps: int) -> None:
     """Brings vertices that nothing touches to step `now`, each by one step of its own length, at most that of `decay`.
 
-    First each gives way as its branches do, as it would if it were in balance and stayed so; then it goes to where its forces
-    balance.
+    First each gives way as its branches do, as it would if it were in balance and stayed so; then all go to where their forces
+    balance: where the sphere has just left, that is far.
     """
     u, s, y, clock, decay, table = wall.u, wall.s, wall.y, wall.clock, wall.decay, wall.table
     indptr, indices, K = wall.indptr, wall.indices, wall.K
-    for i in vertices:
+    begin, length = np.zeros(len(vertices)), np.zeros(len(vertices), dtype=np.int64)
+    for k in range(len(vertices)):
+        i = vertices[k]
         steps = min(now - clock[i], len(decay) - 1)
         clock[i] = now
         if steps <= 0 or (u[i] == 0.0 and s[i] == 0.0):
             continue
         rest = u[i]
-        for k in range(y.shape[1]):
-            change = (1.0 - decay[steps, k]) * (decay[0, k] * rest - y[i, k])
+        for b in range(y.shape[1]):
+            change = (1.0 - decay[steps, b]) * (decay[0, b] * rest - y[i, b])
             u[i] += change
-            y[i, k] += change
-        force, slope = 0.0, table[i, DRAG] / steps + table[i, DIAGONAL]
-        for j in range(indptr[i], indptr[i + 1]):
-            force -= K[j] * s[indices[j]]
-        if u[i] > 0.0:
-            bent = min(u[i], table[i, STRAIGHT_FROM])
-            stiffer, held = table[i, BETA2] * bent * bent, table[i, TENSION] * activation
-            force -= table[i, FOUNDATION] * (stiffer * (u[i] - 2.0 / 3.0 * bent) + held * u[i])
-            slope += table[i, FOUNDATION] * (stiffer + held)
-        u[i] += force / slope
-        s[i] += force / slope
+            y[i, b] += change
+        begin[k], length[k] = u[i], steps
+    for _ in range(sweeps):
+        for k in range(len(vertices)):
+            if length[k] == 0:
+                continue
+            i = vertices[k]
+            drag = table[i, DRAG] / length[k]
+            force, slope = drag * (begin[k] - u[i]), drag + table[i, DIAGONAL]
+            for j in range(indptr[i], indptr[i + 1]):
+                force -= K[j] * s[indices[j]]
+            if u[i] > 0.0:
+                bent = min(u[i], table[i, STRAIGHT_FROM])
+                stiffer, held = table[i, BETA2] * bent * bent, table[i, TENSION] * activation
+                force -= table[i, FOUNDATION] * (stiffer * (u[i] - 2.0 / 3.0 * bent) + held * u[i])
+                slope += table[i, FOUNDATION] * (stiffer + held)
+            u[i] += force / slope
+            s[i] += force / slope
