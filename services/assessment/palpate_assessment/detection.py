@@ -39,8 +39,8 @@ FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
 FEATURES = ("strength", "beyond", "log-radius", "softer")
 """What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, sign."""
-_SURE = 4.0
-"""Standard deviations beyond which the contrast's distance from FELT tells no more."""
+SURE = 4.0
+"""So many standard deviations below FELT a contrast is surely none: 0 of 35 such candidates of tuning patients were lumps."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,14 @@ class Candidate:
     @property
     def features(self) -> Array:
         """The FEATURES, shape (f,)."""
-        strength, contrast = abs(self.t), abs(self.log_contrast)
-        beyond = (contrast - np.log(FELT)) * strength / max(contrast, 1e-9)
         size = np.log(self.bump.radius / RADII_M[2])
-        return np.array((strength, np.clip(beyond, -_SURE, _SURE), size, float(self.log_contrast < 0)))
+        return np.array((abs(self.t), self.beyond, size, float(self.log_contrast < 0)))
+
+    @property
+    def beyond(self) -> float:
+        """By how many of its standard deviations the contrast exceeds FELT, within SURE."""
+        contrast = abs(self.log_contrast)
+        return float(np.clip((contrast - np.log(FELT)) * abs(self.t) / max(contrast, 1e-9), -SURE, SURE))
 
 
 def matched(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array]:

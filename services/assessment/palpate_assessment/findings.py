@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.special import expit
 
-from palpate_assessment.detection import Candidate
+from palpate_assessment.detection import SURE, Candidate
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression
 from palpate_models.frames import Array
@@ -47,7 +47,11 @@ class Area:
 
 
 def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid, assessed: Mask) -> list[Area]:
-    """The areas of candidates, most probable first; a candidate that lies in the area of a more probable one belongs to that."""
+    """The areas of candidates, most probable first; a candidate that lies in the area of a more probable one belongs to that.
+
+    What is there, but surely of less contrast than a lump, is none: a navel, say, where everything else is known well.
+    """
+    candidates = [candidate for candidate in candidates if candidate.beyond > -SURE]
     logits = regression.calibration.logit(np.array([c.features for c in candidates])) if candidates else np.zeros(0)
     order = np.argsort(-logits)
     found: list[Area] = []
