@@ -17,10 +17,10 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from palpate.library.assessment import Assessment, StiffnessMap, assess
-    from palpate.library.examination import Examination, run
-    from palpate.library.scenarios import scenario
-    from palpate.library.studies import StudyResult, study
+    from palpate.interface.assessment import Assessment, StiffnessMap, assess
+    from palpate.interface.examination import Examination, run
+    from palpate.interface.scenarios import scenario
+    from palpate.interface.studies import StudyResult, study
     from palpate.quick.patient import Patient, Touch
     from palpate_models.load import ScenarioError
     from palpate_models.scenario import Scenario
@@ -41,18 +41,18 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Assessment": "palpate.library.assessment",
-    "Examination": "palpate.library.examination",
+    "Assessment": "palpate.interface.assessment",
+    "Examination": "palpate.interface.examination",
     "Patient": "palpate.quick.patient",
     "Scenario": "palpate_models.scenario",
     "ScenarioError": "palpate_models.load",
-    "StiffnessMap": "palpate.library.assessment",
-    "StudyResult": "palpate.library.studies",
+    "StiffnessMap": "palpate.interface.assessment",
+    "StudyResult": "palpate.interface.studies",
     "Touch": "palpate.quick.patient",
-    "assess": "palpate.library.assessment",
-    "run": "palpate.library.examination",
-    "scenario": "palpate.library.scenarios",
-    "study": "palpate.library.studies",
+    "assess": "palpate.interface.assessment",
+    "run": "palpate.interface.examination",
+    "scenario": "palpate.interface.scenarios",
+    "study": "palpate.interface.studies",
 }
 """The module of each name of the interface."""
 

@@ -24,8 +24,8 @@ BARE = ""
 EXTRA_OF = {
     "palpate": "run",
     "palpate.__init__": "study",  # names of the interface, which are imported when they are asked for
-    "palpate.library": "library",
-    "palpate.library.studies": "study",
+    "palpate.interface": "library",
+    "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
     "palpate.fuzz": "fuzz",
     "palpate.study": "study",

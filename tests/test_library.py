@@ -13,7 +13,7 @@ import pytest
 from examination import GATE, Finished
 
 import palpate
-from palpate.library.examination import ExaminationError
+from palpate.interface.examination import ExaminationError
 from palpate.quick.patient import Touch
 from palpate.truth.tissue import true_tissue
 from palpate_models import press
@@ -27,15 +27,15 @@ REGION = {"region_m": [0.1, 0.1], "centre_m": [-0.055, -0.055]}
 LAZY = """
 import sys
 import palpate
-heavy = {"numpy", "pandas", "matplotlib", "scipy", "numba", "pydantic", "palpate.library"} & set(sys.modules)
+heavy = {"numpy", "pandas", "matplotlib", "scipy", "numba", "pydantic", "palpate.interface"} & set(sys.modules)
 assert not heavy, heavy
 assert set(palpate.__all__) <= set(dir(palpate))
 import palpate.run.folder
 import palpate.study.folder
 from palpate.run import folder
 assert folder.usual_folder("x").parent.name == "out"
-assert palpate.run.__module__ == "palpate.library.examination", palpate.run
-assert palpate.study.__module__ == "palpate.library.studies", palpate.study
+assert palpate.run.__module__ == "palpate.interface.examination", palpate.run
+assert palpate.study.__module__ == "palpate.interface.studies", palpate.study
 """
 
 
@@ -66,9 +66,9 @@ def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
     [
         "palpate",
         "palpate.quick.patient",
-        "palpate.library.scenarios",
-        "palpate.library.assessment",
-        "palpate.library.examination",
+        "palpate.interface.scenarios",
+        "palpate.interface.assessment",
+        "palpate.interface.examination",
     ],
 )
 def test_the_examples_hold(module: str) -> None:

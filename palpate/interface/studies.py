@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import pandas as pd
 
-from palpate.library.scenarios import paths
+from palpate.interface.scenarios import paths
 from palpate.study.digest import RunRecord, Session
 from palpate.study.folder import add_session, conclude, usual_folder
 from palpate.study.manifest import Request, cases_of

@@ -17,8 +17,8 @@ import pandas as pd
 
 from palpate.command_line import EXIT_FAILED
 from palpate.environment import FIXED
-from palpate.library.assessment import StiffnessMap, findings_frame, findings_html, html_of
-from palpate.library.scenarios import scenario as scenario_of
+from palpate.interface.assessment import StiffnessMap, findings_frame, findings_html, html_of
+from palpate.interface.scenarios import scenario as scenario_of
 from palpate.report.archive import Evidence, read_evidence
 from palpate.report.page import FILE as PAGE
 from palpate.report.page import read_report
