@@ -19,6 +19,7 @@ from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_matrix, transform_matrix
 from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.runs.run_name import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, patient, plots, truth, words
@@ -88,7 +89,7 @@ class DashboardService(Service):
         exam, limit = given.exam, given.limits.force_working_n
         plane = ForceDepthPlane(exam.depth_m, limit)
         layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, limit, plane.bounds)
-        self._recording = open_recording(path, live, layout, scenario.name)
+        self._recording = open_recording(path, live, layout, scenario.name, "" if path is None else run_of(path.parent))
         self._force_depth = ForceDepth(self._recording, plane)
         self._region = (exam.region_m, exam.centre_m)
         self._send_period = SEND_PERIOD_LIVE if paced and live != Live() else SEND_PERIOD

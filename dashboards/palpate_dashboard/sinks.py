@@ -60,8 +60,8 @@ def _serve(port: int) -> Any:
     return server
 
 
-def open_recording(path: Path | None, live: Live, blueprint: Any, name: str) -> rr.RecordingStream:
-    """A recording named `name` that goes to the file `path`, if there is one, and to viewers as `live` says.
+def open_recording(path: Path | None, live: Live, blueprint: Any, name: str, run: str = "") -> rr.RecordingStream:
+    """A recording named `name`, of the run `run`, that goes to the file `path`, if there is one, and to viewers as `live` says.
 
     Its rows carry simulated time and nothing else. Raises OSError if the file cannot be written.
     """
@@ -77,5 +77,5 @@ def open_recording(path: Path | None, live: Live, blueprint: Any, name: str) -> 
     if live.connect_url is not None:
         sinks.append(rr.GrpcSink(live.connect_url))
     recording.set_sinks(*sinks, default_blueprint=blueprint)
-    recording.send_recording_name(name)
+    recording.send_recording_name(f"{name}, run {run}" if run else name)
     return recording

@@ -86,6 +86,8 @@ class Evidence:
     """Where the tool was believed to touch the skin, and where it did."""
     pressed: Pressed | None
     """What a copy of the patient feels like; None where none can be made."""
+    run: str = ""
+    """Name of the run."""
 
     def phases(self) -> list[tuple[int, float, float]]:
         """Phase, begin and end [s], in order."""
@@ -107,11 +109,14 @@ def _events(collected: Collected) -> list[Event]:
     return sorted(events, key=lambda event: event.time_s)
 
 
-def write_evidence(path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None) -> None:
-    """Writes what was collected of a run, complete or not, and what is known of its truth."""
+def write_evidence(
+    path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None, run: str = ""
+) -> None:
+    """Writes what was collected of the run called `run`, complete or not, and what is known of its truth."""
     states, contacts = c.exam_states, c.indentation
     events = _events(c)
     columns: dict[str, Any] = {
+        "run": np.array(run),
         "time": np.array([nanoseconds(s.header.stamp) / NS for s in states]),
         "phase": np.array([s.phase for s in states], dtype=np.uint8),
         **{name: np.array([getattr(s, field) for s in states], dtype=np.float32) for name, field in _FLOATS.items()},
@@ -178,7 +183,11 @@ def read_evidence(folder: Path) -> Evidence:
         felt = {name: held.pop(f"pressed_{name}") for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in held}
         columns: dict[str, Any] = {k: v.astype(np.float64) if v.dtype == np.float32 else v for k, v in held.items()}
         count = int(columns.pop("target_count"))
-        known: dict[str, Any] = {"touched": touched, "pressed": Pressed(**felt) if felt else None}
+        known: dict[str, Any] = {
+            "run": str(columns.pop("run", "")),
+            "touched": touched,
+            "pressed": Pressed(**felt) if felt else None,
+        }
         return Evidence(**columns, **known, target_count=count, events=events, **messages)
     except (KeyError, TypeError, ValueError) as error:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error

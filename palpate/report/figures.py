@@ -155,10 +155,12 @@ class Drawing:
             axis._axinfo["grid"].update(color="#dfe5e8", linewidth=0.6)
 
 
-def draw_map(path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str) -> None:
+def draw_map(
+    path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str, run: str = ""
+) -> None:
     """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A) with the truth, where known, into a PNG file.
 
-    Nothing is drawn of a map that is not `drawable`.
+    The file's metadata name the run. Nothing is drawn of a map that is not `drawable`.
     """
     if not drawable(message):
         return
@@ -170,7 +172,7 @@ def draw_map(path: Path, message: Any, findings: Any | None, samples: Samples, t
     _draw_force(figure, grid, drawing, samples)
     _draw_stiffness(figure, grid, drawing)
     figure.suptitle(f"{title}: {_summary(drawing)}", fontsize=15, weight="bold", color=INK)
-    figure.savefig(path)
+    figure.savefig(path, metadata={"Title": title, "Comment": f"run {run}"})
 
 
 def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -> None:

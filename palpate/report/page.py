@@ -17,6 +17,7 @@ from markupsafe import Markup
 from pydantic import ValidationError
 
 from palpate.report import page_figures, page_surface
+from palpate.report.archive import FILE as EVIDENCE
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
 from palpate.report.evidence import body_of, felt_truth
 from palpate.report.results import clean_words
@@ -56,6 +57,8 @@ def read_report(folder: Path) -> Report:
 def write_page(folder: Path) -> Path:
     """Writes report.html into the results folder of a run; returns its path. Raises EvidenceError."""
     report, evidence = read_report(folder), read_evidence(folder)
+    if report.run != evidence.run:
+        raise EvidenceError(f"{folder}: report.json is of the run {report.run}, {EVIDENCE} of {evidence.run}: these are two runs")
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))
     except ScenarioError as error:

@@ -31,6 +31,7 @@ from palpate.report.platforms import fingerprint
 from palpate.report.rows import DepthRow, FindingRow, LumpRow, Report, TruthRow
 from palpate.truth.pressed import press_patient
 from palpate.truth.surface import TrueBody
+from palpate_bus.runs.run_name import run_of
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunResult
 from palpate_models.frames import Array, apply, inverse
@@ -115,14 +116,16 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report
     """Writes report.json, samples.csv, evidence.npz and, when there is a map, map.png into a run's folder; returns the report."""
     c = result.collected
     known = truth_of_run(scenario, c)
-    report = assemble(scenario, result, known)
+    run = run_of(folder)
+    report = assemble(scenario, result, known).model_copy(update={"run": run})
     samples = samples_of(c.samples)
     write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
-    write_samples(folder / "samples.csv", samples)
+    write_samples(folder / "samples.csv", samples, run)
     touched, felt = None if known.contact is None else known.contact.touched, known.felt
-    archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed)
+    archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed, run)
     if c.stiffness_map is not None:
-        draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, known.felt, f"{scenario.name}, seed {scenario.seed}")
+        title = f"{scenario.name}, seed {scenario.seed}"
+        draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, known.felt, title, run)
     return report
 
 
@@ -145,14 +148,14 @@ def sample_columns(samples: Samples) -> dict[str, Array]:
     }
 
 
-def write_samples(path: Path, samples: Samples) -> None:
-    """samples.csv: one row a sample, in the abdomen frame."""
+def write_samples(path: Path, samples: Samples, run: str = "") -> None:
+    """samples.csv: one row a sample of the run called `run`, in the abdomen frame."""
     columns = sample_columns(samples)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow((*columns, "force_limited"))
+        writer.writerow((*columns, "force_limited", "run"))
         for row, limited in zip(np.column_stack(tuple(columns.values())), samples.force_limited, strict=True):
-            writer.writerow((*(f"{value:.6g}" for value in row), int(limited)))
+            writer.writerow((*(f"{value:.6g}" for value in row), int(limited), run))
 
 
 def print_findings(console: Console, report: Report) -> None:

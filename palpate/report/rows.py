@@ -72,6 +72,8 @@ class DepthRow(_Row):
 class Report(_Row):
     """report.json."""
 
+    run: str = ""
+    """Name of the run, which every result in its folder repeats."""
     scenario: str
     seed: int
     clean_world: bool

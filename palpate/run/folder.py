@@ -10,10 +10,12 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+from palpate_bus.runs.run_name import FILE as RUN
+
 LOCK = "run.lock"
 """The file whose lock the run holds; it names the process. The kernel drops the lock when the process ends, however it ends."""
-OURS = frozenset({LOCK, "scenario.yaml"})
-"""A folder that has neither of these is no results folder, and is not removed."""
+OURS = frozenset({LOCK, RUN, "scenario.yaml"})
+"""A folder that has none of these is no results folder, and is not removed."""
 
 
 class FolderError(ValueError):

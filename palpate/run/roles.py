@@ -12,6 +12,7 @@ import typer
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
+from palpate_bus.runs.run_name import name_run
 from palpate_models.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario import Scenario, Services
 
@@ -77,10 +78,15 @@ def checked(scenario: Scenario) -> Scenario:
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
-    """Makes the results folder and in it a scenario file of each view; returns the file that each role may see."""
+    """Makes the results folder, names its run, and writes a scenario file of each view; returns the file that each role may see.
+
+    Only scenario.yaml names the run: what the examination is given shall be the same whenever the examination is.
+    """
     (out / "logs").mkdir(parents=True, exist_ok=True)
     for name in RESULTS:  # of an earlier run in the same folder: nobody is to take them for this one's
         (out / name).unlink(missing_ok=True)
+    named = f"# run {name_run(out)}\n"
     for view in HIDDEN:
-        (out / f"{view}.yaml").write_text(dump_scenario(scenario, view), encoding="utf-8")
+        text = dump_scenario(scenario, view)
+        (out / f"{view}.yaml").write_text(named + text if view == "scenario" else text, encoding="utf-8")
     return {role: out / f"{view_of(role)}.yaml" for role in (*WORKERS, *OBSERVERS)}

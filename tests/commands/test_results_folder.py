@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
+from conductor_messages import SETTINGS, collected, result
+from PIL import Image
 
+from palpate.report.archive import EvidenceError, read_evidence
+from palpate.report.page import write_page
+from palpate.report.results import write_results
 from palpate.run.folder import FolderError, results_folder
+from palpate.run.roles import write_scenario_files
+from palpate_bus.runs.run_name import run_of
+from palpate_models.load import load_scenario
 
 
 def test_a_folder_with_anything_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
@@ -39,6 +48,29 @@ def test_two_runs_cannot_have_one_folder_at_a_time(tmp_path: Path, overwrite: bo
         with pytest.raises(FolderError, match="a run is writing into it"), results_folder(out, overwrite=overwrite):
             pass
         assert (out / "scenario.yaml").exists()
+
+
+def test_every_result_names_the_run_it_belongs_to(tmp_path: Path) -> None:
+    scenario = load_scenario("clean", SETTINGS, seed=3)
+    write_scenario_files(scenario, tmp_path)
+    report = write_results(tmp_path, scenario, result(collected()))
+    write_page(tmp_path)
+    run = run_of(tmp_path)
+    assert len(run) == 12
+    assert report.run == run == read_evidence(tmp_path).run
+    for name in ("run.json", "scenario.yaml", "report.json", "report.html", "samples.csv"):
+        assert run in (tmp_path / name).read_text(encoding="utf-8"), name
+    assert run in Image.open(tmp_path / "map.png").info["Comment"]
+
+
+def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path) -> None:
+    scenario = load_scenario("clean", SETTINGS, seed=3)
+    for name in ("one", "two"):
+        write_scenario_files(scenario, tmp_path / name)
+        write_results(tmp_path / name, scenario, result(collected()))
+    shutil.copy(tmp_path / "one" / "evidence.npz", tmp_path / "two")
+    with pytest.raises(EvidenceError, match="these are two runs"):
+        write_page(tmp_path / "two")
 
 
 def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:

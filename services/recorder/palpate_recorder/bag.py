@@ -111,13 +111,18 @@ class BagWriter:
         folder: Path,
         channels: Iterable[Channel],
         *,
+        run: str = "",
         flush_every: int = 1_000_000_000,
         file_bytes: int = FILE_BYTES,
         compression: CompressionType = CompressionType.ZSTD,
     ) -> None:
-        """Opens `folder` (created, parents included) for `channels`. Raises OSError if it cannot be written."""
+        """Opens `folder` (created, parents included) for `channels` of the run called `run`.
+
+        Raises OSError if it cannot be written.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
+        self._run = run
         self.metadata_path = folder / "metadata.yaml"
         self.metadata_path.unlink(missing_ok=True)
         for old in folder.glob(f"{folder.name}_*.mcap"):
@@ -142,6 +147,7 @@ class BagWriter:
         self._stream = self._file.path.open("wb")
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=self._compression)
         self._writer.start(profile="ros2", library="palpate-recorder")
+        self._writer.add_metadata("palpate", {"run": self._run})
         self._ids = self._register()
 
     def _register(self) -> dict[str, int]:
@@ -223,6 +229,6 @@ class BagWriter:
             "compression_format": "",
             "compression_mode": "",
             "files": [{"path": file.path.name, **file.extent} for file in self._files],
-            "custom_data": None,
+            "custom_data": {"run": self._run},
             "ros_distro": "jazzy",
         }

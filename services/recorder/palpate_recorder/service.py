@@ -12,6 +12,7 @@ from typing import Any
 
 from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.messages import codec
+from palpate_bus.runs.run_name import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.scenario import Scenario
@@ -43,7 +44,7 @@ class RecorderService(Service):
 
     def __init__(self, folder: Path, file_bytes: int = FILE_BYTES) -> None:
         """Opens the recording, in files of about `file_bytes`. Raises OSError if the folder cannot be written."""
-        self._bag = BagWriter(folder, channels(contract()), file_bytes=file_bytes)
+        self._bag = BagWriter(folder, channels(contract()), run=run_of(folder.parent), file_bytes=file_bytes)
         self._names = {topic.name: f"/{topic.name}" for topic, _ in contract().inputs(self.role)}
         self._unexpected = 0
 
