@@ -33,7 +33,7 @@ from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.run import chosen, run_service
-from palpate_bus.wire.transport import HELLO, Sender, Transport
+from palpate_bus.wire.transport import Sender, Transport
 from palpate_models.load import load_scenario
 
 DELAY_S: Final = 0.5
@@ -98,7 +98,7 @@ class FaultySender:
         self._left = fault.count
 
     def _due(self, sequence: int) -> bool:
-        if sequence == HELLO or (self._left == 0 and self._fault.count):
+        if self._left == 0 and self._fault.count:
             return False
         at = self._fault.at
         due = self._struck() if at is None else (sequence - 1) * self._topic.period >= at

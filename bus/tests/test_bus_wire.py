@@ -86,6 +86,14 @@ def test_garbage_keys_raise_wire_error_at_most(key: str) -> None:
     assert wire.parse_key(str(parsed)) == parsed
 
 
+def test_hellos_have_a_key_of_their_own() -> None:
+    """On a topic's key an empty message would be a broken one to every ROS 2 client."""
+    key = wire.topic_key(contract().topics["joint_states"], 0)
+    hello = wire.hello_key(key)
+    assert hello == f"0/palpate/hello/{key.removeprefix('0/')}"
+    assert wire.parse_key(hello).type == "sensor_msgs/msg/JointState"
+
+
 def test_any_type_key_meets_topics_whose_definition_differs() -> None:
     import zenoh
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -78,6 +79,20 @@ def test_an_endpoint_in_use_is_an_error(tmp_path: Path) -> None:
     options = BusOptions(listen=(f"unixsock-stream/{tmp_path}/a.sock",))
     with session(options), pytest.raises(BusConfigError, match=r"cannot open a zenoh session.*a\.sock"):
         open_session(options)
+
+
+def test_a_port_in_use_is_said_in_one_line() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        where = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(BusConfigError) as refused:
+            open_session(BusOptions(mode="router", listen=(where,)))
+    said = str(refused.value)
+    assert said == (
+        f"cannot open a zenoh session that listens at {where}: that address is in use; "
+        "end the process that listens there, or name another address"
+    )
 
 
 @pytest.mark.parametrize(

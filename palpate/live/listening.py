@@ -12,7 +12,6 @@ import zenoh
 from palpate_bus.contract import Topic
 from palpate_bus.runs.joining import NoBus
 from palpate_bus.wire.rmw import WireError, topic_key, unpack
-from palpate_bus.wire.transport import HELLO
 
 LONG = 12
 """Arrays of more items than this are shortened for people."""
@@ -34,7 +33,6 @@ class Listener:
     def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
         self.garbage = 0
-        self._open = topic.open
         key = topic_key(topic, domain)
         handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
         if topic.latched:
@@ -57,8 +55,7 @@ class Listener:
             except (WireError, AttributeError):
                 self.garbage += 1
                 continue
-            if sequence != HELLO or (self._open and len(sample.payload)):
-                return Heard(sequence, sent, gid, sample.payload.to_bytes())
+            return Heard(sequence, sent, gid, sample.payload.to_bytes())
 
     def take(self) -> Heard | None:
         """The next message, None when none waits."""

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.command_line import refuse
-from palpate_bus.security.keys import CA_KEY, DAYS, KeysError, certificates, init, members
+from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, DAYS, KEY, KeysError, certificates, init, members
 
 app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
 
@@ -34,11 +34,17 @@ def make(
         made = init(folder, name or (), host or (), days)
     except (KeysError, OSError, ValueError) as error:
         refuse(error)
+    for certificate in made:
+        console.print(
+            f"wrote {certificate.path.parent}: {CERTIFICATE}, {KEY}, {CA}, until {certificate.until:%Y-%m-%d}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    console.print(f"{len(made)} new in {folder}" if made else f"{folder}: all hold", highlight=False, soft_wrap=True)
     console.print(
-        f"{len(made)} new in {folder}: {', '.join(c.name for c in made)}" if made else f"{folder}: all hold", highlight=False
-    )
-    console.print(
-        f"give each member its own folder only; keep {folder / CA_KEY} away from the machines of a run", highlight=False
+        f"give each member its own folder only; keep {folder / CA_KEY} away from the machines of a run",
+        highlight=False,
+        soft_wrap=True,
     )
 
 

@@ -9,6 +9,7 @@ Prints one JSON line for each, and leaves with 0 when all came.
 
 import argparse
 import json
+import logging
 import sys
 import threading
 import time
@@ -47,6 +48,7 @@ def main():
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=120.0)
     options = parser.parse_args()
+    logging.basicConfig(level=logging.WARNING)
     where = {"domain_id": options.domain, "router_port": options.port}
     ZenohSession.get_instance("127.0.0.1", options.port)
     get_registry(options.definitions)
@@ -72,6 +74,7 @@ def main():
 
     subscribers = [ROS2Subscriber(topic, kind, hear(topic), **where) for topic, kind in HEARD.items()]
     subscribers.append(ROS2Subscriber("/robot/status", "palpation_msgs/msg/RobotStatus", watch, **where))
+    print(json.dumps({"listening": sorted(HEARD)}), flush=True)
     while len(heard) < len(HEARD) and time.monotonic() < end:
         time.sleep(0.1)
     names = dict(get_topic_names_and_types(domain_id=options.domain, router_port=options.port, timeout=2.0))

@@ -69,6 +69,10 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
     settings = RigSettings(load_scenario("clean"), slack_ms=3000)
     with ExitStack() as stack:
         bus = stack.enter_context(session(BusOptions(mode="router", listen=(where,))))
+        words = [sys.executable, str(CLIENT), str(port), str(tmp_path / "definitions"), "--seconds", "150"]
+        client = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert client.stdout is not None
+        lines = [client.stdout.readline()]  # it listens from before the hellos on
         rigs = {}
         for role in ("camera", "robot"):
             rig = rigs[role] = LiveRig(bus, role, settings)
@@ -76,10 +80,6 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
             stack.enter_context(started(shlex.join([sys.executable, "-m", f"palpate_{role}"]), role, settings, where, 0))
         for role, rig in rigs.items():
             rig.await_implementation(120, ConformanceReport(role))
-        words = [sys.executable, str(CLIENT), str(port), str(tmp_path / "definitions"), "--seconds", "150"]
-        client = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        lines: list[str] = []
-        assert client.stdout is not None
         reading = threading.Thread(target=lambda: lines.extend(client.stdout or ()), daemon=True)
         reading.start()
         surface = {"sim/surface": plane(np.array(settings.scenario.camera.look_at_m))}
@@ -91,6 +91,7 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
         errors = client.stderr.read() if client.stderr else ""
     said = [json.loads(line) for line in lines if line.startswith("{")]
     assert client.returncode == 0, (said, errors[-2000:])
+    assert "ERROR" not in errors, errors[-2000:]
     heard = {row["heard"]: row for row in said if "heard" in row}
     assert heard["/joint_states"]["names"] == [f"lbr_A{i}" for i in range(1, 8)]
     assert heard["/ft/wrench"]["frame"] == "ft_sensor"

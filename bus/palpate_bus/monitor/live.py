@@ -26,7 +26,6 @@ from palpate_bus.monitor.health import Violation
 from palpate_bus.monitor.monitor import Monitor
 from palpate_bus.wire.liveliness import GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
-from palpate_bus.wire.transport import HELLO
 
 ROOM = 1 << 15
 """Messages that wait for a poll, a topic."""
@@ -145,8 +144,6 @@ class _Listener:
             except (WireError, AttributeError) as error:
                 why = "no attachment" if attachment is None else str(error)
                 monitor.garbage(self.topic.name, why, now)
-                continue
-            if sequence == HELLO and not (self.topic.open and len(sample.payload)):
                 continue
             try:
                 key = parse_key(str(sample.key_expr))

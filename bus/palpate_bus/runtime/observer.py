@@ -19,7 +19,7 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.service import Service
 from palpate_bus.wire.rmw import WireError, unpack
-from palpate_bus.wire.transport import HELLO, decoded
+from palpate_bus.wire.transport import decoded
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,6 @@ class _Feed:
         self.sequence = 0
         self.missed = 0
         self.garbage = 0
-        self.heard = False
 
     def drain(self) -> list[tuple[int, bytes, codec.Message]]:
         """Everything that came in since last time: (sequence, payload, message)."""
@@ -61,9 +60,6 @@ class _Feed:
                 self.garbage += 1
                 continue
             payload = sample.payload.to_bytes()
-            if sequence == HELLO and not (payload and self.topic.open):
-                self.heard = True
-                continue
             message = decoded(self._decode, payload)
             if message is None:  # an observer knows no rightful sender, and must not end with what it gets
                 self.garbage += 1

@@ -21,6 +21,7 @@ from typing import Any
 
 from palpate_bus.contract import Contract, Internal, Visibility, contract
 from palpate_bus.wire.liveliness import ADMIN_SPACE
+from palpate_bus.wire.rmw import hello_key
 
 VIEWER = "viewer"
 """A member who may read every public topic and send nothing: a guest's RViz or Foxglove, or `palpate doctor`."""
@@ -111,8 +112,9 @@ def public(rules: Contract) -> list[str]:
 
 
 def _keys(topic: str) -> list[str]:
-    """Keys of a topic in any domain: of its messages, and of what zenoh's advanced publishers add for latched ones."""
-    return [f"*/{topic}/*/*", f"*/{topic}/*/*/@adv/**"]
+    """Keys of a topic in any domain: of its messages, of hellos, and of what zenoh's advanced publishers add for latched ones."""
+    key = f"*/{topic}/*/*"
+    return [key, hello_key(key), f"{key}/@adv/**"]
 
 
 def _internal_sent(row: Internal, role: str) -> list[str]:

@@ -33,6 +33,9 @@ GID_SIZE = 16
 ATTACHMENT_SIZE = 8 + 8 + 1 + GID_SIZE
 """Bytes in an attachment."""
 
+HELLO_SPACE = "palpate/hello"
+"""Begin of the keys on which edges are tested before the first tick."""
+
 _ATTACHMENT = struct.Struct(f"<qqB{GID_SIZE}s")
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]*)_")
 _HASH = re.compile(r"RIHS01_[0-9a-f]{64}")
@@ -105,6 +108,12 @@ def parse_key(key: str) -> TopicKey:
     if not _HASH.fullmatch(digest):
         raise WireError(f"key {key!r}: {digest!r} is no RIHS01 hash")
     return TopicKey(int(domain), "/".join(topic), ros_type(dds), digest)
+
+
+def hello_key(key: str) -> str:
+    """Where the producer of a key says hello to its readers: a key of our own, since an empty message is none of ROS's."""
+    domain, _, rest = key.partition("/")
+    return f"{domain}/{HELLO_SPACE}/{rest}"
 
 
 def any_type_key(topic: str, domain: int) -> str:

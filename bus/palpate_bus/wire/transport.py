@@ -15,7 +15,7 @@ import zenoh
 
 from palpate_bus.contract import Qos
 from palpate_bus.messages.codec import CodecError
-from palpate_bus.wire.rmw import AttachmentWriter, WireError, unpack
+from palpate_bus.wire.rmw import AttachmentWriter, WireError, hello_key, unpack
 
 HELLO = 0
 """Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""
@@ -49,6 +49,7 @@ class Publisher:
     def __init__(self, session: zenoh.Session, key: str, qos: Qos, gid: bytes, now: Callable[[], int] = time_ns) -> None:
         """`now` gives the wall time [ns] that each message carries."""
         self.key = key
+        self._session = session
         self._now = now
         options: dict[str, Any] = {
             "priority": getattr(zenoh.Priority, qos.priority),
@@ -70,7 +71,7 @@ class Publisher:
 
     def hello(self) -> None:
         """Sends the empty message that tests the edge."""
-        self.put(b"", HELLO)
+        self._session.put(hello_key(self.key), b"", attachment=self._pack(HELLO, self._now()))
 
     def close(self) -> None:
         """Undeclares the publisher."""
@@ -103,6 +104,8 @@ class Subscription:
             )
         else:
             self._subscriber = session.declare_subscriber(key, handler)
+        # Declared after the data's: a producer whose hello arrives here knows of both.
+        self._hellos: Any = session.declare_subscriber(hello_key(key), handler)
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
         """The next message; None when `timeout` [s] passes without one. A timeout of 0 does not wait."""
@@ -125,9 +128,11 @@ class Subscription:
                     continue
                 self._gid = gid
             payload = raw.payload.to_bytes()
-            # Some clients of rmw_zenoh's wire number their messages from 0.
-            if sequence == HELLO and not (payload and self._decode is not None):
-                self.heard = True
+            if not payload:
+                self.heard = self.heard or sequence == HELLO
+                continue
+            if sequence == HELLO and self._decode is None:  # some clients of rmw_zenoh's wire number their messages from 0
+                self.garbage += 1
                 continue
             if self._decode is not None and decoded(self._decode, payload) is None:
                 self.garbage += 1
@@ -140,7 +145,8 @@ class Subscription:
             self._retired, self._gid = self._gid, None
 
     def close(self) -> None:
-        """Undeclares the subscriber."""
+        """Undeclares the subscribers."""
+        self._hellos.undeclare()
         self._subscriber.undeclare()
 
 

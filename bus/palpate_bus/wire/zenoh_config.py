@@ -35,6 +35,7 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -58,6 +59,10 @@ POOLS = "(rx: (handover: net), acc: (handover: net), net: (worker_threads: 2))"
 """`ZENOH_RUNTIME` where the environment has none: sockets are read by the threads that watch them."""
 LOCKSTEP_DROP_WAIT_US = 1_000_000
 WALL_CLOCK_DROP_WAIT_US = 1_000
+
+
+_SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
+"""Where in its own source zenoh met an error."""
 
 
 @dataclass(frozen=True)
@@ -235,9 +240,24 @@ def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | 
     try:
         opened = zenoh.open(config)
     except zenoh.ZError as error:
-        raise BusConfigError(f"cannot open a zenoh session with {options}: {error}") from error
+        raise BusConfigError(f"cannot open a zenoh session {_in_words(options)}: {_reason(error)}") from error
     atexit.register(close_session, opened)
     return opened
+
+
+def _in_words(options: BusOptions) -> str:
+    """Where a session listens and connects."""
+    listens = f"that listens at {', '.join(options.listen)}" if options.listen else "that listens nowhere"
+    asked = [*options.connect, *([options.router] if options.router else [])]
+    keys = f" with the keys in {options.tls}" if options.tls is not None else ""
+    return listens + (f" and connects to {', '.join(asked)}" if asked else "") + keys
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """What zenoh says, without the lines of its source; a port in use is said in a sentence."""
+    if "os error 98" in str(error):
+        return "that address is in use; end the process that listens there, or name another address"
+    return _SOURCE_LINE.sub("", str(error)).rstrip(". ")
 
 
 def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
