@@ -21,6 +21,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 import palpate_assessment
+from palpate.quick.felt import FeltPatient, felt_patient
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.detection import FEATURES, FELT, detect
 from palpate_assessment.observations import observe
@@ -28,7 +29,7 @@ from palpate_models.draw import Draw
 from palpate_models.frames import Array
 from palpate_models.patient import Phantom
 from palpate_models.seeds import generator
-from palpate_validation.felt_scans import FeltPatient, ScanErrors, felt_patient, felt_samples
+from palpate_validation.felt_scans import ScanErrors, felt_samples
 
 _TAIL: Final = 0.25
 """Part of the healthy examinations that the tail is fitted to."""

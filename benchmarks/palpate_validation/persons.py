@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
+from palpate.quick.felt import force_at_10_mm
 from palpate_models.draw import Build
 from palpate_models.frames import Array
-from palpate_models.patient import Phantom, Stiffness
+from palpate_models.patient import Phantom
 from palpate_models.person import drawn
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.phantom.bones import bone_share
-from palpate_models.phantom.tension import pressed_force
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK, QUIET
 
@@ -25,7 +25,6 @@ SHOWN_N = (0.7, 15.0)
 TICKS_N = (1, 2, 5, 10)
 REGION_M = 0.1
 STRIP_M = 0.012
-_TABLE = np.linspace(0.0, 600.0, 25)
 
 
 @dataclass(frozen=True)
@@ -58,12 +57,6 @@ def _person(build: Build, seed: int) -> Person:
     phantom = drawn(Phantom(kind="person", build=build), seed)
     model = build_phantom(phantom, seed)
     return Person(build, phantom, model, force_at_10_mm(model, phantom.stiffness))
-
-
-def force_at_10_mm(model: PhantomModel, wall: Stiffness) -> Array:
-    """Force [N] of a press of 10 mm on a flat wall with the stiffness and stiffening of each vertex, shape (n,)."""
-    unit = [pressed_force(wall.model_copy(update={"stiffening_per_m": beta}), 0.0) for beta in _TABLE.tolist()]
-    return model.stiffness / wall.k_w_n_per_m3 * np.interp(model.stiffening, _TABLE, unit)
 
 
 def section(found: tuple[Person, ...] | None = None) -> PageSection:

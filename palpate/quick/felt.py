@@ -1,0 +1,94 @@
+"""What the standard press feels of a person, without physics in time.
+
+A place's force follows from the wall's stiffness and stiffening there (`force_at_10_mm`) and is averaged over the indenter's
+footprint on a Winkler-Pasternak foundation. It takes half a second a person, so that thousands can be had.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.signal import fftconvolve
+from scipy.special import k0, k1
+
+from palpate_models.frames import Array
+from palpate_models.patient import Phantom, Stiffness
+from palpate_models.person import drawn
+from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.phantom.tension import pressed_force
+
+PITCH_M: Final = 0.004
+HALF_M: Final = 0.148
+"""Half the side of the square in which the wall is known."""
+CONTACT_M: Final = 0.009
+"""Radius of the contact of a sphere of 15 mm at 10 mm depth [C, of the foundation's obstacle problem]."""
+POWER: Final = 0.8
+"""A wall that gives way beside a stiff place makes the mean over the footprint a power mean of this exponent [C, transients]."""
+_TABLE: Final = np.linspace(0.0, 600.0, 25)
+
+
+@dataclass(frozen=True)
+class FeltPatient:
+    """What the standard press feels of a person, by the footprint's mean, on a square grid about the umbilicus; n x n places."""
+
+    force: Array
+    """[N], shape (n, n), rows along y."""
+    healthy: Array
+    """The same without lumps."""
+
+    def force_at(self, xy: Array) -> Array:
+        """Force [N] at places [m], shape (m, 2) -> (m,)."""
+        return np.asarray(map_coordinates(self.force, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
+
+    def excess_at(self, xy: Array) -> Array:
+        """The logarithm of the felt contrast of all lumps at places [m], shape (m, 2) -> (m,)."""
+        excess = np.log(self.force / self.healthy)
+        return np.asarray(map_coordinates(excess, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
+
+
+def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
+    """The person of a seed with the lumps that the phantom draws or has."""
+    phantom = drawn(phantom, seed)
+    model = build_phantom(phantom, seed)
+    axis = np.arange(-HALF_M, HALF_M + 1e-9, PITCH_M)
+    footprint = _footprint(phantom.stiffness.length_m)
+    front = (model.normals[:, 2] > 0.2) & (np.abs(model.vertices[:, :2]) < 1.2 * HALF_M).all(axis=1)
+    xy = np.stack(np.meshgrid(axis, axis), axis=-1)
+
+    def felt(modulus: Array) -> Array:
+        force = force_at_10_mm(replace(model, stiffness=modulus), phantom.stiffness) * (1 + 0.4 * model.tension)
+        raster = np.nan_to_num(
+            LinearNDInterpolator(model.vertices[front, :2], np.log(force[front]))(xy), nan=float(np.log(np.median(force[front])))
+        )
+        padded = np.pad(np.exp(POWER * raster), len(footprint) // 2, mode="edge")
+        return np.asarray(fftconvolve(padded, footprint, mode="valid") ** (1 / POWER))
+
+    return FeltPatient(felt(model.stiffness), felt(model.background))
+
+
+def _footprint(length: float) -> Array:
+    """Sensitivity of the force to the modulus about the indenter, on the grid, summing to 1.
+
+    By the envelope theorem dF = dk_w (u phi + l^2 grad u . grad phi) with the influence phi = K0(r / l) / K0(a / l)
+    beyond the contact.
+    """
+    reach = min(round(3 * length / PITCH_M) + 3, 15)
+    axis = np.arange(-reach, reach + 1) * PITCH_M
+    r = np.hypot(*np.meshgrid(axis, axis))
+    a = CONTACT_M
+    beyond = np.maximum(r, a) / length
+    edge = 0.010 - 0.015 + np.sqrt(0.015**2 - a**2)
+    outside = edge * (k0(beyond) ** 2 + k1(beyond) ** 2) / k0(a / length) ** 2
+    inside = 0.010 - 0.015 + np.sqrt(0.015**2 - np.minimum(r, a) ** 2)
+    footprint = gaussian_filter(np.where(r < a, inside, outside), 0.5)
+    return np.asarray(footprint / footprint.sum())
+
+
+def force_at_10_mm(model: PhantomModel, wall: Stiffness) -> Array:
+    """Force [N] of a press of 10 mm on a flat wall with the stiffness and stiffening of each vertex, shape (n,)."""
+    unit = [pressed_force(wall.model_copy(update={"stiffening_per_m": beta}), 0.0) for beta in _TABLE.tolist()]
+    return model.stiffness / wall.k_w_n_per_m3 * np.interp(model.stiffening, _TABLE, unit)

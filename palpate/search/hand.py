@@ -1,0 +1,152 @@
+"""Presses of a patient with the errors that whole examinations have, each with the time that it takes.
+
+Two hands press alike: one the true tissue, in steps of 10 ms, the other what the standard press feels of the wall
+(`palpate.quick.felt`), which takes no physics and a hundredth of the time. Places are in the abdomen frame as it is registered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final, Protocol
+
+import numpy as np
+
+from palpate.quick.errors import Loop, LoopErrors, loop_errors
+from palpate.quick.felt import FeltPatient, felt_patient
+from palpate.quick.patient import PERIOD_S, Patient
+from palpate_models.breathing import BreathingCurve
+from palpate_models.frames import Array
+from palpate_models.load import exam_input
+from palpate_models.scenario import Scenario
+from palpate_models.seeds import generator
+from palpate_search.presses import Budget, Press, Task, seconds
+
+DESCENT_MPS: Final = 0.030
+HOLD_S: Final = 0.3
+_TARE_N: Final = 0.05
+"""Error of the zero of the surrogate's force sensor, and ..."""
+_NOISE_N: Final = 0.02
+"""... of a press's mean force."""
+_EXPONENT: Final = (1.35, 0.1)
+"""How its force grows with depth, over persons."""
+_SHALLOWEST_M: Final = 0.002
+
+
+class Hand(Protocol):
+    """Presses one patient."""
+
+    task: Task
+    spent: float
+    """Time since the search began [s]."""
+
+    def press(self, xy: Array, depth: float) -> Press:
+        """Presses at a place [m], shape (2,), to `depth` [m]: what the examination measured. Raises ValueError off the region."""
+
+
+class _Timed:
+    """What both hands have: the examination's errors and the time."""
+
+    def __init__(self, scenario: Scenario, budget: Budget, errors: LoopErrors | None) -> None:
+        self._errors = errors or loop_errors(scenario)
+        self.task = replace(Task.of(exam_input(scenario), budget), depth_uncertainty=self._errors.uncertainty_m)
+        self._loop = Loop(scenario, self._errors)
+        self.spent = 0.0
+        self._here: Array | None = None
+        self._strokes = 0
+
+    def _begin(self, xy: Array, depth: float) -> float:
+        """Checks a press and counts it; returns how long it takes [s]."""
+        if not np.all((xy >= self.task.low - 1e-9) & (xy <= self.task.high + 1e-9)):
+            raise ValueError(f"place = {xy.tolist()} m: want one within {self.task.low.tolist()} to {self.task.high.tolist()} m")
+        if not 0 < depth <= self.task.deepest + 1e-9:
+            raise ValueError(f"depth = {depth} m: want more than 0 and at most {self.task.deepest} m")
+        duration = float(seconds(self._here, xy))
+        self.spent += duration
+        self._here, self._strokes = xy, self._strokes + 1
+        return duration
+
+    def _wrong(self, xy: Array) -> float:
+        """How much too deep the stroke is believed to be, all the while [m]."""
+        return float(self._loop.wrong(xy[None])[0]) + self._loop.zero(self._strokes)
+
+
+class PatientHand(_Timed):
+    """Presses the true tissue."""
+
+    def __init__(self, scenario: Scenario, budget: Budget, errors: LoopErrors | None = None) -> None:
+        """`errors`: None for those of loop.yaml. Raises what `Patient` does, and UnknownLoopError where it has none."""
+        super().__init__(scenario, budget, errors)
+        self.patient = Patient(scenario, time=self._loop.begin_s)
+        self._begin_s = self._loop.begin_s
+        self._breathing = self.patient.surface.between(self.patient.tissue.model.breathing)
+        self._mean = self.patient.tissue.breathing.mean_m
+
+    def press(self, xy: Array, depth: float) -> Press:
+        """As `Hand.press`."""
+        patient, loop = self.patient, self._loop
+        idle = self._begin(xy, depth) - depth / DESCENT_MPS - HOLD_S
+        patient.rest(max(idle, 0.0))
+        loop.tare(self._period)
+        places, normals = patient.surface.points((xy + loop.aside_m)[None])
+        place, normal = places[0], normals[0]
+        gain = loop.gains(normals)[0]
+        share, wrong = float(self._breathing((xy + loop.aside_m)[None])[0]), self._wrong(xy)
+        measured, force, limited, held = 0.0, 0.0, False, 0
+        depths: list[float] = []
+        forces: list[float] = []
+        while held < round(HOLD_S / PERIOD_S):
+            if force >= self.task.force:
+                limited = True
+            at_depth = limited or measured >= depth
+            held += at_depth
+            measured = measured if at_depth else min(measured + DESCENT_MPS * PERIOD_S, depth)
+            excursion = patient.tissue.excursion(patient.time + PERIOD_S)
+            unseen = (1.0 - loop.followed) * share * (excursion - self._mean)
+            true = measured - wrong - loop.wander(self._period) + unseen
+            felt = patient.move(place + (patient.radius - true + share * excursion) * normal)
+            force = float(gain @ felt) + loop.tared(self._period)
+            if at_depth:
+                depths.append(measured)
+                forces.append(force)
+        patient.rest(PERIOD_S)
+        noise = float(np.std(forces) / np.sqrt(len(forces)))
+        return Press(float(xy[0]), float(xy[1]), float(np.mean(depths)), float(np.mean(forces)), patient.time, noise, limited)
+
+    @property
+    def _period(self) -> int:
+        return max(round((self.patient.time - self._begin_s) / PERIOD_S), 0)
+
+
+class SurrogateHand(_Timed):
+    """Presses what the standard press feels of the wall; it knows nothing of relaxation, friction or earlier presses."""
+
+    def __init__(
+        self, scenario: Scenario, budget: Budget, errors: LoopErrors | None = None, felt: FeltPatient | None = None
+    ) -> None:
+        """`errors` as of the other hand; `felt`: of the scenario's patient, who is made where there is none."""
+        super().__init__(scenario, budget, errors)
+        self.felt = felt or felt_patient(scenario.phantom, scenario.seed)
+        self._breathing = BreathingCurve(scenario.phantom.breathing, scenario.seed)
+        self._rng = generator(scenario.seed, "surrogate")
+        self._exponent = float(self._rng.normal(*_EXPONENT))
+
+    def press(self, xy: Array, depth: float) -> Press:
+        """As `Hand.press`."""
+        loop, rng = self._loop, self._rng
+        self._begin(xy, depth)
+        time = loop.begin_s + self.spent
+        excursion = np.mean([self._breathing.excursion(time - share * HOLD_S) for share in (0.0, 0.5, 1.0)])
+        unseen = (1.0 - loop.followed) * (float(excursion) - self._breathing.mean_m)
+        wander = self._errors.wander_m * float(rng.standard_normal())
+        stiff = float(self.felt.force_at((xy + loop.aside_m)[None])[0])
+
+        def felt(measured: float) -> float:
+            true = max(measured - self._wrong(xy) - wander + unseen, 0.0)
+            return float(stiff * (true / 0.010) ** self._exponent)
+
+        limited = felt(depth) > self.task.force
+        if limited:
+            depths = np.linspace(0.0, depth, 50)
+            depth = float(np.interp(self.task.force, [felt(d) for d in depths.tolist()], depths))
+        force = max(felt(depth) + float(rng.normal(0.0, _TARE_N) + rng.normal(0.0, _NOISE_N)), 0.02)
+        return Press(float(xy[0]), float(xy[1]), max(depth, _SHALLOWEST_M), force, time, _NOISE_N, limited)

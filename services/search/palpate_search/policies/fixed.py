@@ -1,0 +1,37 @@
+"""Baselines that do not look at what they felt: raster, random, Latin hypercube."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import qmc
+
+from palpate_models.frames import Array
+from palpate_search.posterior import Posterior
+from palpate_search.presses import Budget
+
+
+def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """Line by line, to and fro, over a lattice of as many places as the whole budget has presses."""
+    task, k = posterior.task, len(posterior.presses)
+    width, height = task.high - task.low
+    columns = max(1, round(np.sqrt(task.budget.presses * width / height)))
+    rows = -(-task.budget.presses // columns)
+    column, row = divmod(k % (columns * rows), rows)
+    row = row if column % 2 == 0 else rows - 1 - row
+    share = np.array(((column + 0.5) / columns, (row + 0.5) / rows))
+    return task.low + share * (task.high - task.low), task.depth
+
+
+def random(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """Anywhere, every place as probable as any other."""
+    task = posterior.task
+    rng = np.random.default_rng((task.seed, len(posterior.presses)))
+    return rng.uniform(task.low, task.high), task.depth
+
+
+def latin_hypercube(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """McKay, Beckman and Conover 1979: so many strata along x and along y as the budget has presses, each met once."""
+    task = posterior.task
+    sampler = qmc.LatinHypercube(d=2, rng=np.random.default_rng(task.seed))
+    share = sampler.random(task.budget.presses)[len(posterior.presses) % task.budget.presses]
+    return task.low + share * (task.high - task.low), task.depth

@@ -1,0 +1,116 @@
+"""Baselines that fit a Gaussian process to the forces felt, by scikit-learn, and press where an acquisition function is greatest.
+
+They know nothing of lumps: the process is one smooth field of log-force. Its amplitude is that of what was felt, its length and
+noise are the papers' kind, a squared exponential and white noise, with values of this task rather than of the papers' phantoms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from scipy.stats import norm
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, WhiteKernel
+
+from palpate_assessment.calibration import learned
+from palpate_models import press
+from palpate_models.frames import Array
+from palpate_search.posterior import Posterior
+from palpate_search.presses import Budget, Task
+
+LENGTH_M: Final = 0.020
+"""Of the process: the radius of the lumps sought."""
+NOISE: Final = 0.15
+"""White noise of an observation, of the process's standard deviation."""
+FIRST: Final = 4
+"""Presses before the first fit, spread over the region."""
+UCB: Final = 2.0
+"""Standard deviations of the upper confidence bound."""
+STRADDLE: Final = 1.96
+"""Of the straddle (Bryan et al. 2005)."""
+LEVEL: Final = 0.5
+"""The level sought, between the least and the greatest mean."""
+GARG: Final = 0.5
+"""Weight of nearness to the level against uncertainty."""
+LOCALISED: Final = 30
+"""Presses after which Yan and Pan's search has localised the lump."""
+
+Acquisition = Callable[[Array, Array, Array], Array]
+"""Of mean and standard deviation at the places, shape (p,) each, and of what was felt, shape (n,)."""
+
+
+def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
+    """Mean and standard deviation of the process at the places, and what was felt, in standard deviations of that."""
+    exponent = learned().exponent
+    xy = np.array([felt.xy for felt in posterior.presses])
+    y = np.array([np.log(max(felt.force, 0.1)) - exponent * np.log(felt.depth / press.DEPTH_M) for felt in posterior.presses])
+    y = (y - y.mean()) / max(float(y.std()), 0.05)
+    kernel = RBF(LENGTH_M) + WhiteKernel(NOISE**2)
+    process = GaussianProcessRegressor(kernel, optimizer=None).fit(xy, y)
+    mean, sd = process.predict(posterior.task.places, return_std=True)
+    return mean, np.sqrt(np.maximum(sd**2 - NOISE**2, 1e-9)), y
+
+
+def _greatest(posterior: Posterior, budget: Budget, acquisition: Acquisition) -> tuple[Array, float]:
+    if len(posterior.presses) < FIRST:
+        return first(posterior.task, len(posterior.presses)), posterior.task.depth
+    score = acquisition(*_fit(posterior))
+    return posterior.task.places[int(np.argmax(score))], posterior.task.depth
+
+
+def first(task: Task, k: int) -> Array:
+    """The k-th of the first presses: the middles of the region's quarters, shape (2,) [m]."""
+    share = np.array(((0.25, 0.25), (0.75, 0.75), (0.25, 0.75), (0.75, 0.25))[k])
+    return np.asarray(task.low + share * (task.high - task.low))
+
+
+def expected_improvement(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """Mockus 1975; Jones, Schonlau and Welch 1998: by how much a press is expected to exceed the stiffest place so far."""
+
+    def improvement(mean: Array, sd: Array, felt: Array) -> Array:
+        gain = mean - felt.max()
+        return np.asarray(gain * norm.cdf(gain / sd) + sd * norm.pdf(gain / sd))
+
+    return _greatest(posterior, budget, improvement)
+
+
+def upper_confidence_bound(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """Srinivas et al. 2010: mean + UCB standard deviations."""
+    return _greatest(posterior, budget, lambda mean, sd, _: mean + UCB * sd)
+
+
+def straddle(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """Bryan et al. 2005: 1.96 standard deviations less the distance from the level, half way between least and greatest mean."""
+    return _greatest(posterior, budget, lambda mean, sd, _: STRADDLE * sd - np.abs(mean - _level(mean)))
+
+
+def garg_2016(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """Garg et al. 2016, implicit level set upper confidence bound: uncertainty against distance from the implicit level.
+
+    Their level is a share of the greatest mean. The values of the weights on their phantom say nothing about this one; these
+    are GARG and LEVEL.
+    """
+    return _greatest(posterior, budget, lambda mean, sd, _: (1 - GARG) * sd - GARG * np.abs(mean - _level(mean)))
+
+
+def yan_pan_2021(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """Yan and Pan 2021: Bayesian optimisation for LOCALISED presses, then along the border of what was found.
+
+    Their acquisition function is not in the abstract, which is what was read: this is expected improvement. They slide along
+    the border; here it is pressed where it is least sure which side a place is on.
+    """
+    if len(posterior.presses) < LOCALISED:
+        return expected_improvement(posterior, budget)
+
+    def border(mean: Array, sd: Array, _: Array) -> Array:
+        peak = posterior.task.places[int(np.argmax(mean))]
+        near = np.linalg.norm(posterior.task.places - peak, axis=1) < 2.5 * LENGTH_M
+        return np.where(near, sd - np.abs(mean - _level(mean)), -np.inf)
+
+    return _greatest(posterior, budget, border)
+
+
+def _level(mean: Array) -> float:
+    return float(mean.min() + LEVEL * (mean.max() - mean.min()))

@@ -1,0 +1,52 @@
+"""Ours: the press that tells most a second about where a lump is, and whether there is one."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_assessment.calibration import learned
+from palpate_assessment.model import WHITE_SD
+from palpate_models import press
+from palpate_models.frames import Array
+from palpate_search.information import information
+from palpate_search.posterior import Posterior
+from palpate_search.presses import Budget, seconds
+
+_PROMISING: Final = 12
+"""So many places are weighed for a deeper press, too, ..."""
+_SAFE: Final = 0.8
+"""... where it is to stay below this part of the force limit, ..."""
+_KNOWN: Final = 1.0
+"""... if the variance of the log-force there is less than this."""
+
+
+def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """The place and depth with the greatest expected information a second, the hop there counted."""
+    task, calibration = posterior.task, learned()
+    mean, variance = posterior.field()
+    contrast, contrast_variance = posterior.contrast()
+    unexplained, probability = posterior.unexplained(), posterior.probability
+    duration = seconds(posterior.here, task.places)
+    exponent, spread = calibration.exponent, calibration.exponent_sd
+
+    def rate(some: NDArray[np.intp], depth: float) -> Array:
+        """Information a second of presses at some of the places, shape (k,)."""
+        noise = (exponent / depth * posterior.noise_m) ** 2 + (spread * np.log(depth / press.DEPTH_M)) ** 2 + WHITE_SD**2
+        told = information(unexplained[some], contrast, contrast_variance, probability, variance[some] + noise)
+        return np.asarray(told / duration[some])
+
+    rates = rate(np.arange(len(task.places)), task.depth)
+    best, depth = int(np.argmax(rates)), task.depth
+    if rates[best] <= 0:  # nothing tells more than anything else: the level is not known before the first press
+        best = int(np.argmin(np.linalg.norm(task.places - np.array(task.centre), axis=1)))
+        return task.places[best], task.depth
+    greatest = rates[best]
+    promising = np.argsort(-rates)[:_PROMISING]
+    force = np.exp(mean + exponent * np.log(task.deepest / press.DEPTH_M))
+    safe = promising[(force[promising] < _SAFE * task.force) & (variance[promising] < _KNOWN)]
+    if len(safe) and (deeper := rate(safe, task.deepest)).max() > greatest:
+        best, depth = int(safe[int(np.argmax(deeper))]), task.deepest
+    return task.places[best], depth

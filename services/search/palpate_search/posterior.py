@@ -1,0 +1,241 @@
+"""What presses say of a lump: is there one, and where. A sequential Bayesian test under the assessment's own model.
+
+The logarithm of the force that the standard press would feel is a Gaussian field z with errors (`palpate_assessment.model`). A
+hypothesis h is a round lump of some place and radius; under it z has the bump b_h in addition, times an unknown log-contrast e.
+With S the covariance of all else, and e ~ N(m, s^2), what the data y say for it, against no lump, is
+
+    log B_h = -1/2 log(1 + s^2 p) + 1/2 (m / s^2 + c)^2 / (1 / s^2 + p) - 1/2 m^2 / s^2,    p = b' S^-1 b,  c = b' S^-1 y
+
+How rough the belly is and how wrong depths are is not known: S has a few amplitudes, each model weighed by its evidence. One more
+press adds a row to each Cholesky factor, so that an update takes about a millisecond.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Final
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.special import erfc, logsumexp
+
+from palpate_assessment.calibration import learned
+from palpate_assessment.model import (
+    BONE_SD,
+    EDGE_M,
+    LENGTHS_M,
+    LEVEL_SD,
+    NATURAL_SD,
+    SURFACE_M,
+    SURFACE_SHARE,
+    TARE_N,
+    WHITE_SD,
+    Bump,
+    bone,
+    natural,
+)
+from palpate_models import press
+from palpate_models.frames import Array
+from palpate_search.presses import Budget, Press, Task
+
+RADII_M: Final = (0.012, 0.018, 0.026)
+"""Radii of the lumps that are looked for."""
+LUMP_PROBABILITY: Final = 0.5
+"""That there is one, before anything is felt."""
+CONTRAST: Final = (float(np.log(2.0)), 0.35)
+"""Prior mean and standard deviation of a lump's log-contrast."""
+ROUGH: Final = (0.5, 1.0, 2.0)
+"""Natural variation, of its usual amplitude."""
+WRONG: Final = (0.5, 1.0, 2.0)
+"""Errors of depth, of what the examination states."""
+USUAL_N: Final = 5.0
+"""About this force the level is sought."""
+NEAR_M: Final = 0.020
+"""Hypotheses within this distance speak of one lump."""
+
+
+class Posterior:
+    """The probability of each hypothesis, and the field, given the presses so far."""
+
+    def __init__(self, task: Task, accepted: Sequence[Bump] = ()) -> None:
+        """`accepted`: lumps that count as found; others are sought beside them."""
+        self.task = task
+        self.accepted = tuple(accepted)
+        self.presses: list[Press] = []
+        places = task.places
+        self.centres: Array = np.tile(places, (len(RADII_M), 1))
+        """Centres of the hypotheses' lumps [m], shape (h, 2)."""
+        self.radii: Array = np.repeat(RADII_M, len(places))
+        """Their radii [m], shape (h,)."""
+        self.shapes: Array = self._shapes(places)
+        """Each bump at each place, shape (p, h)."""
+        free = self._free().astype(float)
+        self._log_prior = np.log(np.append(LUMP_PROBABILITY * free / max(free.sum(), 1.0), 1 - LUMP_PROBABILITY) + 1e-300)
+        self._models = list(product(ROUGH, WRONG))
+        self._parts = np.array([[(NATURAL_SD * rough) ** 2] * (len(LENGTHS_M) + 1) + [BONE_SD**2] for rough, _ in self._models])
+        count, most = len(self._models), 16
+        self._factor = np.zeros((count, most, most))
+        self._whitened = np.zeros((count, most))
+        self._bumps = np.zeros((count, most, len(self.radii)))
+        self._field = np.zeros((count, most, len(places)))
+        self._power = np.zeros((count, len(self.radii)))
+        self._match = np.zeros((count, len(self.radii)))
+        self._evidence = np.zeros(count)
+        self._lever: list[float] = []
+        self._log_depth: list[float] = []
+        self._weigh()
+
+    # --- what it says -------------------------------------------------------------------------------------------------
+
+    @property
+    def lump(self) -> float:
+        """Probability that there is a lump besides those accepted: that something was missed, if none is reported."""
+        return float(1.0 - self.none)
+
+    @property
+    def at(self) -> tuple[Array, float]:
+        """The most probable place of a lump [m], shape (2,), and the probability that one is within NEAR_M of it."""
+        centre = self.task.places
+        there = self.by_place
+        peak = centre[int(np.argmax(there))]
+        near = np.linalg.norm(centre - peak, axis=1) <= NEAR_M
+        weight = there[near]
+        total = float(weight.sum())
+        return (weight @ centre[near] / total if total > 0 else peak), total
+
+    @property
+    def by_place(self) -> Array:
+        """Probability that a lump's centre is at each place, shape (p,)."""
+        return np.asarray(self.probability.reshape(len(RADII_M), -1).sum(axis=0))
+
+    @property
+    def here(self) -> Array | None:
+        """Where the indenter is, shape (2,) [m]; None before the first press."""
+        return self.presses[-1].xy if self.presses else None
+
+    @property
+    def best(self) -> Bump:
+        """The most probable lump."""
+        k = int(np.argmax(self.probability))
+        return Bump(float(self.centres[k, 0]), float(self.centres[k, 1]), float(self.radii[k]))
+
+    @property
+    def likeliest(self) -> int:
+        """The most probable model of roughness and errors."""
+        return int(np.argmax(self._weights))
+
+    @property
+    def noise_m(self) -> float:
+        """Error of a press's depth under it, standard deviation [m]."""
+        return float(self._models[self.likeliest][1] * self.task.depth_uncertainty)
+
+    def contrast(self) -> tuple[Array, Array]:
+        """Posterior mean and variance of the log-contrast under each hypothesis, shape (h,) each, by the likeliest model."""
+        k = self.likeliest
+        mean, sd = CONTRAST
+        variance = 1.0 / (1.0 / sd**2 + self._power[k])
+        return (mean / sd**2 + self._match[k]) * variance, variance
+
+    def field(self) -> tuple[Array, Array]:
+        """Mean and variance of z at the places if there is no lump, shape (p,) each, by the likeliest model."""
+        k, n = self.likeliest, len(self.presses)
+        seen = self._field[k, :n]
+        mean = np.log(USUAL_N) + self._whitened[k, :n] @ seen
+        variance = LEVEL_SD**2 + self._parts[k, :-1].sum() + self._parts[k, -1] * bone(self.task.places) ** 2
+        variance = variance + sum((bump(self.task.places) ** 2 for bump in self.accepted), np.zeros(1))
+        return mean, np.maximum(variance - (seen**2).sum(axis=0), 1e-6)
+
+    def unexplained(self) -> Array:
+        """What a bump would add to the mean at each place for a log-contrast of one, shape (p, h), by the likeliest model."""
+        k, n = self.likeliest, len(self.presses)
+        return np.asarray(self.shapes - self._field[k, :n].T @ self._bumps[k, :n])
+
+    # --- one more press -----------------------------------------------------------------------------------------------
+
+    def add(self, felt: Press) -> None:
+        """Takes one more press into account."""
+        calibration = learned()
+        depth, force = max(felt.depth, 0.002), max(felt.force, 0.1)
+        log_depth, lever = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth
+        y = float(np.log(force)) - calibration.exponent * log_depth - np.log(USUAL_N)
+        xy, n = felt.xy[None], len(self.presses)
+        old = np.array([one.xy for one in self.presses]).reshape(-1, 2)
+        self._grow(n + 1)
+        with_old, with_places, with_itself = (self._natural(xy, other)[:, 0] for other in (old, self.task.places, xy))
+        u = np.array([wrong * self.task.depth_uncertainty for _, wrong in self._models])
+        if n:
+            apart = ((old - xy) ** 2).sum(axis=1)
+            shared = SURFACE_SHARE**2 * lever * np.array(self._lever) * np.exp(-0.5 * apart / SURFACE_M**2)
+            with_old = with_old + u[:, None] ** 2 * shared
+            with_old += calibration.exponent_sd**2 * log_depth * np.array(self._log_depth)
+        white = WHITE_SD**2 + (felt.noise_n**2 + TARE_N**2) / force**2 + (calibration.exponent_sd * log_depth) ** 2
+        itself = with_itself[:, 0] + white + (1 + SURFACE_SHARE**2) * (u * lever) ** 2
+        new_bump = self._shapes(xy)[0]
+        for k in range(len(self._models)):
+            row = solve_triangular(self._factor[k, :n, :n], with_old[k], lower=True) if n else np.zeros(0)
+            sd = float(np.sqrt(max(itself[k] - row @ row, 1e-9)))
+            residual = (y - row @ self._whitened[k, :n]) / sd
+            bumps = (new_bump - row @ self._bumps[k, :n]) / sd
+            self._factor[k, n, :n], self._factor[k, n, n] = row, sd
+            self._whitened[k, n], self._bumps[k, n] = residual, bumps
+            self._field[k, n] = (with_places[k] - row @ self._field[k, :n]) / sd
+            self._power[k] += bumps**2
+            self._match[k] += bumps * residual
+            self._evidence[k] -= np.log(sd) + 0.5 * residual**2
+        self.presses.append(felt)
+        self._lever.append(lever)
+        self._log_depth.append(log_depth)
+        self._weigh()
+
+    def accept(self, bump: Bump) -> Posterior:
+        """The posterior of what else there is, given that this lump is there."""
+        other = Posterior(self.task, (*self.accepted, bump))
+        for felt in self.presses:
+            other.add(felt)
+        return other
+
+    def left(self, spent_s: float) -> Budget:
+        """What is left of the budget."""
+        whole = self.task.budget
+        return Budget(whole.presses - len(self.presses), whole.seconds - spent_s)
+
+    # --- parts --------------------------------------------------------------------------------------------------------
+
+    def _weigh(self) -> None:
+        mean, sd = CONTRAST
+        power, match = self._power, self._match
+        gain = 0.5 * (mean / sd**2 + match) ** 2 / (1 / sd**2 + power) - 0.5 * mean**2 / sd**2 - 0.5 * np.log1p(sd**2 * power)
+        joint = self._evidence[:, None] + np.column_stack((gain, np.zeros(len(gain)))) + self._log_prior
+        joint = np.exp(joint - logsumexp(joint))
+        self._weights = joint.sum(axis=1)
+        self.probability: Array = joint[:, :-1].sum(axis=0)
+        """Of each hypothesis, shape (h,)."""
+        self.none = float(joint[:, -1].sum())
+        """Probability that there is no lump besides those accepted."""
+
+    def _natural(self, a: Array, b: Array) -> Array:
+        """Covariance of the field without the lump sought, under each model, shape (models, k, l)."""
+        parts = np.array(natural(a, b))
+        known = sum((bump.covariance(a, b) for bump in self.accepted), np.zeros((len(a), len(b))))
+        return np.asarray(LEVEL_SD**2 + np.tensordot(self._parts, parts, 1) + known)
+
+    def _shapes(self, xy: Array) -> Array:
+        """Each hypothesis' bump at places, shape (k, 2) -> (k, h)."""
+        r = np.linalg.norm(xy[:, None] - self.centres, axis=2)
+        return np.asarray(0.5 * erfc((r - self.radii) / (np.sqrt(2) * EDGE_M)))
+
+    def _free(self) -> Array:
+        """Which hypotheses lie beside the accepted lumps."""
+        free = np.ones(len(self.radii), dtype=bool)
+        for bump in self.accepted:
+            free &= np.hypot(self.centres[:, 0] - bump.x, self.centres[:, 1] - bump.y) > self.radii + bump.radius
+        return free
+
+    def _grow(self, n: int) -> None:
+        most = self._whitened.shape[1]
+        if n > most:
+            self._factor = np.pad(self._factor, ((0, 0), (0, most), (0, most)))
+            self._whitened = np.pad(self._whitened, ((0, 0), (0, most)))
+            self._bumps = np.pad(self._bumps, ((0, 0), (0, most), (0, 0)))
+            self._field = np.pad(self._field, ((0, 0), (0, most), (0, 0)))

@@ -1,0 +1,112 @@
+"""What a search knows of an examination: the region, the presses so far, and what is left of its budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from palpate_models.frames import Array
+from palpate_models.scenario import ExamInput
+
+PLACES_M = 0.010
+"""Distance of the places that are weighed."""
+BORDER_M = 0.010
+"""Presses keep so far from the edge of the region, in which the arm's reach and the skin are known."""
+TRAVEL_MPS = 0.12
+"""Mean speed of a hop from one place to the next."""
+PRESS_S = 2.2
+"""What a press takes besides the hop: rest and tare in the air, descent, settling, hold and lift."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """One press as it was measured, in the abdomen frame."""
+
+    x: float
+    """[m]"""
+    y: float
+    """[m]"""
+    depth: float
+    """[m]"""
+    force: float
+    """Normal force at that depth [N]."""
+    time: float
+    """[s]"""
+    noise_n: float = 0.02
+    """Standard error of the force [N]."""
+    limited: bool = False
+    """Whether depth yielded to the force limit."""
+
+    @property
+    def xy(self) -> Array:
+        """Where, shape (2,) [m]."""
+        return np.array((self.x, self.y))
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What is left."""
+
+    presses: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is searched, and how it may be pressed."""
+
+    centre: tuple[float, float]
+    """Of the region, in the abdomen frame [m]."""
+    size: tuple[float, float]
+    """Of the region along x and y [m]."""
+    depth: float = 0.010
+    """Usual depth of a press [m]."""
+    deepest: float = 0.014
+    """[m]"""
+    force: float = 15.0
+    """At this force depth yields [N]."""
+    depth_uncertainty: float = 0.001
+    """Standard deviation of the depth of one press [m]."""
+    budget: Budget = Budget(100, 600.0)
+    """At the beginning."""
+    seed: int = 0
+    """Of what a policy draws."""
+
+    @classmethod
+    def of(cls, known: ExamInput, budget: Budget) -> Task:
+        """The task of an examination."""
+        exam, limits = known.exam, known.limits
+        deepest = min(1.4 * exam.depth_m, limits.depth_m)
+        return cls(exam.centre_m, exam.region_m, exam.depth_m, deepest, limits.force_working_n, budget=budget, seed=exam.seed)
+
+    @cached_property
+    def places(self) -> Array:
+        """Places that may be pressed [m], shape (p, 2): a lattice about PLACES_M apart, x by x."""
+        axes = [self._axis(k) for k in (0, 1)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    @cached_property
+    def low(self) -> Array:
+        """Least x and y of a press [m], shape (2,)."""
+        return np.array(self.centre) - self._half
+
+    @cached_property
+    def high(self) -> Array:
+        """Greatest x and y of a press [m], shape (2,)."""
+        return np.array(self.centre) + self._half
+
+    @property
+    def _half(self) -> Array:
+        return np.maximum(0.5 * np.array(self.size) - BORDER_M, 0.0)
+
+    def _axis(self, k: int) -> Array:
+        low, high = self.low[k], self.high[k]
+        return np.linspace(low, high, max(round((high - low) / PLACES_M), 0) + 1)
+
+
+def seconds(begin: Array | None, end: Array) -> Array:
+    """What it takes to press at `end` (2,), or at each of several (k, 2), coming from `begin` [s]: shape () or (k,)."""
+    hop = np.linalg.norm(end - (end if begin is None else begin), axis=-1)
+    return np.asarray(PRESS_S + hop / TRAVEL_MPS)

@@ -1,0 +1,49 @@
+"""Searches on patients under the hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import palpate
+from palpate.search.hand import PatientHand, SurrogateHand
+from palpate.search.trial import Trial, search
+from palpate_search.choice import policy
+from palpate_search.presses import Budget
+
+CENTRE = (0.04, -0.03)
+LUMP = {"lesions": [{"centre_m": CENTRE, "radii_m": [0.02, 0.02], "contrast": 6}], "breathing": {"kind": "none"}}
+
+
+def trial(hand: type[PatientHand] | type[SurrogateHand], lump: bool, presses: int, name: str = "informed") -> Trial:
+    region = {"region_m": [0.14, 0.14]}
+    patient = LUMP if lump else {"breathing": {"kind": "none"}}
+    scenario = palpate.scenario("person", seed=3, phantom=patient, exam=region, errors="none")
+    return search(hand(scenario, Budget(presses, 600.0)), policy(name))
+
+
+@pytest.mark.parametrize("hand", [PatientHand, SurrogateHand])
+def test_ours_finds_a_lump_in_a_dozen_presses_and_none_where_none_is(hand: type[PatientHand] | type[SurrogateHand]) -> None:
+    found = trial(hand, True, 15)
+    decided = found.decided(0.9)
+    assert decided is not None
+    assert decided < 12
+    assert np.linalg.norm(found.place[-1] - CENTRE) < 0.010
+    assert trial(hand, False, 15).near.max() < 0.9
+
+
+def test_a_search_is_repeatable_and_keeps_to_its_budget() -> None:
+    first, again = (trial(SurrogateHand, True, 8, "upper-confidence-bound") for _ in range(2))
+    np.testing.assert_array_equal(first.force, again.force)
+    assert len(first.xy) == 8
+    scenario = palpate.scenario("person", seed=3, errors="none", phantom={"breathing": {"kind": "none"}})
+    assert search(SurrogateHand(scenario, Budget(100, 10.0)), policy("raster")).seconds[-2] < 10.0
+
+
+def test_a_hand_refuses_what_is_out_of_reach() -> None:
+    scenario = palpate.scenario("person", seed=3, errors="none", phantom={"breathing": {"kind": "none"}})
+    hand = SurrogateHand(scenario, Budget(3, 60.0))
+    with pytest.raises(ValueError, match=r"place = .* want one within"):
+        hand.press(np.array((0.3, 0.0)), 0.01)
+    with pytest.raises(ValueError, match=r"depth = 0.1 m: want more than 0 and at most"):
+        hand.press(np.zeros(2), 0.1)
