@@ -121,7 +121,7 @@ def _conduct(folder: Path, runtime: str) -> None:
     roles = (*WORKERS, "recorder")
     files = write_scenario_files(scenario, folder)
     timing = Timing(wallclock=runtime == "wallclock")
-    local = LocalProcesses(apart(roles), folder, files, timing, record=True, forks=forks())
+    local = LocalProcesses(apart(roles), folder, files, timing, record="normal", forks=forks())
     session = open_session(local.bus["conductor"])
     for process in read_processes(compose_file(), roles).values():
         local.start(process)

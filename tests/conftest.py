@@ -48,7 +48,7 @@ def distributed(tmp_path_factory: pytest.TempPathFactory, overheard: list[subpro
 @pytest.fixture(scope="session")
 def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """The same examination in one process."""
-    return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--no-record", settings=GATE)
+    return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--record", "none", settings=GATE)
 
 
 EXAMINATION_FILES = ("test_gate.py", "test_examination.py", "test_contract_ros_tools.py", "test_library.py")

@@ -21,7 +21,7 @@ def test_an_examination_of_the_elastic_tissue_completes_with_findings(tmp_path: 
     """
     words = [sys.executable, "-m", "palpate_tissue.backends.elastic.prepare", "clean"]
     subprocess.run([*words, *(word for setting in ELASTIC for word in ("--set", setting))], check=True, timeout=600)
-    finished = palpate_run("clean", tmp_path, "--wallclock", "--no-record", settings=ELASTIC, timeout=300)
+    finished = palpate_run("clean", tmp_path, "--wallclock", "--record", "none", settings=ELASTIC, timeout=300)
     assert finished.status == 0, finished.output
     report = finished.report
     assert report["samples"] > 50

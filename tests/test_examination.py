@@ -70,7 +70,7 @@ def test_bad_input_ends_with_status_2_and_says_what_is_wrong(
 )
 def test_an_examination_that_planning_gave_up_ends_with_status_3_and_says_why(tmp_path: Path, runtime: str) -> None:
     own = ("--service", f"planning={Path(__file__).with_name('quitting_planning.py')}")
-    finished = palpate_run("clean", tmp_path, runtime, "--no-record", *own)
+    finished = palpate_run("clean", tmp_path, runtime, "--record", "none", *own)
     assert finished.status == 3, finished.output
     assert "the run failed: aborted in phase HOME: enough" in finished.output
     assert finished.report["failure"] == "aborted in phase HOME: enough"

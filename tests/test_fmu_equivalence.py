@@ -224,7 +224,7 @@ def test_one_line_of_the_compose_file_puts_it_on_the_bus(tmp_path: Path, monkeyp
     swapped = tmp_path / "docker-compose.yml"
     swapped.write_text(text.replace(line, "command: [python, -m, palpate_tissue, fmu]"), encoding="utf-8")
     monkeypatch.setenv("PALPATE_COMPOSE", str(swapped))
-    finished = palpate_run("clean", tmp_path / "out", "--no-record", "--seed", "3", settings=SETTINGS)
+    finished = palpate_run("clean", tmp_path / "out", "--record", "none", "--seed", "3", settings=SETTINGS)
     assert finished.status == 0, finished.output
     assert "FMI 3.0" in (tmp_path / "out" / "logs" / "tissue.log").read_text(encoding="utf-8")
     assert finished.report["run_hash"] == composed.stdout.split()[-1]

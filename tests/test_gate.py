@@ -41,7 +41,7 @@ def test_the_lesion_is_found(distributed: Finished) -> None:
 
 
 def test_healthy_has_no_finding(tmp_path: Path) -> None:
-    finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=(*SHORT, "phantom.lesions=[]"))
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=(*SHORT, "phantom.lesions=[]"))
     assert finished.status == 0, finished.output
     assert finished.report["samples"] > 30
     assert finished.report["findings"] == []
@@ -57,7 +57,7 @@ def test_a_killed_service_ends_the_run_by_name_and_the_force_does_not_rise(tmp_p
 
 def test_the_fmu_gives_the_same_examination(composed: Finished, tmp_path: Path) -> None:
     """The sums are the same in another order: 1e-13 of a force, which sticking and slipping enlarge; the scores do not differ."""
-    finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=(*GATE, "services.tissue=fmu"))
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=(*GATE, "services.tissue=fmu"))
     assert_within_bounds(finished)
     ours, theirs = finished.report, composed.report
     assert ours["samples"] == theirs["samples"]

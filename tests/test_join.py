@@ -13,7 +13,7 @@ SMALL = ("exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "camera
 
 @pytest.mark.slow
 def test_a_role_that_nobody_starts_is_named_with_what_would_have_joined(tmp_path: Path) -> None:
-    finished = palpate_run("clean", tmp_path / "alone", "--no-record", "--without", "assessment", "--wait", "1")
+    finished = palpate_run("clean", tmp_path / "alone", "--record", "none", "--without", "assessment", "--wait", "1")
     assert finished.status == 3
     end = finished.output.split("the run failed")[1]
     for words in (
@@ -33,7 +33,7 @@ def test_unknown_roles_are_answered_with_the_known_ones(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_examination_begins_when_the_role_has_joined(tmp_path: Path) -> None:
     folder = tmp_path / "joined"
-    words = command("clean", folder, "--no-record", "--without", "control", settings=SMALL)
+    words = command("clean", folder, "--record", "none", "--without", "control", settings=SMALL)
     run = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     assert run.stderr is not None
     for line in run.stderr:

@@ -230,7 +230,7 @@ def test_an_examination_is_read_from_its_folder(composed: Finished) -> None:
 @pytest.mark.timeout(1800)
 def test_an_examination_is_that_of_the_command_line(composed: Finished, tmp_path: Path) -> None:
     assert (*(f"exam.{name}={value}" for name, value in REGION.items()), "camera.frames=10") == GATE
-    made = palpate.run("clean", out=tmp_path / "made", record=False, exam=REGION, camera={"frames": 10}, quiet=True)
+    made = palpate.run("clean", out=tmp_path / "made", record="none", exam=REGION, camera={"frames": 10}, quiet=True)
     assert made.report.run_hash == composed.report["run_hash"] is not None
 
 

@@ -33,7 +33,7 @@ def test_without_a_viewer_the_run_goes_on(role: str, tmp_path: Path) -> None:
 
 def test_in_wall_clock_mode_too(tmp_path: Path) -> None:
     """Without recorder and viewer: two cores that others use too do not carry them in real time."""
-    killed = kill_in_contact("control", tmp_path, "--wallclock", "--no-record")
+    killed = kill_in_contact("control", tmp_path, "--wallclock", "--record", "none")
     assert killed.status == 3, killed.lines
     assert killed.named_after_s < 2.0, killed.lines
     report = json.loads((killed.folder / "report.json").read_text(encoding="utf-8"))

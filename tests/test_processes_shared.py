@@ -90,7 +90,7 @@ def test_a_frozen_process_is_blamed() -> None:
 
 @pytest.fixture(scope="module")
 def one_process(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    return palpate_run("clean", tmp_path_factory.mktemp("one"), "--composed", "--no-record", settings=SHORT)
+    return palpate_run("clean", tmp_path_factory.mktemp("one"), "--composed", "--record", "none", settings=SHORT)
 
 
 @pytest.mark.slow
@@ -98,8 +98,8 @@ def one_process(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     "options",
     [
         ("--group", "robot,tissue,control"),
-        ("--group", "robot,camera", "--group", "control,perception,planning", "--no-record"),
-        ("--processes", "2", "--secure", "--no-record"),
+        ("--group", "robot,camera", "--group", "control,perception,planning", "--record", "none"),
+        ("--processes", "2", "--secure", "--record", "none"),
     ],
 )
 def test_an_examination_has_one_run_hash_however_it_is_placed(

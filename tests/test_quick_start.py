@@ -80,7 +80,7 @@ def test_the_service_that_a_page_shows_is_one(page: str, name: str, tmp_path: Pa
 def test_ones_own_assessment_finds_the_lesion(tmp_path: Path) -> None:
     place = f"assessment={EXAMPLES / 'threshold_assessment.py'}"
     settings = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.04, -0.04]", "camera.frames=6")
-    ran = palpate_run("clean", tmp_path, "--composed", "--no-record", "--service", place, settings=settings)
+    ran = palpate_run("clean", tmp_path, "--composed", "--record", "none", "--service", place, settings=settings)
     assert ran.status == 0, ran.output
     assert ran.report["scores"]["matched"] == 1
     assert ran.report["scores"]["place_error_m"] < 0.02
@@ -91,7 +91,7 @@ def test_ones_own_assessment_finds_the_lesion(tmp_path: Path) -> None:
 @pytest.mark.timeout(900)
 def test_ones_own_patient_and_mesh_are_examined(tmp_path: Path) -> None:
     patient = palpate_run(
-        str(EXAMPLES / "my_patient.yaml"), tmp_path / "patient", "--composed", "--no-record",
+        str(EXAMPLES / "my_patient.yaml"), tmp_path / "patient", "--composed", "--record", "none",
         settings=("exam.region_m=[0.08, 0.08]", "exam.centre_m=[-0.05, 0.0]", "camera.frames=6"),
     )  # fmt: skip
     assert patient.status == 0, patient.output
@@ -99,7 +99,12 @@ def test_ones_own_patient_and_mesh_are_examined(tmp_path: Path) -> None:
     mesh = tmp_path / "my_abdomen.stl"
     subprocess.run([sys.executable, str(EXAMPLES / "make_abdomen.py"), str(mesh)], check=True, timeout=120)
     ran = palpate_run(
-        "healthy", tmp_path / "mesh", "--composed", "--no-record", settings=("phantom.kind=mesh", f"phantom.mesh={mesh}", *SMALL)
+        "healthy",
+        tmp_path / "mesh",
+        "--composed",
+        "--record",
+        "none",
+        settings=("phantom.kind=mesh", f"phantom.mesh={mesh}", *SMALL),
     )
     assert ran.status == 0, ran.output
     assert ran.report["findings"] == []

@@ -12,7 +12,7 @@ TINY = ("exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "phantom
 def test_a_secure_examination_completes_with_the_same_run_hash(tmp_path: Path) -> None:
     secure = palpate_run("clean", tmp_path / "secure", "--secure", settings=TINY)
     assert secure.status == 0, secure.output
-    composed = palpate_run("clean", tmp_path / "composed", "--composed", "--no-record", settings=TINY)
+    composed = palpate_run("clean", tmp_path / "composed", "--composed", "--record", "none", settings=TINY)
     assert secure.report["run_hash"] == composed.report["run_hash"]
 
 

@@ -16,14 +16,14 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    finished = palpate_run("clean", tmp_path_factory.mktemp("reference"), "--composed", settings=SHORT)
+    finished = palpate_run("clean", tmp_path_factory.mktemp("reference"), "--composed", "--record", "full", settings=SHORT)
     assert finished.status == 0, finished.output
     return finished
 
 
 def test_another_plant_finds_the_same(reference: Finished, tmp_path: Path) -> None:
     settings = (*SHORT, "services.robot=mujoco")
-    finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=settings)
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=settings)
     assert finished.status == 0, finished.output
     assert finished.report["run_hash"] != reference.report["run_hash"], "it is another plant"
     (found,), (expected,) = finished.report["findings"], reference.report["findings"]
@@ -34,7 +34,7 @@ def test_another_plant_finds_the_same(reference: Finished, tmp_path: Path) -> No
 
 def test_a_replayed_camera_gives_the_recorded_run_to_the_last_bit(reference: Finished, tmp_path: Path) -> None:
     settings = (*SHORT, "services.camera=replay", f"camera.recording={reference.folder}")
-    finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=settings)
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=settings)
     assert finished.status == 0, finished.output
     assert finished.report["run_hash"] == reference.report["run_hash"]
 
@@ -42,7 +42,7 @@ def test_a_replayed_camera_gives_the_recorded_run_to_the_last_bit(reference: Fin
 def test_a_replayed_camera_of_another_patient_shows_another_surface(reference: Finished, tmp_path: Path) -> None:
     """So the pixels are used: with the recorded patient at another place, the exam goes where that one was."""
     settings = (*SHORT, "services.camera=replay", f"camera.recording={reference.folder}", "seed=1")
-    finished = palpate_run("clean", tmp_path, "--composed", "--no-record", settings=settings)
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=settings)
     assert finished.status == 0, finished.output
     digests, recorded = finished.report["digests"], reference.report["digests"]
     assert digests["camera/depth/image_raw"] == recorded["camera/depth/image_raw"]
@@ -50,7 +50,7 @@ def test_a_replayed_camera_of_another_patient_shows_another_surface(reference: F
 
 
 def test_a_stopped_assessment_is_replaced_in_a_wall_clock_run(tmp_path: Path) -> None:
-    words = command("clean", tmp_path, "--wallclock", "--no-record", "--handover", "100", settings=SHORT)
+    words = command("clean", tmp_path, "--wallclock", "--record", "none", "--handover", "100", settings=SHORT)
     run = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     assert run.stderr is not None
     lines: list[str] = []

@@ -92,7 +92,7 @@ def _run(number: int) -> float:
 
 
 def _start(name: str, number: int, options: BusOptions) -> subprocess.Popen[bytes]:
-    settings = Settings.read().replaced(**options.settings(), runtime="lockstep", record=False)
+    settings = Settings.read().replaced(**options.settings(), runtime="lockstep", record="none")
     environment = {**os.environ, **settings.to_env()}
     return subprocess.Popen([sys.executable, "-m", "palpate_benchmarks.barrier", name, str(number)], env=environment)
 

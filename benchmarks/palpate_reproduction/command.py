@@ -13,7 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from palpate.command_line import fail, output_file, output_folder, refuse
 from palpate.report.archive import EvidenceError, completed
-from palpate.run.inputs import Settings, usable
+from palpate.run.inputs import usable
+from palpate.run.options import Settings
 from palpate_reproduction import reproduction
 from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, RunError, perform, record_graph
 

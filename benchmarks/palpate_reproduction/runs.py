@@ -50,7 +50,7 @@ class RunError(RuntimeError):
 
 def perform(case: ReproductionCase, folder: Path, settings: tuple[str, ...]) -> None:
     """Examines in one process into `folder`; the paper's case is recorded. Raises RunError."""
-    words = ["--composed", "--quiet"] + ([] if case == SNAKE else ["--no-record"])
+    words = ["--composed", "--quiet", "--record", "full" if case == SNAKE else "none"]
     for setting in (f"exam.pattern={case.pattern}", f"exam.mode={case.mode}", *settings):
         words += ["--set", setting]
     process = _start(folder, words)

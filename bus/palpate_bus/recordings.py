@@ -19,6 +19,8 @@ from palpate_bus.contract import Contract
 
 RUN_FOLDER = "recording_mcap"
 """Name of the recording within a run's folder."""
+KEPT_EVERY = "kept_every_ms"
+"""In the metadata of a channel: the time in which one message was kept."""
 SCENARIO = "scenario.yaml"
 """Name of the attachment that a reference has its scenario in."""
 
@@ -48,6 +50,8 @@ class Recording:
     """Message type and RIHS01 hash by topic (without its leading slash)."""
     counts: dict[str, int]
     """Messages by topic."""
+    thinned: dict[str, int]
+    """Topics of which not every message was kept, with the time [ms] in which one was."""
     first: int
     """Earliest stamp [ns]."""
     last: int
@@ -75,9 +79,17 @@ class Recording:
             except (McapError, EOFError, struct.error) as error:
                 raise RecordingError(f"{self.path}: breaks off: {error!r}; {_RECOVER}") from error
 
-    def check(self, rules: Contract, topics: Collection[str]) -> None:
-        """Raises RecordingError when a topic was recorded with another type, or another definition of it, than the contract's."""
+    def check(self, rules: Contract, topics: Collection[str], *, whole: bool = True) -> None:
+        """Raises RecordingError when a topic was recorded with another type, or another definition of it, than the contract's.
+
+        So it does for a topic that is not there `whole`, unless that does not matter.
+        """
         for name in topics:
+            if whole and name in self.thinned:
+                raise RecordingError(
+                    f"{self.path}: of topic {name} one message in {self.thinned[name]} ms was kept, and every one is needed; "
+                    "examine with --record full"
+                )
             row, recorded = rules.topics[name], self.types.get(name)
             if recorded is not None and recorded != (row.type, row.type_hash):
                 raise RecordingError(
@@ -108,6 +120,7 @@ def open_recording(path: Path) -> Recording:
     files = _files(path)
     types: dict[str, tuple[str, str]] = {}
     counts: dict[str, int] = {}
+    thinned: dict[str, int] = {}
     first: list[int] = []
     last: list[int] = []
     scenario = None
@@ -129,7 +142,9 @@ def open_recording(path: Path) -> Recording:
         for channel in summary.channels.values():
             topic = channel.topic.removeprefix("/")
             types[topic] = (summary.schemas[channel.schema_id].name, channel.metadata.get("topic_type_hash", ""))
+            if every := int(channel.metadata.get(KEPT_EVERY, 0)):
+                thinned[topic] = every
             counts[topic] = counts.get(topic, 0) + summary.statistics.channel_message_counts.get(channel.id, 0)
     if not first:
         raise RecordingError(f"{path}: holds no message")
-    return Recording(path, files, types, counts, min(first), max(last), scenario)
+    return Recording(path, files, types, counts, thinned, min(first), max(last), scenario)

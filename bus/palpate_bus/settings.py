@@ -1,7 +1,7 @@
 """The settings of a process: everything that a user, `palpate run` or docker-compose.yml may say about how it runs.
 
     settings = Settings.read()                                  from this process's environment
-    child = settings.replaced(runtime="wallclock", record=True)
+    child = settings.replaced(runtime="wallclock", record="full")
     subprocess.Popen(command, env={**os.environ, **child.to_env()})
 
 Nothing else in the project reads a PALPATE_ variable. What is examined, and how, is no setting: it is in the scenario.
@@ -87,7 +87,11 @@ class Settings(BaseSettings):
     )
     scenario: Path | None = Field(default=None, description="The scenario file of a service, as `palpate prepare` writes it.")
     out: Path | None = Field(default=None, description="The run's results folder, for services that write files.")
-    record: bool = Field(default=False, description="Whether the run has a recorder, to which services pass on what they send.")
+    record: Literal["none", "normal", "full"] = Field(
+        default="none",
+        description="What the recorder keeps, to which services pass on what they send: `full`, every message; `normal`, of "
+        "topics with `record_ms` in the contract one message in that time, a fifth of the bytes; `none`, there is no recorder.",
+    )
     record_file_mb: int | None = Field(default=None, ge=1, description="Size [MB] at which the recorder begins a new file.")
     viewer: str | None = Field(
         default=None, description="How the dashboard shows a run live: `serve`, `serve:PORT`, `connect` or `connect:URL`."

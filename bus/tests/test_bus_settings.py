@@ -10,7 +10,7 @@ SETTINGS = {
     "PALPATE_LISTEN": "tcp/a:1, tcp/b:2",
     "PALPATE_ROUTER": "",
     "PALPATE_RUNTIME": "wallclock",
-    "PALPATE_RECORD": "1",
+    "PALPATE_RECORD": "full",
     "PALPATE_PERIODS": "control=5,planning=20",
     "PALPATE_COMPOSE": "a.yml:b.yml",
     "PALPATE_OUT": "/results",
@@ -22,7 +22,7 @@ def test_environment_is_read_with_types_and_written_back() -> None:
     settings = Settings.read(SETTINGS)
     assert settings.listen == ("tcp/a:1", "tcp/b:2")
     assert settings.router is None
-    assert settings.record is True
+    assert settings.record == "full"
     assert settings.domain == 7
     assert settings.periods == {"control": 5, "planning": 20}
     assert settings.compose == (Path("a.yml"), Path("b.yml"))
@@ -42,7 +42,7 @@ def test_process_reads_its_own_environment_and_a_child_gets_changes(monkeypatch:
     [
         ("PALPATE_MODE", "star", "peer, client, router"),
         ("PALPATE_RUNTIME", "fast", "lockstep, wallclock"),
-        ("PALPATE_RECORD", "maybe", "0, 1"),
+        ("PALPATE_RECORD", "maybe", "none, normal, full"),
         ("PALPATE_RECORD_FILE_MB", "0", "a whole number from 1"),
         *[("PALPATE_PERIODS", bad, "ROLE=MILLISECONDS") for bad in ("control", "control=0", "control=2.5", "control=5,")],
         ("ROS_DOMAIN_ID", "233", "0 to 232"),

@@ -45,6 +45,10 @@ PLOT_PERIOD: Final = 50 * MS
 TEXT_PERIOD: Final = 500 * MS
 IMAGE_PERIOD: Final = 500 * MS
 MAP_PERIOD: Final = 1000 * MS
+SELDOM: Final = 1000 * MS
+"""Meshes and images of a recording that is not full."""
+POSE_PERIOD: Final = 100 * MS
+"""The arm of such a recording."""
 AHEAD: Final = 4
 """Which forecast of the wall is drawn: that of 0.2 s ahead, about what planning needs."""
 SEND_PERIOD: Final = 1000 * MS
@@ -75,10 +79,10 @@ class DashboardService(Service):
 
     role = "dashboard"
 
-    def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True) -> None:
+    def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True, full: bool = True) -> None:
         """Of the truth in `scenario` it makes a page, no more; `paced`: whether the pace is worth showing.
 
-        Without a `path` nothing is kept in a file.
+        Without a `path` nothing is kept in a file. Unless it is `full`, meshes and images come seldom where nobody watches.
 
         Raises OSError if `path` is not writable.
         """
@@ -119,12 +123,13 @@ class DashboardService(Service):
         self._pace_mark = (0, perf_counter())
         self._steps = 0
         self._busy_s = 0.0
+        often = full or live != Live()
         self._drawing: tuple[tuple[str, int, Callable[[int, Message], None]], ...] = (
-            ("sim/surface", MESH_PERIOD, self._surface),
+            ("sim/surface", MESH_PERIOD if often else SELDOM, self._surface),
             ("truth/phantom", 0, self._phantom),
             ("tf_static", 0, self._tf_static),
             ("camera/depth/camera_info", IMAGE_PERIOD, self._camera_info),
-            ("camera/depth/image_raw", IMAGE_PERIOD, self._depth),
+            ("camera/depth/image_raw", IMAGE_PERIOD if often else SELDOM, self._depth),
             ("perception/points", IMAGE_PERIOD, self._points),
             ("perception/surface", IMAGE_PERIOD, self._perceived),
             ("perception/targets", 0, self._targets),
@@ -133,7 +138,7 @@ class DashboardService(Service):
             ("exam/state", PLOT_PERIOD, self._exam),
             ("truth/indentation", PLOT_PERIOD, self._indentation),
             ("truth/patient", PLOT_PERIOD, self._patient),
-            ("sim/link_poses", PLOT_PERIOD, self._link_poses),
+            ("sim/link_poses", PLOT_PERIOD if often else POSE_PERIOD, self._link_poses),
             ("robot/status", PLOT_PERIOD, self._robot_status),
             ("assessment/map", MAP_PERIOD, self._stiffness),
             ("assessment/findings", 0, self._findings),
@@ -340,4 +345,4 @@ def create(scenario: Scenario) -> DashboardService:
     """
     settings = Settings.read()
     out = settings.required("out", f"the dashboard writes $PALPATE_OUT/{FILE}, so give it the run's folder")
-    return DashboardService(scenario, out / FILE, Live.parse(settings.viewer or ""))
+    return DashboardService(scenario, out / FILE, Live.parse(settings.viewer or ""), full=settings.record == "full")

@@ -26,7 +26,7 @@ examination = palpate.run(
     "clean",
     exam={"region_m": [0.10, 0.10], "centre_m": [-0.055, -0.055]},  # the right lower quadrant
     camera={"frames": 10},
-    record=False,
+    record="none",
     quiet=True,
 )
 examination
@@ -86,4 +86,4 @@ print(f"run hash {examination.report.run_hash[:16]}, results in {examination.fol
 
 # %% [markdown]
 # Any results folder can be opened again, one from the command line too: `palpate.Examination("out/clean-...")`. Its `page` is the
-# report to read, and with `record=True` it has a `recording` for `palpate dashboard`.
+# report to read, and unless `record="none"` it has a `recording` for `palpate dashboard`.

@@ -28,7 +28,7 @@ def started(words: str | None, role: str, settings: RigSettings, endpoint: str, 
         file.write_text(dump_scenario(settings.scenario, view), encoding="utf-8")
         environment = {
             **os.environ, "PALPATE_ROUTER": endpoint, "PALPATE_RUNTIME": "wallclock", "PALPATE_SCENARIO": str(file),
-            "PALPATE_OUT": folder, "PALPATE_RECORD": "0", "ROS_DOMAIN_ID": str(domain),
+            "PALPATE_OUT": folder, "PALPATE_RECORD": "none", "ROS_DOMAIN_ID": str(domain),
         }  # fmt: skip
         split = shlex.split(words)
         try:

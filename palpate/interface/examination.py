@@ -11,7 +11,7 @@ import warnings
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import pandas as pd
 
@@ -123,7 +123,7 @@ def run(
     seed: int | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-    record: bool = True,
+    record: Literal["none", "normal", "full"] = "normal",
     quiet: bool = False,
     **settings: Any,
 ) -> Examination:
@@ -140,7 +140,7 @@ def run(
     overwrite
         Remove the results of an earlier run from the folder.
     record
-        Write recording.rrd and the MCAP recording.
+        Which recordings to write, recording.rrd and MCAP: "full", every message; "normal", a fifth of that; "none".
     quiet
         Do not tell on stderr how the examination goes on.
 
@@ -160,7 +160,7 @@ def run(
     --------
     >>> import palpate
     >>> small = {"region_m": [0.06, 0.06], "centre_m": [-0.055, -0.055]}
-    >>> examination = palpate.run("clean", exam=small, record=False)  # doctest: +SKIP
+    >>> examination = palpate.run("clean", exam=small, record="none")  # doctest: +SKIP
     >>> examination.findings.quadrant.tolist()  # doctest: +SKIP
     ['RLQ']
     """
@@ -169,8 +169,9 @@ def run(
     with tempfile.TemporaryDirectory(prefix="palpate-run-") as place:
         file = Path(place) / f"{chosen.name}.yaml"
         file.write_text(dump_scenario(chosen), encoding="utf-8")
-        flags = {"--overwrite": overwrite, "--no-record": not record, "--quiet": quiet}
-        words = [str(file), "--out", str(folder), "--composed", *(flag for flag, wanted in flags.items() if wanted)]
+        flags = {"--overwrite": overwrite, "--quiet": quiet}
+        words = [str(file), "--out", str(folder), "--composed", "--record", record]
+        words += [flag for flag, wanted in flags.items() if wanted]
         status, said = _palpate("run", *words, quiet=quiet)
     if status not in (0, EXIT_FAILED) or not (folder / "report.json").is_file():
         raise ExaminationError(said[-1] if said else f"{folder}: there are no results (status {status})")

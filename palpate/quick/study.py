@@ -221,7 +221,7 @@ def examine(number: int, level: str, breathing: str, out: Path, settings: Sequen
             lumps = "phantom.draw.lumps=[1, 1]" if seed % 2 else "phantom.draw.lumps=[0, 0]"
             words = [f"errors={level}", f"phantom.breathing.kind={breathing}", lumps, *settings]
             options = [word for setting in words for word in ("--set", setting)]
-            command = [sys.executable, "-m", "palpate", "run", "person", "--composed", "--no-record", "-q"]
+            command = [sys.executable, "-m", "palpate", "run", "person", "--composed", "--record", "none", "-q"]
             subprocess.run([*command, "--seed", str(seed), "--out", str(folder), *options], check=True)
         return folder
 

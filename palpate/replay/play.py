@@ -50,7 +50,7 @@ class Player:
         self._looked = 0
         rules = contract()
         self.topics = _chosen(recording, rules, topics)
-        recording.check(rules, self.topics)
+        recording.check(rules, self.topics, whole=False)
         options = _options(listen)
         self.where = f"on {', '.join(options.listen)}" if options.listen else "on the bus of the environment"
         self._session = open_session(options)

@@ -29,7 +29,7 @@ from palpate_recorder.recover import recover as complete_recording
 RUNTIME: Final = "recovered"
 STILL_S: Final = 3.0
 """A recording that has not grown for so long [s] grows no more: its recorder writes every simulated second."""
-MISSING: Final = "a run with --no-record keeps nothing that could be recovered"
+MISSING: Final = "a run with --record none keeps nothing that could be recovered"
 
 
 def recovered(folder: Path) -> tuple[Scenario, RunResult]:

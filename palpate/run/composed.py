@@ -7,7 +7,7 @@ from pathlib import Path
 from time import perf_counter
 
 from palpate.environment import given
-from palpate.run.roles import OBSERVERS, WORKERS, choice, write_scenario_files
+from palpate.run.roles import OBSERVERS, WORKERS, choice, kept, write_scenario_files
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.collection import rare_collections
@@ -35,7 +35,8 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     begin = perf_counter()
     write_scenario_files(scenario, out)
     collector = Collector(tree=FrameTree(exam_input(scenario)))
-    with given({"PALPATE_OUT": str(out)}):  # the others are not told the results folder: its name may tell of the patient
+    told = {"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}
+    with given(told):  # the others are not told the results folder: its name may tell of the patient
         observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
@@ -43,13 +44,13 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     start = perf_counter()
     failure = None
     last = 0
-    told = start
+    shown = start
 
     def end() -> int | None:
-        nonlocal told
+        nonlocal shown
         now = perf_counter()
-        if now - told > 0.1:
-            told = now
+        if now - shown > 0.1:
+            shown = now
             tell(RunProgress(run.t, run.t / NS / (now - start), collector.collected, tuple(run.trouble)))
         return collector.collected.end_tick
 

@@ -9,7 +9,7 @@ from time import perf_counter
 from palpate.run.placement import Groups, PlacementError, apart
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, override_files, read_processes
-from palpate.run.roles import OBSERVERS, choice, workers, write_scenario_files
+from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
 from palpate.run.secure import SecureBus
 from palpate_bus import implementations
 from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
@@ -53,7 +53,7 @@ def run_distributed(
     for role in (role for group in groups if len(group) > 1 for role in group):
         _check_shares(processes[role], absent)
     files = write_scenario_files(scenario, out)
-    local = LocalProcesses(groups, out, files, timing, "recorder" in observers, secure)
+    local = LocalProcesses(groups, out, files, timing, kept(observers), secure)
     try:
         options = local.bus["conductor"]
         session = open_session(replace(options, drop_wait_us=WALL_CLOCK_DROP_WAIT_US) if timing.wallclock else options)

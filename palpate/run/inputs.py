@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
-
-import typer
 
 from palpate.command_line import refuse
 from palpate.run.roles import NONE, checked, settings_of
@@ -13,9 +10,6 @@ from palpate_bus.implementations import ChoiceError
 from palpate_models.load import ScenarioError, load_scenario
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.scenario import Scenario
-
-Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")]
-"""Overrides of a scenario."""
 
 
 def usable(

@@ -21,6 +21,7 @@ from palpate.environment import FIXED
 from palpate.run.forks import Child, Forks
 from palpate.run.group import GroupMember
 from palpate.run.group import command as group_command
+from palpate.run.options import Record
 from palpate.run.placement import Groups, PlacementError
 from palpate.run.secure import SecureBus
 from palpate_bus.contract import contract
@@ -144,14 +145,14 @@ class LocalProcesses:
         out: Path,
         scenario_files: Mapping[str, Path],
         timing: Timing,
-        record: bool = False,
+        record: Record = "none",
         secure: SecureBus | None = None,
         forks: Forks | None = None,
     ) -> None:
         """`groups` gives the roles of each process, `scenario_files` the scenario that each role may see; with `secure` all are
         clients of its router.
 
-        `record` says that the run has a recorder; `forks` starts the processes in place of a fresh interpreter each.
+        `record` says what the run's recorder keeps; `forks` starts the processes in place of a fresh interpreter each.
         """
         settings = Settings.read()
         self._given = {"runtime": timing.runtime, "record": record}

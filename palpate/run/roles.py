@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
+from palpate.run.options import Record
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.run_name import name_run
+from palpate_bus.settings import Settings
 from palpate_models.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario import Scenario, Services
 
@@ -24,20 +23,18 @@ NONE = "none"
 RESULTS = ("report.json", "report.html", "map.png", "samples.csv", "evidence.npz", "bus.json", "recording.rrd")
 """What the end of a run leaves in its folder, and the viewer's drawing; the recorder removes its own files."""
 
-ServiceChoices = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--service",
-        metavar="ROLE=NAME_OR_FILE",
-        help="Who plays a role: an installed implementation, or a Python file with create(scenario). Short for "
-        "--set services.ROLE=...; may be repeated.",
-    ),
-]
-
 
 def workers(scenario: Scenario) -> tuple[str, ...]:
     """The roles that a run of this scenario cannot do without: all, except for the tissue where what is examined is real."""
     return tuple(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE)
+
+
+def kept(observers: Sequence[str]) -> Record:
+    """What the recorder of a run keeps, if it has one: what the settings say, and unless they do, `normal`."""
+    if "recorder" not in observers:
+        return "none"
+    said = Settings.read().record
+    return "normal" if said == "none" else said
 
 
 def choice(scenario: Scenario, role: str) -> str:

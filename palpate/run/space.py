@@ -2,45 +2,72 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Final
 
 from palpate.run.folder import FolderError
+from palpate.run.options import Record
 from palpate_conductor.result import RunProgress, Tell
 from palpate_models.scenario import Exam, Mode
 
 MB = 1_000_000
 REPORT_MB = 10
 """Report, page, map and evidence of a run, and its logs."""
-RECORDED_MB_PER_S = 2.0
-"""Both recordings, a simulated second: 88 MB of 50 s."""
+RECORDED_MB_PER_S: Final[dict[Record, float]] = {"none": 0.0, "normal": 0.33, "full": 1.7}
+"""Both recordings, a simulated second: of 79 s at full 129 MB, at normal 24 MB."""
 LOW_MB = 20
 """With less than this left the recordings are about to stop."""
-_BEFORE_AND_AFTER_S = 30.0
-"""What an examination takes before its first line and after its last."""
-_TURN_S = 2.0
-"""From one line to the next."""
-_POINT_S = 2.0
+_BEFORE_AND_AFTER_S = 12.0
+"""What an examination takes before its first descent and after its last."""
+_TOUCH_S = 2.7
+"""A touch before the scan, of which there is one in a square of `_TOUCH_EVERY_M`."""
+_TOUCH_EVERY_M = 0.07
+_DESCENT_S = 3.0
+"""From one line to the next: lifting, going there, touching the skin and pressing."""
+_POINT_S = 2.2
 """A point that is pressed by itself."""
+_MINUTE_S = 60.0
 
 
 def expected_duration(exam: Exam) -> float:
-    """About how long an examination takes, in simulated time [s]."""
+    """About how long an examination takes, in simulated time [s]: a fit to examinations of three sizes."""
     width, height = exam.region_m
     lines = width / exam.spacing_m + 1
+    touches = math.ceil(width / _TOUCH_EVERY_M) * math.ceil(height / _TOUCH_EVERY_M)
+    begin = _BEFORE_AND_AFTER_S + _TOUCH_S * touches
     if exam.mode is Mode.POINT:
-        return _BEFORE_AND_AFTER_S + lines * (height / exam.spacing_m + 1) * _POINT_S
-    return _BEFORE_AND_AFTER_S + lines * (height / exam.speed_mps + _TURN_S)
+        return begin + lines * (height / exam.spacing_m + 1) * _POINT_S
+    return begin + lines * (height / exam.speed_mps + _DESCENT_S)
 
 
-def check_room(folder: Path, exam: Exam, *, recorded: bool) -> None:
+def expected_mb(exam: Exam, record: Record) -> float:
+    """About what the results of an examination take on the disk [MB]."""
+    return REPORT_MB + RECORDED_MB_PER_S[record] * expected_duration(exam)
+
+
+def what_it_takes(exam: Exam, record: Record) -> str:
+    """How long an examination takes and how much it writes, in words for its user."""
+    seconds = expected_duration(exam)
+    time = f"{seconds / _MINUTE_S:.0f} min" if seconds > 2 * _MINUTE_S else f"{seconds:.0f} s"
+    return f"about {time} of simulated time, and about {expected_mb(exam, record):.0f} MB of results (--record {record})"
+
+
+def megabytes_of(folder: Path) -> float:
+    """What a folder holds [MB]."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / MB
+
+
+def check_room(folder: Path, exam: Exam, record: Record) -> None:
     """Raises FolderError when the disk of a folder has no room for the results of an examination."""
-    needed = REPORT_MB + (RECORDED_MB_PER_S * expected_duration(exam) if recorded else 0.0)
-    free = free_mb(folder)
+    needed, free = expected_mb(exam, record), free_mb(folder)
     if free < needed:
-        shorter = f"; without recordings (--no-record) {REPORT_MB} MB are enough" if recorded and free > REPORT_MB else ""
+        shorter = (
+            f"; without recordings (--record none) {REPORT_MB} MB are enough" if record != "none" and free > REPORT_MB else ""
+        )
         raise FolderError(f"--out {folder}: {free:.0f} MB are free there, and this run needs about {needed:.0f} MB{shorter}")
 
 

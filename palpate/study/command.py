@@ -14,8 +14,8 @@ from rich.table import Table
 
 from palpate.case_display import CaseDisplay
 from palpate.command_line import EXIT_FAILED, fail, output_folder, refuse
-from palpate.run.inputs import Settings
-from palpate.run.roles import ServiceChoices, settings_of
+from palpate.run.options import ServiceChoices, Settings
+from palpate.run.roles import settings_of
 from palpate.study.digest import RunRecord, Session
 from palpate.study.folder import Manifest, add_session, conclude, usual_folder
 from palpate.study.manifest import Case, Request, cases_of, secret_of

@@ -38,7 +38,9 @@ def main() -> None:
     palpate = str(Path(sys.executable).with_name("palpate"))
     with tempfile.TemporaryDirectory(prefix="palpate-references-") as folder:
         words = [word for setting in SETTINGS for word in ("--set", setting)]
-        subprocess.run([palpate, "run", "clean", "--composed", "--quiet", "--out", folder, *words], check=True)
+        subprocess.run(
+            [palpate, "run", "clean", "--composed", "--record", "full", "--quiet", "--out", folder, *words], check=True
+        )
         for role, (begin, length) in CUTS.items():
             target = FOLDER / f"{role}.mcap"
             make_reference(prepare(Path(folder), role), target, round(begin * NS), round((begin + length) * NS))

@@ -33,6 +33,15 @@ def test_the_list_of_commands_imports_none_and_says_what_each_is_for() -> None:
     assert done.stdout.split() == ["[]", "True"]
 
 
+def test_the_help_of_the_command_that_examines_does_not_wait_for_what_examines() -> None:
+    program = (
+        "import sys; from palpate.commands import app_for; app_for('run');"
+        "print(sorted({'numpy', 'pydantic', 'zenoh', 'matplotlib', 'scipy'} & sys.modules.keys()))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_the_version_is_that_of_the_package() -> None:
     called = CliRunner().invoke(app_for(""), ["--version"])
     assert called.exit_code == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections import namedtuple
 from pathlib import Path
@@ -12,9 +13,9 @@ from conductor_messages import SETTINGS, collected, result
 from rich.console import Console
 
 from palpate.command_line import EXIT_FAILED
-from palpate.run.command import _conclude
+from palpate.run.examine import conclude
 from palpate.run.folder import FolderError
-from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration
+from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration, what_it_takes
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunProgress
 from palpate_models.load import load_scenario
@@ -28,12 +29,21 @@ def leave(megabytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    leave(50, monkeypatch)
-    with pytest.raises(FolderError, match=r"50 MB are free there, and this run needs about \d{3} MB; without recordings"):
-        check_room(tmp_path, Exam(), recorded=True)
-    check_room(tmp_path, Exam(), recorded=False)
-    leave(1000, monkeypatch)
-    check_room(tmp_path, Exam(), recorded=True)
+    leave(40, monkeypatch)
+    with pytest.raises(FolderError, match=r"40 MB are free there, and this run needs about \d{2} MB; without recordings"):
+        check_room(tmp_path, Exam(), "normal")
+    check_room(tmp_path, Exam(), "none")
+    leave(100, monkeypatch)
+    check_room(tmp_path, Exam(), "normal")
+    with pytest.raises(FolderError, match=r"100 MB are free there, and this run needs about \d{3} MB"):
+        check_room(tmp_path, Exam(), "full")
+
+
+def test_it_is_said_before_the_start_how_long_it_takes_and_how_much_it_writes() -> None:
+    assert re.fullmatch(
+        r"about \d min of simulated time, and about \d\d MB of results \(--record normal\)", what_it_takes(Exam(), "normal")
+    )
+    assert what_it_takes(Exam(mode=Mode.POINT), "none").startswith("about 11 min of simulated time, and about 10 MB")
 
 
 def test_a_larger_region_and_points_take_longer() -> None:
@@ -58,7 +68,7 @@ def test_what_a_folder_does_not_take_is_written_to_another(
     monkeypatch.setattr("tempfile.tempdir", None)
     lost = tmp_path / "gone"
     with pytest.raises(typer.Exit) as left:
-        _conclude(Console(quiet=True), lost, load_scenario("clean", SETTINGS, seed=3), result(collected()), quiet=True)
+        conclude(Console(quiet=True), lost, load_scenario("clean", SETTINGS, seed=3), result(collected()), quiet=True)
     assert left.value.exit_code == EXIT_FAILED
     (other,) = tmp_path.glob("palpate-results-*")
     assert {"report.json", "report.html", "map.png"} <= {path.name for path in other.iterdir()}

@@ -63,7 +63,7 @@ def distributed(scenario: Scenario, out: Path, leak: Callable[[Scenario, dict[st
     if leak is not None:
         leak(scenario, files)
     witness = Witness()
-    local = LocalProcesses(apart(ROLES), out, files, Timing(), record=True, forks=cast("Forks", witness))
+    local = LocalProcesses(apart(ROLES), out, files, Timing(), record="full", forks=cast("Forks", witness))
     try:
         for process in read_processes(compose_file(), ROLES).values():
             local.start(process)

@@ -69,7 +69,7 @@ def images(engine: None) -> None:
 
 @pytest.fixture(scope="module")
 def local(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    finished = palpate_run("clean", tmp_path_factory.mktemp("local"), "--composed", "--no-record", settings=SHORT)
+    finished = palpate_run("clean", tmp_path_factory.mktemp("local"), "--composed", "--record", "none", settings=SHORT)
     assert finished.status == 0, finished.output
     return finished
 

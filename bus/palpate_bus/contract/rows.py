@@ -93,6 +93,8 @@ class Topic(_Row):
     ranges: dict[str, tuple[float, float]] = {}
     max_age_ms: int | None = None
     expiry_ms: int | None = None
+    record_ms: int = 0
+    """With --record normal the recorder keeps one message in this time; 0: every one."""
     open: bool = False
     """Whether others than the producer may send on it too."""
     doc: str

@@ -18,7 +18,7 @@ class ServiceOutput:
         self._publishers = {topic.name: member.publisher(topic) for topic in member.rules.outputs(role)}
         self._chunks = member.internal_publisher(f"palpate/record/{role}", CHUNK_TYPE, "event")
         self._chunk_sequence = 0
-        self._writer = ChunkWriter(role, tuple(self._publishers)) if Settings.read().record else None
+        self._writer = ChunkWriter(role, tuple(self._publishers)) if Settings.read().record != "none" else None
 
     def hello(self) -> None:
         """Sends the empty message that tests the edge on every topic."""

@@ -14,6 +14,9 @@ from typing import Any
 import yaml
 from mcap.writer import CompressionType, Writer
 
+from palpate_bus.contract import MS
+from palpate_bus.recordings import KEPT_EVERY
+
 CHUNK_BYTES = 4 * 1024 * 1024
 """A chunk is closed at this size, whatever its age: this bounds the memory."""
 FILE_BYTES = 1 << 30
@@ -39,6 +42,8 @@ class Channel:
     """Depth of the history offered."""
     transient_local: bool = False
     """Whether late joiners get the last message."""
+    kept_every_ms: int = 0
+    """One message in this time is kept; 0: every one."""
 
     @property
     def qos(self) -> list[dict[str, Any]]:
@@ -67,6 +72,8 @@ class Count:
     missing: int = 0
     """Messages that never came, by the gaps in the sequence numbers."""
     last: int = field(default=0, repr=False)
+    due: int = field(default=0, repr=False)
+    """Stamp [ns] from which the next message is kept."""
 
 
 @dataclass
@@ -160,19 +167,24 @@ class BagWriter:
             metadata = {
                 "offered_qos_profiles": yaml.safe_dump(channel.qos, sort_keys=False),
                 "topic_type_hash": channel.type_hash,
+                **({KEPT_EVERY: str(channel.kept_every_ms)} if channel.kept_every_ms else {}),
             }
             ids[channel.topic] = self._writer.register_channel(channel.topic, "cdr", schemas[channel.type], metadata)
         return ids
 
     def write(self, topic: str, payload: bytes | memoryview, stamp: int, sequence: int) -> None:
-        """Appends one message, stamped `stamp` [ns]. Raises KeyError for a topic that has no channel."""
-        self._writer.add_message(self._ids[topic], stamp, payload, stamp, sequence & 0xFFFFFFFF)
+        """Appends one message, stamped `stamp` [ns], unless its channel is not due. Raises KeyError for an unknown topic."""
         count = self.counts[topic]
-        count.messages += 1
-        count.bytes += len(payload)
         if sequence > count.last + 1:
             count.missing += sequence - count.last - 1
         count.last = sequence
+        if stamp < count.due:
+            return
+        if every := self.channels[topic].kept_every_ms:
+            count.due = stamp + every * MS
+        self._writer.add_message(self._ids[topic], stamp, payload, stamp, sequence & 0xFFFFFFFF)
+        count.messages += 1
+        count.bytes += len(payload)
         self._file.take(stamp)
         if self._flush_at is None:
             self._flush_at = stamp + self._flush_every

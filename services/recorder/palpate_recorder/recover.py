@@ -19,6 +19,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Message, Schema
 from mcap.stream_reader import StreamReader
 
+from palpate_bus.recordings import KEPT_EVERY
 from palpate_recorder.bag import BagWriter, Channel
 
 _BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
@@ -80,6 +81,7 @@ def _channel(record: ChannelRecord, schema: Schema) -> Channel:
         type_hash=record.metadata["topic_type_hash"],
         depth=qos["depth"],
         transient_local=qos["durability"] == "transient_local",
+        kept_every_ms=int(record.metadata.get(KEPT_EVERY, 0)),
     )
 
 

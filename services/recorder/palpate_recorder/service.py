@@ -22,8 +22,8 @@ FOLDER = "recording_mcap"
 """Name of the rosbag2 folder within the folder of the run."""
 
 
-def channels(rows: Contract) -> list[Channel]:
-    """The channels of all topics that the contract lets the recorder observe, in contract order."""
+def channels(rows: Contract, *, full: bool) -> list[Channel]:
+    """The channels of all topics that the contract lets the recorder observe, in contract order; `full`: of every message."""
     return [
         Channel(
             topic=f"/{topic.name}",
@@ -32,6 +32,7 @@ def channels(rows: Contract) -> list[Channel]:
             type_hash=topic.type_hash,
             depth=rows.qos[topic.qos].depth,
             transient_local=rows.qos[topic.qos].transient_local,
+            kept_every_ms=0 if full else topic.record_ms,
         )
         for topic, _ in rows.inputs("recorder")
     ]
@@ -42,9 +43,12 @@ class RecorderService(Service):
 
     role = "recorder"
 
-    def __init__(self, folder: Path, file_bytes: int = FILE_BYTES) -> None:
-        """Opens the recording, in files of about `file_bytes`. Raises OSError if the folder cannot be written."""
-        self._bag = BagWriter(folder, channels(contract()), run=run_of(folder.parent), file_bytes=file_bytes)
+    def __init__(self, folder: Path, file_bytes: int = FILE_BYTES, *, full: bool = True) -> None:
+        """Opens the recording, in files of about `file_bytes`, `full` or thinned as the contract's `record_ms` say.
+
+        Raises OSError if the folder cannot be written.
+        """
+        self._bag = BagWriter(folder, channels(contract(), full=full), run=run_of(folder.parent), file_bytes=file_bytes)
         self._names = {topic.name: f"/{topic.name}" for topic, _ in contract().inputs(self.role)}
         self._unexpected = 0
 
@@ -89,4 +93,4 @@ def create(scenario: Scenario) -> RecorderService:
     settings = Settings.read()
     out = settings.required("out", f"the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder")
     size = settings.record_file_mb
-    return RecorderService(out / FOLDER, FILE_BYTES if size is None else size * 1_000_000)
+    return RecorderService(out / FOLDER, FILE_BYTES if size is None else size * 1_000_000, full=settings.record == "full")

@@ -78,7 +78,7 @@ def main() -> None:
     print("|---|---|---|---|---|")
     for compression in (CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD):
         with tempfile.TemporaryDirectory() as folder:
-            bag = BagWriter(Path(folder) / "bag", channels(contract()), compression=compression)
+            bag = BagWriter(Path(folder) / "bag", channels(contract(), full=True), compression=compression)
             spent = np.empty(len(messages))
             cpu = process_time()
             for i, (topic, payload, stamp, sequence) in enumerate(messages):

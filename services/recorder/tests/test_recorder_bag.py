@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Reader
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, SurfaceMesh, codec
 from palpate_bus.messages.stamps import header
+from palpate_bus.recordings import RecordingError, open_recording
 from palpate_models.scenario import Scenario
 from palpate_recorder.recover import recover
 from palpate_recorder.service import FOLDER, RecorderService, create
@@ -96,7 +97,7 @@ def test_every_schema_of_the_contract_parses(tmp_path: Path, name: str) -> None:
 
     from palpate_recorder.service import channels
 
-    channel = next(c for c in channels(contract()) if c.topic == f"/{name}")
+    channel = next(c for c in channels(contract(), full=True) if c.topic == f"/{name}")
     schema = Schema(id=1, name=channel.type, encoding="ros2msg", data=channel.schema.encode())
     assert Factory().decoder_for("cdr", schema) is not None
 
@@ -207,6 +208,24 @@ def test_a_shorter_run_in_the_same_folder_leaves_no_file_of_the_longer_one(tmp_p
     record(service, 5)
     service.finish()
     assert [path.name for path in (tmp_path / FOLDER).glob("*.mcap")] == [f"{FOLDER}_0.mcap"]
+
+
+def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_most(tmp_path: Path) -> None:
+    every = TOPICS["joint_states"].record_ms
+    service = RecorderService(tmp_path / FOLDER, full=False)
+    for k in range(101):
+        service.record(TOPICS["joint_states"], joint_states(k * MS), k * MS, k + 1)
+        service.record(TOPICS["planning/setpoint"], b"", k * MS, k + 1)
+    facts = service.finish()
+    assert facts["topics"]["/joint_states"] == 100 // every + 1
+    assert facts["topics"]["/planning/setpoint"] == 101
+    assert facts["missing"] == {}
+    recording = open_recording(tmp_path / FOLDER)
+    assert recording.thinned.keys() == {name for name, topic in TOPICS.items() if topic.record_ms}
+    recording.check(contract(), ["planning/setpoint"])
+    recording.check(contract(), ["joint_states"], whole=False)
+    with pytest.raises(RecordingError, match=r"of topic joint_states one message in \d+ ms was kept.*--record full"):
+        recording.check(contract(), ["joint_states"])
 
 
 def test_rerun_opens_the_recording(tmp_path: Path) -> None:

@@ -1,0 +1,173 @@
+"""What `palpate run` does: an examination from its start to its results. `palpate.run.command` has the options."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from palpate.command_line import fail, refuse, say
+from palpate.environment import given
+from palpate.report.page import write_page
+from palpate.report.results import print_findings, write_results
+from palpate.run.composed import run_composed
+from palpate.run.distributed import run_distributed
+from palpate.run.folder import FolderError, results_folder, usual_folder
+from palpate.run.options import Record
+from palpate.run.placement import Groups, PlacementError, placement
+from palpate.run.places import Absent, PlaceError
+from palpate.run.processes import ProcessListError
+from palpate.run.progress import RunDisplay
+from palpate.run.roles import NONE, OBSERVERS, workers, write_scenario_files
+from palpate.run.secure import SecureBus
+from palpate.run.space import WatchedRoom, another_folder, check_room, megabytes_of, what_it_takes
+from palpate_bus.implementations import ChoiceError
+from palpate_bus.security.keys import KeysError
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire.zenoh_config import close_session, open_session
+from palpate_conductor.conduct import conduct as conduct_run
+from palpate_conductor.outcome import RunFailed
+from palpate_conductor.result import RunResult, Tell
+from palpate_conductor.timing import Timing
+from palpate_conductor.tree import FrameTree
+from palpate_models.load import ScenarioError, exam_input, load_scenario
+from palpate_models.scenario import Scenario
+
+NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
+
+
+@dataclass(frozen=True)
+class How:
+    """How an examination is to be run: the options of `palpate run`."""
+
+    out: Path | None
+    overwrite: bool
+    composed: bool
+    group: tuple[str, ...]
+    processes: int | None
+    realtime: bool
+    wallclock: bool
+    handover_s: float
+    without: tuple[str, ...]
+    wait_s: float
+    record: Record
+    secure: bool
+    keys: Path | None
+    quiet: bool
+    as_json: bool
+
+    @property
+    def observers(self) -> tuple[str, ...]:
+        """Recorder and dashboard, unless nothing is recorded."""
+        return OBSERVERS if self.record != "none" else ()
+
+
+def examine(scenario: Scenario, how: How) -> None:
+    """Runs the examination and writes its results; ends the command when it cannot start or has failed."""
+    console = Console(stderr=True)
+    quiet = how.quiet or how.as_json
+    _refuse_contradictions(scenario, how)
+    try:
+        absent = Absent(how.without, how.wait_s, partial(console.print, highlight=False, soft_wrap=True))
+        groups = placement((*workers(scenario), *how.observers), how.group, how.processes)
+    except (PlaceError, PlacementError) as error:
+        refuse(error)
+    folder = how.out or usual_folder(scenario.name)
+    if not quiet:
+        console.print(f"[bold]{scenario.name}[/] seed {scenario.seed}, results in {folder}", highlight=False)
+        console.print(f"[dim]{what_it_takes(scenario.exam, how.record)}[/]", highlight=False, soft_wrap=True)
+        if not how.composed:
+            console.print("[dim]look at it from another terminal: palpate doctor, palpate topic list[/]", highlight=False)
+    try:
+        with results_folder(folder, overwrite=how.overwrite):
+            check_room(folder, scenario.exam, how.record)
+            with RunDisplay(console, quiet) as display, given({"PALPATE_RECORD": how.record}):
+                tell = WatchedRoom(folder, display.tell, say).tell
+                result = _run(scenario, folder.resolve(), tell, how, absent, groups)
+            conclude(console, folder, scenario, result, quiet, how.as_json)
+    except (ProcessListError, ChoiceError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
+        refuse(error)
+    except RunFailed as error:
+        fail(error)
+
+
+def _refuse_contradictions(scenario: Scenario, how: How) -> None:
+    shared = bool(how.group) or how.processes is not None
+    for contradiction, why in (
+        (
+            how.composed and (how.realtime or how.wallclock),
+            "--composed runs as fast as it can: it takes neither --realtime nor --wallclock",
+        ),
+        (scenario.services.tissue == NONE and not how.wallclock, NEEDS_WALLCLOCK),
+        (how.without and how.composed, "--without ROLE leaves out a process: it goes without --composed"),
+        (shared and how.composed, "--composed is one process for all: it takes neither --group nor --processes"),
+        (shared and how.wallclock, "--wallclock needs a process for each service: it takes neither --group nor --processes"),
+        (
+            how.handover_s and not how.wallclock,
+            "--handover is for --wallclock: in lockstep every message is awaited",
+        ),
+        (how.composed and how.secure, "--secure is for processes, so it goes without --composed"),
+        (how.keys and not how.secure, "--keys goes with --secure"),
+    ):
+        if contradiction:
+            refuse(why)
+
+
+def _run(scenario: Scenario, folder: Path, tell: Tell, how: How, absent: Absent, groups: Groups) -> RunResult:
+    if how.composed:
+        return run_composed(scenario, folder, tell, how.observers)
+    timing = Timing(how.wallclock, 1.0 if how.realtime else None, handover_s=how.handover_s)
+    with SecureBus(how.keys) if how.secure else nullcontext() as bus:
+        return run_distributed(scenario, folder, tell, how.observers, timing, bus, absent, groups)
+
+
+def conclude(
+    console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
+) -> None:
+    """Writes the results, prints the findings, and leaves with status 3 when the run failed or its folder took no results."""
+    with nullcontext() if quiet else console.status("writing report and maps"):
+        trouble = ""
+        try:
+            report = write_results(folder, scenario, result)
+            page = write_page(folder)
+        except OSError as error:
+            trouble = f"{folder}: the results cannot be written there ({error.strerror})"
+            folder = another_folder()
+            write_scenario_files(scenario, folder)
+            report = write_results(folder, scenario, result)
+            page = write_page(folder)
+    if as_json:
+        print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
+    else:
+        print_findings(Console(), report)
+    if not quiet or trouble:
+        console.print(f"to read: {page} ({megabytes_of(folder):.0f} MB in {folder})", highlight=False, soft_wrap=True)
+    if result.failure:
+        fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+    if trouble:
+        fail(f"{trouble}; they are in {folder}")
+
+
+def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallclock: bool, quiet: bool) -> None:
+    """Conducts services that others start and writes the results into `out`, which has scenario.yaml."""
+    console = Console(stderr=True)
+    for name in observers:
+        if name not in OBSERVERS:
+            refuse(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
+    try:
+        chosen = load_scenario(str(out / "scenario.yaml"))
+        if chosen.services.tissue == NONE and not wallclock:
+            refuse(NEEDS_WALLCLOCK)
+        session = open_session()
+    except (ScenarioError, BusConfigError) as error:
+        refuse(error)
+    roles = (*workers(chosen), *observers)
+    with RunDisplay(console, quiet) as display:
+        timing = Timing(wallclock, 1.0 if realtime else None)
+        result = conduct_run(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
+    close_session(session)
+    conclude(console, out, chosen, result, quiet)
