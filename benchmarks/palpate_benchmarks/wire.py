@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -33,7 +32,7 @@ from palpate_bus.security.keys import init
 from palpate_bus.settings import Settings
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.transport import Publisher, Subscription
-from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session, session
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, free_port, mesh, open_session, session
 
 ROUNDS = 1500
 REPEATS = 3
@@ -203,7 +202,7 @@ def _secure() -> list[float]:
     with ExitStack() as stack:
         keys = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="palpate-bench-")))
         init(keys, ("robot", "control", ROUTER), days=1)
-        where = f"tls/127.0.0.1:{_free_port()}"
+        where = f"tls/127.0.0.1:{free_port()}"
         router = BusOptions(mode="router", listen=(where,), tls=keys / ROUTER)
         stack.enter_context(session(router, access_control(contract())))
         here, there = (BusOptions(mode="client", router=where, tls=keys / role) for role in ("robot", "control"))
@@ -224,7 +223,7 @@ def _against_sdk() -> dict[str, float]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="palpate-bench-")))
         _write_definitions(folder)
-        port = _free_port()
+        port = free_port()
         router = open_session(BusOptions(mode="router", listen=(f"tcp/127.0.0.1:{port}",)))
         stack.callback(close_session, router)
         sides = ("sdk", "message")
@@ -340,20 +339,10 @@ def _ping(side: str, port: int, folder: Path) -> list[float]:
 
 def _write_definitions(folder: Path) -> None:
     """The .msg files that the other client would clone."""
-    text, _ = codec.store.generate_msgdef(TYPE, ros_version=2)
-    first, *others = str(text).split("=" * 80)
-    for section in (f"MSG: {TYPE}\n{first}", *(part.strip() for part in others)):
-        head, _, body = section.partition("\n")
-        package, base = head.removeprefix("MSG: ").split("/")[0], head.rsplit("/", 1)[1]
-        path = folder / package / "msg" / f"{base}.msg"
+    for file, text in codec.interface_files(TYPE).items():
+        path = folder / file
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(body + "\n", encoding="utf-8")
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

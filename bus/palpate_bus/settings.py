@@ -27,11 +27,17 @@ DOMAIN_MAX = 232
 """The highest ROS domain with DDS's default port range; zenoh itself knows no limit."""
 
 COMPOSE_VARIABLES = {
-    "PALPATE_SCENARIO_NAME": ("clean", "Scenario that the containers examine: a name or a file."),
-    "PALPATE_SETTINGS": ("", "Changes to the scenario, `a.b=c`, separated by spaces."),
+    "PALPATE_SCENARIO_NAME": (
+        "clean",
+        "Scenario that the containers examine: a name, or a file in the results folder as `/results/my.yaml`.",
+    ),
+    "PALPATE_SETTINGS": (
+        "",
+        "Changes to the scenario, `a.b=c`, separated by spaces, with none inside: `exam.region_m=[0.1,0.1]`.",
+    ),
     "PALPATE_RESULTS": ("./out", "Folder of this machine into which the containers write."),
-    "PALPATE_UID": ("1000", "User id under which the containers write."),
-    "PALPATE_GID": ("1000", "Group id under which the containers write."),
+    "PALPATE_UID": ("1000", "User id under which the containers write; on Linux `$(id -u)`."),
+    "PALPATE_GID": ("1000", "Group id under which the containers write; on Linux `$(id -g)`."),
     "PALPATE_RECORDING": ("", "Folder with a recording, for compose/camera-replay.yml."),
 }
 """What only docker-compose.yml reads: default and meaning."""

@@ -1,7 +1,6 @@
 """Access control with real sessions: a secure router passes what the rows say and nothing else."""
 
 import json
-import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,16 +14,10 @@ from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, acces
 from palpate_bus.security.keys import KeysError, certificates, init, members, read
 from palpate_bus.wire.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
 from palpate_bus.wire.rmw import message_key, topic_key
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, open_session, zenoh_config
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, free_port, open_session, zenoh_config
 
 RULES = contract()
 CONTROL = message_key("palpate/control", "palpation_msgs/msg/RunControl", 0)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Bus:

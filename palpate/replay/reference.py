@@ -91,7 +91,6 @@ def write_reference(path: Path, rules: Contract, messages: Iterable[RecordedMess
 
 
 def _register(writer: Writer, topic: Topic) -> int:
-    text = str(codec.store.generate_msgdef(topic.type, ros_version=2)[0])
-    schema = writer.register_schema(topic.type, "ros2msg", text.encode())
+    schema = writer.register_schema(topic.type, "ros2msg", codec.definition(topic.type).encode())
     channel: int = writer.register_channel(f"/{topic.name}", "cdr", schema, {"topic_type_hash": topic.type_hash})
     return channel

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import socket
 import tempfile
 from pathlib import Path
 from types import TracebackType
@@ -12,7 +11,7 @@ from typing import Self
 from palpate_bus.contract import contract
 from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init, read
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, open_session
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, free_port, open_session
 
 
 class SecureBus:
@@ -25,7 +24,7 @@ class SecureBus:
         """
         self._own = None if keys else Path(tempfile.mkdtemp(prefix="palpate-keys-"))
         self.keys = (keys or self._own or Path()).resolve()
-        self.endpoint = f"tls/127.0.0.1:{_free_port()}"
+        self.endpoint = f"tls/127.0.0.1:{free_port()}"
 
     def options(self, role: str) -> BusOptions:
         """How a role joins."""
@@ -58,9 +57,3 @@ class SecureBus:
         """Removes keys that were made for this run alone."""
         if self._own is not None:
             shutil.rmtree(self._own, ignore_errors=True)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

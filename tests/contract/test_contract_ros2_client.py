@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import json
 import shlex
-import socket
 import subprocess
 import sys
 import threading
@@ -25,7 +24,7 @@ from palpate.check.suites.robot import quiet
 from palpate_bus.contract import contract
 from palpate_bus.messages import CameraTrigger, codec
 from palpate_bus.messages.stamps import header
-from palpate_bus.wire.zenoh_config import BusOptions, session
+from palpate_bus.wire.zenoh_config import BusOptions, free_port, session
 from palpate_models.load import load_scenario
 
 CLIENT = Path(__file__).with_name("ros2_client.py")
@@ -35,22 +34,12 @@ TYPES = ("sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped", "senso
 
 
 def write_definitions(folder: Path) -> None:
-    """What the client would clone otherwise: <package>/msg/<Name>.msg of the types that it needs, and of those within."""
+    """What the client would clone otherwise."""
     for name in TYPES:
-        text, _ = codec.store.generate_msgdef(name, ros_version=2)
-        sections = [f"MSG: {name}\n{text.split('=' * 80)[0]}", *[part.strip() for part in text.split("=" * 80)[1:]]]
-        for section in sections:
-            head, _, body = section.partition("\n")
-            package, base = head.removeprefix("MSG: ").split("/")[0], head.rsplit("/", 1)[1]
-            path = folder / package / "msg" / f"{base}.msg"
+        for file, text in codec.interface_files(name).items():
+            path = folder / file
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(body + "\n", encoding="utf-8")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+            path.write_text(text, encoding="utf-8")
 
 
 def test_the_client_imports_nothing_of_ours() -> None:

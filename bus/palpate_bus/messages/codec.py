@@ -16,15 +16,25 @@ from rosbags.interfaces import Nodetype
 from palpate_bus.messages.arrays import array_dtype, fitted
 from palpate_bus.messages.cdr import ENCAPSULATION
 from palpate_bus.messages.struct_codecs import STRUCT_CODECS
-from palpate_bus.messages.typestore import CodecError, message_type, palpation_definitions, store, type_hash
+from palpate_bus.messages.typestore import (
+    CodecError,
+    definition,
+    interface_files,
+    message_type,
+    palpation_definitions,
+    store,
+    type_hash,
+)
 
 __all__ = [
     "CodecError",
     "Message",
     "decode",
     "decoder",
+    "definition",
     "encode",
     "encoder",
+    "interface_files",
     "message_type",
     "palpation_definitions",
     "store",

@@ -56,6 +56,22 @@ def message_type(name: str) -> Any:
         raise CodecError(f"no such message type: {name!r} (ROS 2 Jazzy and palpation_msgs are known)") from None
 
 
+def definition(name: str) -> str:
+    """The .msg text of a message type, followed by those of the types within it, as recordings keep them."""
+    return str(store.generate_msgdef(name, ros_version=2)[0])
+
+
+def interface_files(name: str) -> dict[str, str]:
+    """The .msg files that a client of ROS 2 needs for a message type: text by path (`sensor_msgs/msg/JointState.msg`)."""
+    first, *others = (part.strip() for part in definition(name).split("=" * 80))
+    files = {f"{name}.msg": first + "\n"}
+    for part in others:
+        head, _, text = part.partition("\n")
+        package, kind = head.removeprefix("MSG: ").split("/")
+        files[f"{package}/msg/{kind}.msg"] = text + "\n"
+    return files
+
+
 @cache
 def type_hash(name: str) -> str:
     """The RIHS01 hash of a message type, `RIHS01_<64 hex digits>`, which rmw_zenoh puts into the key."""

@@ -36,6 +36,7 @@ import atexit
 import json
 import os
 import re
+import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -285,3 +286,10 @@ def session(options: BusOptions | None = None, access: Mapping[str, Any] | None 
         yield opened
     finally:
         close_session(opened)
+
+
+def free_port() -> int:
+    """A TCP port of this machine on which nobody listens now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -35,15 +35,17 @@ class SurfaceCorrection:
     def __init__(self) -> None:
         self._places = np.empty((0, 2))
         self._heights, self._variances, self._weights = np.empty(0), np.empty(0), np.empty(0)
-        self._factor: tuple[Array, bool] = (np.empty((0, 0)), True)
+        self._precision: Array = np.empty((0, 0))
+        """(K + S)^-1 [1/m^2]: places are asked about at every step, and touched seldom."""
 
     def touch(self, xy_A: Array, height: float, sigma: float) -> None:
         """The surface was felt at `xy_A`, shape (2,), `height` [m] outward of where it was perceived, within `sigma` [m]."""
         self._places = np.vstack((self._places, xy_A))
         self._heights = np.append(self._heights, height)
         self._variances = np.append(self._variances, sigma**2)
-        self._factor = cho_factor(_covariance(self._places, self._places) + np.diag(self._variances), lower=True)
-        self._weights = cho_solve(self._factor, self._heights)
+        factor = cho_factor(_covariance(self._places, self._places) + np.diag(self._variances), lower=True)
+        self._weights = cho_solve(factor, self._heights)
+        self._precision = cho_solve(factor, np.eye(len(self._heights)))
 
     def height(self, xy_A: Array) -> float:
         """C [m] at a place, shape (2,)."""
@@ -51,14 +53,12 @@ class SurfaceCorrection:
 
     def sigma(self, xy_A: Array) -> float:
         """Standard deviation of c [m] at a place, shape (2,)."""
-        prior = float(_covariance(xy_A, xy_A[None])[0])
-        if not len(self._heights):
-            return math.sqrt(prior)
+        prior = OFFSET_M**2 + TILT_RAD**2 * float(xy_A @ xy_A) + FIELD_M**2
         k = _covariance(xy_A, self._places)
-        return math.sqrt(max(prior - float(k @ cho_solve(self._factor, k)), 0.0))
+        return math.sqrt(max(prior - float(k @ self._precision @ k), 0.0))
 
 
 def _covariance(a: Array, b: Array) -> Array:
     """The covariance of places a, shape (..., 2), with places b, shape (n, 2): shape (..., n)."""
-    apart = np.sum((a[..., None, :] - b) ** 2, axis=-1)
+    apart = ((a[..., None, :] - b) ** 2).sum(axis=-1)
     return np.asarray(OFFSET_M**2 + TILT_RAD**2 * (a @ b.T) + FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)))

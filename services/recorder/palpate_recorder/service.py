@@ -28,7 +28,7 @@ def channels(rows: Contract, *, full: bool) -> list[Channel]:
         Channel(
             topic=f"/{topic.name}",
             type=topic.type,
-            schema=str(codec.store.generate_msgdef(topic.type, ros_version=2)[0]),
+            schema=codec.definition(topic.type),
             type_hash=topic.type_hash,
             depth=rows.qos[topic.qos].depth,
             transient_local=rows.qos[topic.qos].transient_local,

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 from palpate_models.nearest import nearest_vertex
 from palpate_models.phantom import PhantomModel
+from palpate_models.vectors import Vector, add, dot, row, scale, subtract
 
 _FAR_M = 0.15
 """Further away than this, the nearest vertex stands for the nearest point."""
@@ -70,31 +72,37 @@ class SkinSurface:
         return tilted
 
 
+@compiled
 def nearest_on_triangles(p: Array, corners: Array) -> tuple[Array, Array]:
     """Square distances [m^2] of `p` from k triangles, shape (k,), and the barycentric coordinates of the nearest points, (k, 3).
 
     The nearest point a + v (b - a) + w (c - a) is p's projection on the plane where that lies inside, else that on a side.
-    `corners` [m], shape (k, 3, 3), has a, b and c of each triangle as rows.
+    `corners` [m], shape (k, 3, 3), has a, b and c of each triangle as rows. Compiled: of so few numbers numpy makes two hundred
+    small arrays.
     """
-    a, b, c = corners.swapaxes(0, 1)
-    sides = np.stack((b - a, c - a), axis=1)
-    inside = np.linalg.solve(sides @ sides.swapaxes(1, 2), sides @ (p - a)[:, :, None])[..., 0]
-    v, w = inside.T
-    on_ab, on_ac, on_bc = (_share(p - start, end - start) for start, end in ((a, b), (a, c), (b, c)))
-    none = np.zeros_like(v)
-    candidates = np.array(
-        ((1 - v - w, v, w), (1 - on_ab, on_ab, none), (1 - on_ac, none, on_ac), (none, 1 - on_bc, on_bc))
-    ).transpose(2, 0, 1)  # (k, 4, 3)
-    squares = ((p - candidates @ corners) ** 2).sum(axis=-1)
-    squares[(candidates < 0).any(axis=-1)] = np.inf
-    nearest = squares.argmin(axis=1)
-    each = np.arange(len(corners))
-    return squares[each, nearest], candidates[each, nearest]
+    squares, weights = np.full(len(corners), np.inf), np.empty((len(corners), 3))
+    point = row(p.reshape(1, 3), 0)
+    for k in range(len(corners)):
+        a, b, c = row(corners[k], 0), row(corners[k], 1), row(corners[k], 2)
+        ab, ac, ap = subtract(b, a), subtract(c, a), subtract(point, a)
+        g_bb, g_bc, g_cc, r_b, r_c = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ab, ap), dot(ac, ap)
+        determinant = g_bb * g_cc - g_bc * g_bc
+        v, w = (g_cc * r_b - g_bc * r_c) / determinant, (g_bb * r_c - g_bc * r_b) / determinant
+        on_ab, on_ac, on_bc = _share(ap, ab), _share(ap, ac), _share(subtract(point, b), subtract(c, b))
+        for at in ((1 - v - w, v, w), (1 - on_ab, on_ab, 0.0), (1 - on_ac, 0.0, on_ac), (0.0, 1 - on_bc, on_bc)):
+            if min(at) < 0.0:
+                continue
+            gap = subtract(ap, add(scale(at[1], ab), scale(at[2], ac)))
+            if dot(gap, gap) < squares[k]:
+                squares[k] = dot(gap, gap)
+                weights[k] = at
+    return squares, weights
 
 
-def _share(offset: Array, side: Array) -> Array:
-    """Where points at `offset` [m] from the start of each `side` [m] project on it, as a share of it from 0 to 1, shape (k,)."""
-    return np.asarray(np.clip((offset * side).sum(axis=1) / (side * side).sum(axis=1), 0.0, 1.0))
+@compiled
+def _share(offset: Vector, side: Vector) -> float:
+    """Where a point at `offset` [m] from the start of a `side` [m] projects on it, as a share of it from 0 to 1."""
+    return min(max(dot(offset, side) / dot(side, side), 0.0), 1.0)
 
 
 def _incident_faces(model: PhantomModel) -> list[NDArray[np.intp]]:

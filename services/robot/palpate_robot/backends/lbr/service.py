@@ -37,9 +37,8 @@ DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
 """Most joint damping in a hold [N m s/rad] [A]: as an overlay it acts one to three cycles late on a filtered speed. Below the
 arm's own viscous friction (10) that is stable with any delay; more is for the joints with inertia for it."""
 LINKS_PERIOD = contract().topics["sim/link_poses"].period
-FT_AGE = 50_000_000
-"""An F/T reading older than this [ns] counts as none. Longer than the contract's age of ft/wrench, which is what a reader of the
-bus may rely on: a sensor's driver on another computer may send no more than 50 readings a second."""
+FT_AGE_NS = contract().topics["ft/wrench"].max_age
+"""An F/T reading older than this [ns] counts as none."""
 TAKE_OVER = 100_000_000
 """For so long after its first command [ns] the driver lets others finish: the watchdog commands until it hears a new driver."""
 _NAMES = list(lbr.JOINT_NAMES)
@@ -97,7 +96,7 @@ class LbrService(Service):
             outbox["joint_states"] = (
                 joints  # on every tick, as readers count on it: between two states the newest, with its stamp
             )
-            if self._wrench_at is not None and t - self._wrench_at <= FT_AGE:
+            if self._wrench_at is not None and t - self._wrench_at <= FT_AGE_NS:
                 outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), _wrench(self._wrench))
             if fresh:
                 self._drive(t, inbox, joints)
@@ -151,7 +150,7 @@ class LbrService(Service):
     def _judge_connection(self, t: int) -> str:
         """Latches a hold when the arm was active and does not take commands any more; returns why it does not."""
         trouble = self._arm.trouble(t)
-        if not trouble and (self._wrench_at is None or t - self._wrench_at > FT_AGE):
+        if not trouble and (self._wrench_at is None or t - self._wrench_at > FT_AGE_NS):
             trouble = "no F/T reading" if self._wrench_at is None else f"no F/T reading for {(t - self._wrench_at) / 1e6:.0f} ms"
         if trouble and self._driver.mode is DriverMode.ACTIVE:
             self._driver.hold(t, HoldCause.DEVICE, trouble)
