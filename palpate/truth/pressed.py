@@ -23,7 +23,6 @@ from palpate_models.cache import content_key, remembered
 from palpate_models.frames import Array
 from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom.field import edge_distance
-from palpate_models.press import apparent_stiffness
 from palpate_models.scenario import Exam, Scenario
 from palpate_tissue.backend import TissueBackend
 
@@ -96,11 +95,11 @@ def press_patient(scenario: Scenario) -> Pressed | None:
     def press(tissue: TissueBackend, where: NDArray[np.bool_], otherwise: Array) -> Array:
         felt = otherwise.copy()
         if where.any():
-            felt[where] = apparent_stiffness(tissue.press(places[where], normals[where], radius))[0]
+            felt[where] = tissue.press(places[where], normals[where], radius)[0]
         return felt
 
     def compute() -> Array:
-        force, limited = apparent_stiffness(body.press(places, normals, radius))
+        force, limited = body.press(places, normals, radius)
         near = _near(places, lesions)
         healthy = force
         if near.any() and (without := copies.with_lesions(())) is not None:

@@ -53,11 +53,11 @@ class TissueBackend(ABC):
         self.settle()
         return self
 
-    def press(self, places: Array, normals: Array, radius: float) -> Array:
-        """Standard presses with a sphere of `radius` [m], each into the body at rest: forces along the normals [N], shape (k, n).
+    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Standard presses with a sphere of `radius` [m], each into the body at rest, as it is afterwards.
 
-        `places` [m] on the skin at rest and outward unit `normals` there, shape (k, 3); n are the press's steps. The body is at
-        rest afterwards. Faster ways to do the same are the subclass's.
+        `places` [m] on the skin at rest and outward unit `normals` there, shape (k, 3). Returns their apparent stiffness [N] and
+        whether they ended at their limit, each of shape (k,). Here it is done step by step; faster ways are the subclass's.
         """
         at = press.times(self.dt)
         depths = press.depths(at)
@@ -69,7 +69,7 @@ class TissueBackend(ABC):
                 force, _ = self.step(float(at[i]), place + (radius - depth) * normal, -speeds[i] * normal, radius)
                 forces[k, i] = force @ normal
         self.settle()
-        return forces
+        return press.apparent_stiffness(forces)
 
     @property
     @abstractmethod

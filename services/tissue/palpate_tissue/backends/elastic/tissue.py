@@ -139,7 +139,7 @@ class ElasticTissue(TissueBackend):
         """See `TissueBackend`. Its steps are implicit already."""
         return ElasticTissue(self.model, self.compliance, self._stiffness, self.breathing, dt)
 
-    def press(self, places: Array, normals: Array, radius: float) -> Array:
+    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
         """See `TissueBackend`. In steps of PRESS_STEP_S: the step is implicit, and what is read is the end of the hold."""
         if self.dt >= PRESS_STEP_S:
             return super().press(places, normals, radius)

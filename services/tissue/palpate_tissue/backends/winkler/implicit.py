@@ -58,7 +58,7 @@ class ImplicitTissue(TissueBackend):
         self.friction = friction.skin(stiffness.friction, model.background)
         self._reach_m = REACHED * stiffness.length_m
         self._every = max(1, round(FAR_S / dt))
-        self._wall = self._wall_of(stiffness)
+        self._wall = implicit_wall(model, stiffness, dt, self._every)
         self._free = np.flatnonzero(~model.fixed)
         self._search = Search(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._tree = cKDTree(model.vertices[self._free])
@@ -140,33 +140,6 @@ class ImplicitTissue(TissueBackend):
         place[near] = np.arange(len(near))
         return ImplicitPatch(near, place[vertex], table, np.zeros(len(vertex)), np.empty((len(near), 2)))
 
-    def _wall_of(self, stiffness: Stiffness) -> ImplicitWall:
-        model = self.model
-        n, g, tau = len(model.vertices), np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
-        K = stiffness_matrix(model, stiffness)
-        foundation = model.stiffness * model.areas
-        table = np.column_stack(
-            (
-                stiffness.dashpot_s * foundation / self.dt,
-                K.diagonal(),
-                foundation,
-                model.stiffening**2,
-                wall.straight_from(model.stiffening),
-                model.tension,
-            )
-        )
-        return ImplicitWall(
-            u=np.zeros(n),
-            s=np.zeros(n),
-            y=np.zeros((n, len(g))),
-            clock=np.zeros(n, dtype=np.int64),
-            table=table,
-            indptr=K.indptr.astype(np.uint32),
-            indices=K.indices.astype(np.uint32),
-            K=K.data,
-            decay=np.vstack((g, np.exp(-self.dt * np.arange(1, self._every + 1)[:, None] / tau))),
-        )
-
     @property
     def contacts(self) -> NDArray[np.intp]:
         """Vertices in contact after the step, shape (k,)."""
@@ -185,3 +158,31 @@ class ImplicitTissue(TissueBackend):
     def inward(self) -> Array:
         """See `TissueBackend`."""
         return np.asarray(self._wall.u - self._excursion * self.model.breathing)
+
+
+def implicit_wall(model: PhantomModel, stiffness: Stiffness, dt: float, longest: int) -> ImplicitWall:
+    """The wall of a model at rest, for steps of `dt` [s], of which it takes at most `longest` in one."""
+    n, g, tau = len(model.vertices), np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
+    K = stiffness_matrix(model, stiffness)
+    foundation = model.stiffness * model.areas
+    table = np.column_stack(
+        (
+            stiffness.dashpot_s * foundation / dt,
+            K.diagonal(),
+            foundation,
+            model.stiffening**2,
+            wall.straight_from(model.stiffening),
+            model.tension,
+        )
+    )
+    return ImplicitWall(
+        u=np.zeros(n),
+        s=np.zeros(n),
+        y=np.zeros((n, len(g))),
+        clock=np.zeros(n, dtype=np.int64),
+        table=table,
+        indptr=K.indptr.astype(np.uint32),
+        indices=K.indices.astype(np.uint32),
+        K=K.data,
+        decay=np.vstack((g, np.exp(-dt * np.arange(1, longest + 1)[:, None] / tau))),
+    )

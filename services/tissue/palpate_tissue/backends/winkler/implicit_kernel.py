@@ -65,6 +65,21 @@ class ImplicitPatch(NamedTuple):
     """Displacement before the step and the least that the sphere allows [m] of the stepped, shape (p, 2). Changed in place."""
 
 
+class Stride(NamedTuple):
+    """One step of vertices."""
+
+    length: float
+    """How many of the wall's own steps it has [1]."""
+    kept: float
+    """Which part of a displacement is strain at the end of the step; what is missing has relaxed meanwhile [1]."""
+    over: float
+    """How far a sweep goes beyond the balance [1]."""
+
+
+OWN = Stride(1.0, 1.0, OVER_RELAXATION)
+"""One of the wall's own steps, in which branches follow afterwards."""
+
+
 @compiled
 def press(
     wall: ImplicitWall,
@@ -91,7 +106,7 @@ def press(
         if square > radius * radius * RIM * RIM:
             room[patch.within[k], 1] = along + sqrt(square) + excursion * table[k, 6]
     for _ in range(sweeps):
-        sweep(wall, near, room, activation)
+        sweep(wall, near, room, activation, OWN)
     load = 0.0
     force = normal = moment = (0.0, 0.0, 0.0)
     for k in range(len(table)):
@@ -99,7 +114,7 @@ def press(
         patch.f[k] = 0.0
         if u[near[at]] > room[at, 1]:
             continue
-        f = -unbalanced(wall, near[at], room[at, 0], activation)
+        f = -unbalanced(wall, near[at], room[at, 0], activation, 1.0)
         if f <= 0.0:
             continue
         n, d = row(table, k, 0), subtract(sphere.p, row(table, k, 3))
@@ -119,14 +134,15 @@ def press(
 
 
 @compiled
-def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: float) -> None:
-    """One sweep over vertices, each to where its forces balance and beyond, but not through its floor."""
+def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: float, stride: Stride) -> float:
+    """One sweep over vertices, each to where its forces balance and beyond, but not through its floor. The longest way [m]."""
     u, s, table, indptr, indices, K = wall.u, wall.s, wall.table, wall.indptr, wall.indices, wall.K
+    longest = 0.0
     for k in range(len(near)):
         i = near[k]
-        at = u[i]
-        force = table[i, DRAG] * (room[k, 0] - at)
-        slope = table[i, DRAG] + table[i, DIAGONAL]
+        at, drag = u[i], table[i, DRAG] / stride.length
+        force = drag * (room[k, 0] - at)
+        slope = drag + stride.kept * table[i, DIAGONAL]
         for j in range(indptr[i], indptr[i + 1]):
             force -= K[j] * s[indices[j]]
         if at > 0.0:
@@ -134,16 +150,18 @@ def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: f
             stiffer, held = table[i, BETA2] * bent * bent, table[i, TENSION] * activation
             force -= table[i, FOUNDATION] * (stiffer * (at - 2.0 / 3.0 * bent) + held * at)
             slope += table[i, FOUNDATION] * (stiffer + held)
-        moved = max(at + OVER_RELAXATION * force / slope, room[k, 1])
-        s[i] += moved - at
+        moved = max(at + stride.over * force / slope, room[k, 1])
+        s[i] += stride.kept * (moved - at)
         u[i] = moved
+        longest = max(longest, abs(moved - at))
+    return longest
 
 
 @compiled
-def unbalanced(wall: ImplicitWall, i: int, before: float, activation: float) -> float:
-    """The force that nothing balances at a vertex that was at `before` [m] a step ago [N], inward."""
+def unbalanced(wall: ImplicitWall, i: int, before: float, activation: float, length: float) -> float:
+    """The force that nothing balances at a vertex that was at `before` [m] a step of `length` ago [N], inward."""
     at = wall.u[i]
-    force: float = wall.table[i, DRAG] * (before - at)
+    force: float = wall.table[i, DRAG] / length * (before - at)
     for j in range(wall.indptr[i], wall.indptr[i + 1]):
         force -= wall.K[j] * wall.s[wall.indices[j]]
     if at > 0.0:

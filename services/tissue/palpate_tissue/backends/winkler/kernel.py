@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
@@ -90,31 +89,6 @@ def step(
     if disturbed or touching:
         relax(wall)
     return touching
-
-
-def cut(wall: Wall, part: NDArray[np.intp]) -> Wall:
-    """A part of a wall, at rest: vertices in ascending order, shape (k,). Those beyond it do not move."""
-    n = len(wall.u)
-    A = sparse.csr_array((wall.rate, wall.indices.astype(np.int32), wall.indptr.astype(np.int32)), shape=(n, n))[part][:, part]
-    u, y = np.zeros(len(part)), np.zeros((len(wall.y), len(part)))
-    spring = wall.spring[:, part] if wall.spring.shape[1] else wall.spring
-    matrix = A.indptr.astype(np.uint32), A.indices.astype(np.uint32), A.data
-    return Wall(u, y, *matrix, wall.prony, wall.h, spring, wall.share, wall.activation)
-
-
-@compiled
-def press(wall: Wall, patch: Patch, at: Array, radius: float, depths: Array, forces: Array) -> None:
-    """A frictionless sphere of `radius` [m] pressed into a wall at rest, to depths [m], shape (n,), a step each.
-
-    `at` (2, 3) has the place [m] and the outward normal there as rows; `forces` (n,) gets the forces along it [N].
-    """
-    n = row(at, 1)
-    for step in range(len(depths)):
-        move_freely(wall)
-        p = add(row(at, 0), scale(radius - depths[step], n))
-        _, push = hold(wall, patch, Sphere(p, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), radius), 0.0)
-        forces[step] = dot(push.force, n)
-        relax(wall)
 
 
 @compiled

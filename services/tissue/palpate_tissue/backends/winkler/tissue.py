@@ -15,9 +15,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from palpate_models import press, wall
+from palpate_models import wall
 from palpate_models.breathing import STILL, BreathingCurve
 from palpate_models.frames import Array
 from palpate_models.patient import Stiffness
@@ -28,16 +27,12 @@ from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.kernel import Patch, Wall
 from palpate_tissue.backends.winkler.mechanics import assemble
+from palpate_tissue.backends.winkler.presses import press_in_turn
 from palpate_tissue.near import Near, Search
 
 _NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 _MARGIN_M = 0.005
 """The vertices near the sphere are searched anew when it has moved this far."""
-
-
-_REACHED = 4.0
-"""A press reaches so many Pasternak lengths beyond the sphere: the wall gives way as K0(r / l), and what is left there acts back
-by its square."""
 
 
 class WinklerTissue(TissueBackend):
@@ -63,7 +58,7 @@ class WinklerTissue(TissueBackend):
         self.disturbed = False
         """Whether anything has ever moved; until then the field is left at its exact rest."""
         self._stiffness = stiffness
-        self._prony_g, self._length_m = stiffness.prony_g, stiffness.length_m
+        self._prony_g = stiffness.prony_g
         self._wall = self._wall_of(stiffness, h)
         self._gain = self.mechanics.damping / h
         self._excursion = 0.0
@@ -119,19 +114,9 @@ class WinklerTissue(TissueBackend):
         """See `TissueBackend`. Implicit steps."""
         return ImplicitTissue(self.model, self._stiffness, self.breathing, dt)
 
-    def press(self, places: Array, normals: Array, radius: float) -> Array:
-        """See `TissueBackend`. Each goes into the part of the wall that it reaches, cut out and held at its rim."""
-        depths = press.depths(press.times(self.dt / self.substeps))
-        forces = np.empty((len(places), len(depths)))
-        half_way = places + (radius - 0.5 * press.DEPTH_M) * normals
-        tree = cKDTree(self.model.vertices)
-        for place, normal, middle, force in zip(places, normals, half_way, forces, strict=True):
-            part = np.sort(np.asarray(tree.query_ball_point(place, radius + _REACHED * self._length_m), dtype=np.intp))
-            near = self._free[self._search.around(middle.tolist(), radius, press.DEPTH_M).vertex]
-            near = near[np.isin(near, part)]
-            patch = self._patch_of(near)._replace(vertex=np.searchsorted(part, near).astype(np.uint32))
-            kernel.press(kernel.cut(self._wall, part), patch, np.stack((place, normal)), radius, depths, force)
-        return forces
+    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
+        """See `TissueBackend`. In a few long steps, each press into the part of the wall that it reaches."""
+        return press_in_turn(self.model, self._stiffness, (places, normals, radius), self.activation)
 
     def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
         self._excursion = excursion
