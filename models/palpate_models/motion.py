@@ -71,6 +71,14 @@ class BodyMotion:
         X[:3, 3] = s * self._d + self._p - X[:3, :3] @ self._p
         return X
 
+    def on_body(self, t_s: Array, p: Array) -> Array:
+        """Points of A [m], shape (k, 3), at times [s], shape (k,), as points of the body: in A', shape (k, 3)."""
+        if not self.moves:
+            return p
+        x = np.clip((t_s - self.at_s) / (self.until_s - self.at_s), 0.0, 1.0)
+        s = (x * x * (3 - 2 * x))[:, None]
+        return np.asarray(Rotation.from_rotvec(-s * self._theta).apply(p - s * self._d - self._p) + self._p)
+
     def twist(self, t_s: float) -> tuple[Array, Array]:
         """The body's velocity at time `t_s` [s], in A: v [m/s] and w [rad/s], shape (3,) each.
 

@@ -74,3 +74,11 @@ def test_nobody_moves_by_default():
 def test_bad_settings_are_refused_by_name(fields):
     with pytest.raises(ValidationError, match=next(iter(fields))):
         Motion.model_validate(fields)
+
+
+@pytest.mark.parametrize("motion", [SHIFT, TURN])
+def test_points_on_the_body_are_where_its_pose_says(motion: Motion) -> None:
+    body, times = BodyMotion(motion, 1), np.array((0.0, 20.2, 20.4, 300.0))
+    p = np.random.Generator(np.random.PCG64(0)).normal(size=(4, 3))
+    carried = np.array([apply(body.pose(t), q[None])[0] for t, q in zip(times, p, strict=True)])
+    np.testing.assert_allclose(body.on_body(times, carried), p, atol=1e-14)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot
 from typing import Any
@@ -20,6 +19,7 @@ from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
+from palpate_models.motion import BodyMotion
 from palpate_models.scenario import Scenario
 
 Mask = NDArray[np.bool_]
@@ -136,27 +136,26 @@ def peak_force(message: Any) -> float:
 
 
 def steady_contact(
-    exam_states: list[Any], indentation: list[Any], X_WA: Callable[[float], Array], registered_X_WA: Array
+    exam_states: list[Any], indentation: list[Any], X_WA: Array, motion: BodyMotion, registered_X_WA: Array
 ) -> ContactRecord:
     """Exam states that count, with the true contact at the same stamp.
 
-    Poses of A in world: the true one as a function of time [s], since a patient may move, and the registered one.
+    Poses of A in world: the true one at first, how the body moves from there, and the registered one.
     """
     true = {nanoseconds(m.header.stamp): m for m in indentation}
     pairs = [(s, true[t]) for s in exam_states if s.steady and (t := nanoseconds(s.header.stamp)) in true]
 
-    def place(message: Any, pose: Array) -> Array:
-        p = message.surface_point
-        return apply(inverse(pose), np.array(((p.x, p.y, p.z),)))
+    def places(messages: list[Any], pose: Array) -> Array:
+        p = np.array([(m.surface_point.x, m.surface_point.y, m.surface_point.z) for m in messages]).reshape(-1, 3)
+        return apply(inverse(pose), p)
 
-    believed = [place(s, registered_X_WA) for s, _ in pairs]
-    truly = [place(m, X_WA(nanoseconds(m.header.stamp) / NS)) for _, m in pairs]
-
+    truly = [m for _, m in pairs]
+    times = np.array([nanoseconds(m.header.stamp) / NS for m in truly])
     return ContactRecord(
         measured=np.array([s.depth for s, _ in pairs]),
         true=np.array([m.depth for _, m in pairs]),
         wanted=np.array([s.depth_setpoint for s, _ in pairs]),
         force=np.array([s.normal_force for s, _ in pairs]),
-        touched=Touched(np.array(believed).reshape(-1, 3), np.array(truly).reshape(-1, 3)),
+        touched=Touched(places([s for s, _ in pairs], registered_X_WA), motion.on_body(times, places(truly, X_WA))),
         limited=np.array([s.force_limited for s, _ in pairs], dtype=bool),
     )

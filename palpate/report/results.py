@@ -57,7 +57,7 @@ def truth_of_run(scenario: Scenario, c: Collected) -> Known:
     body = body_of(c.phantom)
     motion = BodyMotion(scenario.phantom.motion, scenario.seed)
     registered = np.array(exam_input(scenario).X_WA)
-    contact = steady_contact(c.exam_states, c.indentation, lambda t_s: body.X_WA @ motion.pose(t_s), registered)
+    contact = steady_contact(c.exam_states, c.indentation, body.X_WA, motion, registered)
     pressed = press_patient(scenario)
     return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
 

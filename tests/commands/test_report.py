@@ -19,6 +19,7 @@ from palpate.report.results import Known, assemble, clean_world, print_findings,
 from palpate.report.rows import Report
 from palpate.run.roles import write_scenario_files
 from palpate_models.load import load_scenario
+from palpate_models.motion import BodyMotion, Motion
 from palpate_models.scenario import Scenario
 
 ISSUE_FIELDS = [
@@ -82,8 +83,8 @@ def test_depth_error_is_of_the_true_depth_in_steady_contact(scenario: Scenario, 
 
 def test_states_without_a_truth_of_their_stamp_are_left_out() -> None:
     c = collected()
-    whole = steady_contact(c.exam_states, c.indentation, lambda _: np.eye(4), np.eye(4))
-    half = steady_contact(c.exam_states, c.indentation[::2], lambda _: np.eye(4), np.eye(4))
+    whole = steady_contact(c.exam_states, c.indentation, np.eye(4), BodyMotion(Motion(), 0), np.eye(4))
+    half = steady_contact(c.exam_states, c.indentation[::2], np.eye(4), BodyMotion(Motion(), 0), np.eye(4))
     assert len(whole.true) == sum(s.steady for s in c.exam_states)
     assert 0 < len(half.true) < len(whole.true)
 

@@ -28,7 +28,7 @@ from palpate_tissue.near import Near, Search
 SWEEPS: Final = 3
 """Of over-relaxation in a step near the sphere."""
 FAR_SWEEPS: Final = 20
-"""The same in a step of the others."""
+"""The same in a step of the others, at most."""
 REACHED: Final = 1.5
 """Vertices within so many Pasternak lengths of the sphere are stepped."""
 FAR_S: Final = 0.1

@@ -23,6 +23,9 @@ from palpate_tissue.near import RIM
 OVER_RELAXATION = 1.35
 """Near the best for a footprint of the wall: 2 / (1 + sqrt(1 - rho^2)) with rho = 0.87, that of Jacobi's sweeps at 10 ms."""
 
+STILL_M = 1e-7
+"""Far from the sphere, sweeps end when no vertex goes further."""
+
 
 class ImplicitWall(NamedTuple):
     """The wall: n vertices and b Prony branches. Compiled code takes time to open arrays at every step: so there are few."""
@@ -188,7 +191,7 @@ def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation:
     """Brings vertices that nothing touches to step `now`, each by one step of its own length, at most that of `decay`.
 
     First each gives way as its branches do, as it would if it were in balance and stayed so; then all go to where their forces
-    balance: where the sphere has just left, that is far.
+    balance: where the sphere has just left, that is far, and takes up to `sweeps` sweeps.
     """
     u, s, y, clock, decay, table = wall.u, wall.s, wall.y, wall.clock, wall.decay, wall.table
     indptr, indices, K = wall.indptr, wall.indices, wall.K
@@ -206,6 +209,7 @@ def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation:
             y[i, b] += change
         begin[k], length[k] = u[i], steps
     for _ in range(sweeps):
+        longest = 0.0
         for k in range(len(vertices)):
             if length[k] == 0:
                 continue
@@ -221,3 +225,6 @@ def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation:
                 slope += table[i, FOUNDATION] * (stiffer + held)
             u[i] += force / slope
             s[i] += force / slope
+            longest = max(longest, abs(force / slope))
+        if longest < STILL_M:
+            return
