@@ -27,7 +27,7 @@ WATCHING = ("conductor", "dashboard", "recorder")
 
 
 @dataclass(frozen=True)
-class Way:
+class MeasuredWay:
     """One way to cover the region, measured."""
 
     name: str
@@ -41,7 +41,7 @@ class Way:
     dice: str
 
 
-def way(case: ReproductionCase, folder: Path) -> tuple[Way, Evidence]:
+def way(case: ReproductionCase, folder: Path) -> tuple[MeasuredWay, Evidence]:
     """What a finished run says of its way to cover."""
     report, evidence = read_report(folder), read_evidence(folder)
     held = np.flatnonzero(evidence.in_contact)
@@ -50,7 +50,7 @@ def way(case: ReproductionCase, folder: Path) -> tuple[Way, Evidence]:
     first, last = held[0], held[-1]
     dice = "" if report.scores is None or report.scores.dice is None else f"{report.scores.dice:.2f}"
     found = ", ".join(f.quadrant for f in report.findings) or "none"
-    return Way(
+    return MeasuredWay(
         name=f"{case.pattern}, {case.mode}",
         total_s=report.sim_time_s,
         covering_s=float(evidence.time[last] - evidence.time[first]),

@@ -37,7 +37,7 @@ _RIDGE: Final = 0.5
 
 
 @dataclass(frozen=True)
-class Case:
+class WeighedPatient:
     """What was weighed in one patient."""
 
     seed: int
@@ -67,7 +67,7 @@ def scan_errors(seed: int) -> ScanErrors:
     return ScanErrors(stroke_m=7e-4 * scale, field_m=5e-4 * scale, breathing_m=7e-4 * scale, tare_n=0.05 * scale)
 
 
-def case(seed: int, calibration: Calibration) -> Case:
+def case(seed: int, calibration: Calibration) -> WeighedPatient:
     """One patient, scanned and weighed."""
     patient = felt_patient(phantom(seed), seed)
     observations = observe(felt_samples(patient, scan_errors(seed), seed), calibration)
@@ -80,7 +80,7 @@ def case(seed: int, calibration: Calibration) -> Case:
     real = [_real(patient, c.bump.x, c.bump.y, c.bump.radius, np.sign(c.log_contrast)) for c in candidates]
     greatest = float(np.exp(np.abs(patient.excess_at(places)).max()))
     rows = np.array([c.features for c in candidates]).reshape(len(candidates), len(FEATURES))
-    return Case(seed, rows, np.array(real, dtype=bool), greatest, float(held.mean()))
+    return WeighedPatient(seed, rows, np.array(real, dtype=bool), greatest, float(held.mean()))
 
 
 def _real(patient: FeltPatient, x: float, y: float, radius: float, sign: float) -> bool:
@@ -90,7 +90,7 @@ def _real(patient: FeltPatient, x: float, y: float, radius: float, sign: float) 
     return bool((sign * patient.excess_at(np.clip(places, -0.14, 0.14))).max() >= np.log(FELT))
 
 
-def fitted(cases: list[Case], calibration: Calibration) -> Calibration:
+def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration:
     """The calibration with probabilities and operating point of the cases: logistic regression, and an exponential tail."""
     features = np.concatenate([c.features for c in cases if len(c.features)])
     real = np.concatenate([c.real for c in cases if len(c.features)])
@@ -108,7 +108,7 @@ def fitted(cases: list[Case], calibration: Calibration) -> Calibration:
     return new.model_copy(update={"tail": (round(location, 3), round(scale, 3))})
 
 
-def told(cases: list[Case], calibration: Calibration, false_findings: float = 0.02) -> None:
+def told(cases: list[WeighedPatient], calibration: Calibration, false_findings: float = 0.02) -> None:
     """Prints what the calibration makes of cases."""
     threshold = calibration.threshold(false_findings)
     logits = [calibration.logit(c.features) if len(c.features) else np.zeros(0) for c in cases]

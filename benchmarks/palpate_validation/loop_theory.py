@@ -48,7 +48,7 @@ MOST_MS = 24
 
 
 @dataclass(frozen=True)
-class Loop:
+class LinearLoop:
     """The linear model of one contact. Joint matrices have shape (7, 7)."""
 
     inertia: Array
@@ -95,7 +95,7 @@ class Loop:
         return MOST_MS
 
 
-def linearise(contrast: float, stiffness: float, across: float = 1.0) -> Loop:
+def linearise(contrast: float, stiffness: float, across: float = 1.0) -> LinearLoop:
     """The loop about a contact 10 mm deep on a wall `contrast` times the default's, `stiffness` [N/m] asked for along the tool.
 
     `across` multiplies what an examination asks for across the tool.
@@ -119,7 +119,7 @@ def linearise(contrast: float, stiffness: float, across: float = 1.0) -> Loop:
     radius = scenario(contrast).robot.indenter_radius_m
     model.update(q, zero)
     lever = np.array(((0, -radius, 0), (radius, 0, 0), (0, 0, 0)))  # velocity of the point below the centre by rotation
-    return Loop(
+    return LinearLoop(
         inertia=model.inertia(q),
         friction=np.diag(model.viscous_friction),
         stiffness=np.array(springs).T,

@@ -28,7 +28,7 @@ AT_10_MM = 1
 
 
 @dataclass(frozen=True)
-class Sample:
+class PopulationSample:
     """Places of a number of people."""
 
     person: NDArray[np.int_]
@@ -64,14 +64,14 @@ WITHIN = (0.08, 0.08, 0.10, 0.15, 0.15, 0.40, 0.20, 0.12, 0.07, 0.07, 0.40)
 """How far each of the figures may be from the measured one, of the measured one: of ten people they are no nearer than that."""
 
 
-def measured() -> Sample:
+def measured() -> PopulationSample:
     """The 48 relaxed places of the file."""
     places = remus2024.relaxed_people()
     force = np.array([remus2024.curve(*place).force(DEPTHS_M) for place in places])
-    return Sample(np.array([remus2024.PEOPLE.index(person) for _, person in places]), force)
+    return PopulationSample(np.array([remus2024.PEOPLE.index(person) for _, person in places]), force)
 
 
-def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> Sample:
+def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> PopulationSample:
     """Persons of the seeds 0, 1, 2 .., each pressed at `PLACES` random places of the belly away from bone.
 
     The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
@@ -89,7 +89,7 @@ def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> Sample:
         for factor, stiffening in zip(wall.stiffness.tolist(), wall.stiffening.tolist(), strict=True):
             here = usual.model_copy(update={"k_w_n_per_m3": usual.k_w_n_per_m3 * factor, "stiffening_per_m": stiffening})
             force.append([pressed_force(here, 0.0, depth + offset) for depth in DEPTHS_M.tolist()])
-    return Sample(np.repeat(np.arange(persons), PLACES), np.array(force))
+    return PopulationSample(np.repeat(np.arange(persons), PLACES), np.array(force))
 
 
 def _places(points: Array, rng: np.random.Generator) -> Array:
@@ -103,7 +103,7 @@ def _places(points: Array, rng: np.random.Generator) -> Array:
     raise RuntimeError(f"population: fewer than {PLACES} places {APART_M} m apart among {len(points)}")
 
 
-def section(found: Sample | None = None) -> PageSection:
+def section(found: PopulationSample | None = None) -> PageSection:
     """The comparison with its bounds."""
     found, people = found or sampled(), measured()
     checks = tuple(
@@ -122,7 +122,7 @@ def section(found: Sample | None = None) -> PageSection:
     return PageSection("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)
 
 
-def draw(figure: Figure, found: Sample, people: Sample) -> None:
+def draw(figure: Figure, found: PopulationSample, people: PopulationSample) -> None:
     """Distributions of force, of its ratio within a person and of its exponent, sampled and measured."""
     axes = figure.subplots(1, 3)
     shown = (
@@ -143,5 +143,5 @@ def draw(figure: Figure, found: Sample, people: Sample) -> None:
     axes[0].legend()
 
 
-def _ratios(sample: Sample) -> Array:
+def _ratios(sample: PopulationSample) -> Array:
     return np.array([np.exp(np.ptp(logs)) for logs in sample.of_people(AT_10_MM)])

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Any, Final
 
 from palpate.quick.errors import Drawn, Loop, LoopErrors, loop_errors
-from palpate.quick.examination import Examination
+from palpate.quick.examination import QuickExamination
 from palpate.quick.messages import collected
 from palpate.report.results import assemble, truth_of_run
 from palpate.report.rows import Report
@@ -50,7 +50,7 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
     none, NoTissueError for a tissue of which there is no copy, ChoiceError for an assessment that cannot be made.
     """
     begin = perf_counter()
-    examination = Examination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
+    examination = QuickExamination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
     gathered = collected(examination, examination.run())
     simulated = perf_counter()
     (service,) = load_services(scenario, ("assessment",))

@@ -106,7 +106,7 @@ class Row:
     limited: bool
 
 
-class Examination:
+class QuickExamination:
     """One examination of one patient."""
 
     def __init__(self, scenario: Scenario, loop: Loop) -> None:

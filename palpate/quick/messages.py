@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate.quick.examination import Examination, Row
+from palpate.quick.examination import QuickExamination, Row
 from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import NS, header
@@ -20,7 +20,7 @@ _NO_TRIANGLES: Final = np.empty(0, np.uint32)
 _NO_SHARES: Final = np.empty(0, np.float32)
 
 
-def collected(examination: Examination, rows: list[Row]) -> Collected:
+def collected(examination: QuickExamination, rows: list[Row]) -> Collected:
     """What a conductor would have collected of it before the assessment. The last state is in phase ASSESS."""
     X_WA = examination.patient.X_WA
     model = examination.patient.tissue.model

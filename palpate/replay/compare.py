@@ -45,7 +45,7 @@ def _upwards(name: str) -> Iterator[str]:
 
 
 @dataclass
-class Difference:
+class FieldDifference:
     """The worst difference of one field, as a part of its tolerance."""
 
     name: str
@@ -79,10 +79,10 @@ class TopicResult:
     """Sent now, but not recorded."""
     off_time: int = 0
     """Sent at another tick than recorded."""
-    worst: dict[str, Difference] = field(default_factory=dict)
+    worst: dict[str, FieldDifference] = field(default_factory=dict)
 
     @property
-    def violations(self) -> list[Difference]:
+    def violations(self) -> list[FieldDifference]:
         """Fields beyond their tolerance, worst first."""
         return sorted((d for d in self.worst.values() if d.ratio > 1), key=lambda d: -d.ratio)
 
@@ -133,7 +133,7 @@ def _differ(result: TopicResult, topic: Topic, then: RecordedMessage, now: Recor
     decode = codec.decoder(topic.type)
     was, is_now = list(flat(decode(then.payload))), list(flat(decode(now.payload)))
     if [name for name, _ in was] != [name for name, _ in is_now]:
-        _note(result, Difference("", now.stamp, f"{len(was)} fields", f"{len(is_now)} fields", float("inf"), 0.0))
+        _note(result, FieldDifference("", now.stamp, f"{len(was)} fields", f"{len(is_now)} fields", float("inf"), 0.0))
         return
     for (name, a), (_, b) in zip(was, is_now, strict=True):
         difference = _difference(topic, name, a, b, now.stamp, tolerance)
@@ -141,17 +141,17 @@ def _differ(result: TopicResult, topic: Topic, then: RecordedMessage, now: Recor
             _note(result, difference)
 
 
-def _note(result: TopicResult, difference: Difference) -> None:
+def _note(result: TopicResult, difference: FieldDifference) -> None:
     before = result.worst.get(difference.name)
     if before is None or difference.ratio > before.ratio:
         result.worst[difference.name] = difference
 
 
-def _difference(topic: Topic, name: str, a: Value, b: Value, stamp: int, tolerance: Tolerance) -> Difference | None:
+def _difference(topic: Topic, name: str, a: Value, b: Value, stamp: int, tolerance: Tolerance) -> FieldDifference | None:
     if isinstance(a, tuple) or isinstance(b, tuple):
-        return None if a == b else Difference(name, stamp, _word(a), _word(b), float("inf"), 0.0)
+        return None if a == b else FieldDifference(name, stamp, _word(a), _word(b), float("inf"), 0.0)
     if a.shape != b.shape:
-        return Difference(name, stamp, f"{a.size} items", f"{b.size} items", float("inf"), 0.0)
+        return FieldDifference(name, stamp, f"{a.size} items", f"{b.size} items", float("inf"), 0.0)
     x, y = a.astype(np.float64), b.astype(np.float64)
     off = np.abs(x - y)
     off[(x == y) | (np.isnan(x) & np.isnan(y))] = 0.0
@@ -163,7 +163,7 @@ def _difference(topic: Topic, name: str, a: Value, b: Value, stamp: int, toleran
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(off == 0, 0.0, off / allowed)
     i = int(np.argmax(ratio))
-    return Difference(name, stamp, f"{x[i]:.9g}", f"{y[i]:.9g}", float(off[i]), float(allowed[i]))
+    return FieldDifference(name, stamp, f"{x[i]:.9g}", f"{y[i]:.9g}", float(off[i]), float(allowed[i]))
 
 
 def _word(value: Value) -> str:

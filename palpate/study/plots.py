@@ -17,7 +17,7 @@ from palpate.report.figures import INK, QUIET
 from palpate.report.page_figures import GRID, plain
 from palpate.study import human_line
 from palpate.study.statistics.analysis import Analysis
-from palpate.study.statistics.calibration import Calibration
+from palpate.study.statistics.calibration import FindingCalibration
 from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, Surface
 from palpate.study.statistics.errors import Agreement
@@ -223,7 +223,7 @@ def _bland_altman(axes: Axes, agreement: Agreement, scale: float) -> None:
     axes.axhline(0, color=QUIET, lw=0.7, ls=":")
 
 
-def reliability(rows: Sequence[tuple[str, Calibration]]) -> str | None:
+def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> str | None:
     """Reliability diagram of the first MOST methods; None without any."""
     if not rows:
         return None

@@ -10,7 +10,7 @@ import pytest
 
 from palpate.quick.case import QuickCase, run_quick
 from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops, loop_errors
-from palpate.quick.examination import Examination
+from palpate.quick.examination import QuickExamination
 from palpate.quick.messages import collected
 from palpate.quick.patient import NoTissueError, Patient
 from palpate_models.load import load_scenario
@@ -62,7 +62,7 @@ def test_depth_is_wrong_by_what_was_drawn() -> None:
     chosen = scenario(4, settings=SMALL)
     errors = loop_errors(chosen)
     loop = Loop(chosen, errors)
-    rows = [row for row in Examination(chosen, loop).run() if row.steady]
+    rows = [row for row in QuickExamination(chosen, loop).run() if row.steady]
     wrong = np.array([row.depth - row.true_depth for row in rows])
     curve = Patient(chosen).tissue.breathing
     unseen = np.array([(curve.excursion(row.time) - curve.mean_m) * row.way.breathing[row.at] for row in rows])
@@ -101,7 +101,7 @@ def test_the_force_sensor_may_be_of_any_kind() -> None:
 
 def test_states_are_those_of_the_contract() -> None:
     chosen = scenario(3)
-    examination = Examination(chosen, Loop(chosen, loop_errors(chosen)))
+    examination = QuickExamination(chosen, Loop(chosen, loop_errors(chosen)))
     gathered = collected(examination, examination.run())
     stamps = np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in gathered.exam_states])
     assert np.diff(stamps[:-1]) == pytest.approx(0.010)

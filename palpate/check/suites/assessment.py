@@ -26,7 +26,7 @@ FORCE_N = 3.0
 ANSWER_S = 30.0
 
 
-class Examination:
+class PlayedScan:
     """States of a raster scan of a square about the umbilicus, at 100 Hz; the force follows the local stiffness."""
 
     def __init__(self, X_WA: Array, depth: float, half: float, start: int) -> None:
@@ -76,7 +76,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     rig.run(0.2, {})
     quiet = len(rig.log[SAMPLES]) + len(rig.log[FINDINGS])
     report.expect("finds nothing before contact", quiet == 0, "no samples, no findings", quiet)
-    play = Examination(X_WA, exam.depth_m, half, rig.t)
+    play = PlayedScan(X_WA, exam.depth_m, half, rig.t)
     rig.run(play.duration, {"exam/state": play.state})
     _samples(rig, half, report)
     _findings(rig, play, report)
@@ -104,7 +104,7 @@ def _samples(rig: Rig, half: float, report: ConformanceReport) -> None:
     )
 
 
-def _findings(rig: Rig, play: Examination, report: ConformanceReport) -> None:
+def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
     report.section("findings")
     waited = 0.0
     while not rig.log[FINDINGS] and waited < ANSWER_S:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from palpate.study.statistics.calibration import Calibration, calibration
+from palpate.study.statistics.calibration import FindingCalibration, calibration
 from palpate.study.statistics.detectability import FELT, MADE, Surface, observed, surface
 from palpate.study.statistics.effort import COVERED, MEASURED, Spread, coverage, spread
 from palpate.study.statistics.errors import FindingErrors, finding_errors
@@ -32,7 +32,7 @@ class Analysis:
     observed: dict[str, list[tuple[float, Estimate]]]
     """Part of the lumps found, in bins over each covariate."""
     errors: FindingErrors
-    calibration: Calibration | None
+    calibration: FindingCalibration | None
     effort: dict[str, Spread]
     coverage: dict[str, Estimate]
 

@@ -21,7 +21,7 @@ LEAST: Final = 1e-6
 
 
 @dataclass(frozen=True)
-class Calibration:
+class FindingCalibration:
     """Of findings and candidates together, or of the reported findings where a method publishes no candidates."""
 
     slope: Estimate
@@ -39,7 +39,7 @@ class Calibration:
     """Mean confidence and part of hits of each bin: the reliability diagram."""
 
 
-def calibration(variant: Variant, bootstrap: Bootstrap) -> Calibration | None:
+def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
     """The calibration of one method's confidences; None where it has no areas with a confidence."""
     areas = variant.findings.dropna(subset=["confidence"])
     if areas.empty:
@@ -57,7 +57,7 @@ def calibration(variant: Variant, bootstrap: Bootstrap) -> Calibration | None:
     error = float(_expected_error(p, hit, label, np.ones((1, len(p))))[0])
     errors = _expected_error(p, hit, label, drawn)
     errors = np.maximum(errors - np.nanmean(errors) + error, 0)
-    return Calibration(
+    return FindingCalibration(
         slope=estimate(slope, slopes, len(p), "areas"),
         in_the_large=estimate(float(np.mean(hit - p)), gaps, len(p), "areas"),
         expected_error=estimate(error, errors, len(p), "areas"),

@@ -36,7 +36,7 @@ class Reason(IntEnum):
 
 
 @dataclass(frozen=True)
-class Assessment:
+class AssessedMap:
     """The stiffness map on a grid's nodes, and the findings."""
 
     grid: MapGrid
@@ -55,7 +55,7 @@ class Assessment:
     samples: int
 
 
-def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_findings: float) -> Assessment | None:
+def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_findings: float) -> AssessedMap | None:
     """Map and findings of a scan; None while there are too few samples.
 
     `reach`: distance within which a sample speaks for a node [m]. `false_findings`: how many a healthy examination may have.
@@ -82,7 +82,7 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
     return _assessment(regression, grid, unassessed.astype(np.uint8), findings, weighed[len(findings) :])
 
 
-def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> Assessment | None:
+def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> AssessedMap | None:
     """The cheap variant for a growing map: with usual amplitudes, and without findings."""
     calibration: Calibration = learned()
     o = observe(samples, calibration)
@@ -95,11 +95,11 @@ def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> Asse
 
 def _assessment(
     regression: Regression, grid: MapGrid, unassessed: NDArray[np.uint8], findings: list[Area], candidates: list[Area]
-) -> Assessment:
+) -> AssessedMap:
     mean, sd = regression.field(grid.nodes[:, :2])
     remarkable = np.any([area.nodes for area in findings], axis=0) if findings else np.zeros(len(mean), dtype=bool)
     rest = (unassessed == Reason.ASSESSED) & ~remarkable
-    return Assessment(
+    return AssessedMap(
         grid=grid,
         apparent=np.exp(mean),
         lower=np.exp(mean - Z90 * sd),

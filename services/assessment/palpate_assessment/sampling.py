@@ -18,7 +18,7 @@ _FEWEST = 3
 
 
 @dataclass(frozen=True)
-class State:
+class ContactState:
     """What the examination measures at one instant, in the abdomen frame A."""
 
     time: float
@@ -73,10 +73,10 @@ class Sampler:
 
     def __init__(self, travel: float = TRAVEL) -> None:
         self._travel = travel
-        self._block: list[State] = []
+        self._block: list[ContactState] = []
         self._onset: float | None = None
 
-    def add(self, state: State) -> ForceSample | None:
+    def add(self, state: ContactState) -> ForceSample | None:
         """Takes the next state; returns the sample that it completes, if any."""
         sample = None
         if state.in_contact:

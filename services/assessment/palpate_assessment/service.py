@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from palpate_assessment.assess import Assessment, assess, growing
+from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.calibration import learned
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
-from palpate_assessment.sampling import ForceSample, Sampler, State
+from palpate_assessment.sampling import ContactState, ForceSample, Sampler
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
 from palpate_bus.messages.codec import Message
@@ -58,7 +58,7 @@ class AssessmentService(Service):
         self._coarse: MapGrid | None = None
         self._last_map = 0
         self._mapped = 0
-        self._final: Assessment | None = None
+        self._final: AssessedMap | None = None
         self._finished = False
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -107,9 +107,9 @@ class AssessmentService(Service):
         assert self._surface is not None
         return map_grid(self._surface, self._exam.centre_m, self._exam.region_m, MARGIN, pitch)
 
-    def _state(self, message: Message) -> State:
+    def _state(self, message: Message) -> ContactState:
         p, n = message.surface_point, message.surface_normal
-        return State(
+        return ContactState(
             time=nanoseconds(message.header.stamp) / NS,
             position=self._R_AW.dot((p.x, p.y, p.z)) + self._p_AW,
             normal=self._R_AW.dot((n.x, n.y, n.z)),
@@ -172,7 +172,7 @@ def sample_message(sample: ForceSample) -> Message:
     )
 
 
-def map_message(t: int, result: Assessment, common_depth: float) -> Message:
+def map_message(t: int, result: AssessedMap, common_depth: float) -> Message:
     """`palpation_msgs/StiffnessMap`: its force is what sliding at `common_depth` [m] would feel."""
     calibration = learned()
     sliding = float(np.exp(calibration.conversion) * (common_depth / press.DEPTH_M) ** calibration.exponent)

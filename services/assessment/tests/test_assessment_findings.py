@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
 
-from palpate_assessment.assess import Assessment, assess, growing
+from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.sampling import ForceSample
 from palpate_bus.messages import StiffnessMap
 
 REACH, FALSE_FINDINGS = 0.010, 0.02
 
 
-def examine(samples: list[ForceSample]) -> Assessment:
+def examine(samples: list[ForceSample]) -> AssessedMap:
     result = assess(samples, flat_grid(), REACH, FALSE_FINDINGS)
     assert result is not None
     return result
 
 
-def held(result: Assessment, truth: np.ndarray) -> float:
+def held(result: AssessedMap, truth: np.ndarray) -> float:
     inside = result.unassessed == StiffnessMap.ASSESSED
     return float(((result.lower <= truth) & (truth <= result.upper))[inside].mean())
 
@@ -61,7 +61,7 @@ def test_a_lump_is_found_under_errors_of_depth() -> None:
 
 
 def test_errors_of_strokes_widen_the_band() -> None:
-    def width(result: Assessment) -> float:
+    def width(result: AssessedMap) -> float:
         return float(np.median(np.log(result.upper / result.lower)[result.unassessed == StiffnessMap.ASSESSED]))
 
     exact, wrong = (examine(lines(level, stroke_m=error)) for error in (0.0, 0.001))

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 
 from palpate_assessment.grid import map_grid
-from palpate_assessment.sampling import LONGEST, TRAVEL, ForceSample, Sampler, State
+from palpate_assessment.sampling import LONGEST, TRAVEL, ContactState, ForceSample, Sampler
 
 UP = np.array((0.0, 0.0, 1.0))
 
 
-def state(k: int, x: float = 0.0, depth: float = 0.01, force: float = 2.0, counts: bool = True, touching: bool = True) -> State:
-    return State(0.01 * k, np.array((x, 0.0, 0.0)), UP, depth, force, touching, counts)
+def state(
+    k: int, x: float = 0.0, depth: float = 0.01, force: float = 2.0, counts: bool = True, touching: bool = True
+) -> ContactState:
+    return ContactState(0.01 * k, np.array((x, 0.0, 0.0)), UP, depth, force, touching, counts)
 
 
-def run(states: list[State]) -> list[ForceSample]:
+def run(states: list[ContactState]) -> list[ForceSample]:
     sampler = Sampler()
     return [s for s in map(sampler.add, states) if s is not None]
 

@@ -10,7 +10,7 @@ from palpate_perception.arm import ArmMask
 from palpate_perception.fusion import Image
 from palpate_perception.tracker import NOTHING, Followed, Tracker
 from palpate_perception.views import Intrinsics
-from palpate_perception.wall import UnseenWallError, Wall
+from palpate_perception.wall import SeenWall, UnseenWallError
 from palpate_perception.watch import Watch
 
 
@@ -45,7 +45,7 @@ class Follower:
         """Whether the wall was watched for long enough, or is not shown at all."""
         return self._watch is None or self._watch.over()
 
-    def end(self) -> tuple[Wall, Array, Array] | None:
+    def end(self) -> tuple[SeenWall, Array, Array] | None:
         """Ends the watch: the wall, which is followed from now on, and its displacements [m] by time [s].
 
         None when it was not seen; then what was followed before is followed on.

@@ -15,7 +15,7 @@ from palpate_perception import cloud, pattern, surface, visibility
 from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
 from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
-from palpate_perception.wall import Mode
+from palpate_perception.wall import BreathingMode
 
 MARGIN_M: Final = 0.03
 """The cloud is cropped this much wider than the region, so that the surface at its edge has data on both sides."""
@@ -91,7 +91,7 @@ class Pipeline:
         X_CA = inverse(camera.X_WC) @ self._X_WA
         return DepthFusion(cloud.window(self._box, X_CA, camera.K, camera.shape))
 
-    def perceive(self, fusion: DepthFusion, camera: Intrinsics, mode: Mode | None = None) -> Perceived:
+    def perceive(self, fusion: DepthFusion, camera: Intrinsics, mode: BreathingMode | None = None) -> Perceived:
         """Runs the five steps on the fused frames; `mode` is the breathing's, if it is known."""
         fused = fusion.fused()
         origin = (fusion.window[0].start, fusion.window[1].start)
@@ -143,7 +143,7 @@ class Pipeline:
         p_A = np.column_stack((xy, field.height(xy[:, 0], xy[:, 1])))
         return apply(self._X_WA, p_A), field.normal(xy[:, 0], xy[:, 1]) @ self._X_WA[:3, :3].T
 
-    def _mesh(self, field: surface.HeightField, p_A: Array, mode: Mode | None) -> PerceivedMesh:
+    def _mesh(self, field: surface.HeightField, p_A: Array, mode: BreathingMode | None) -> PerceivedMesh:
         """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         x = pattern.stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)

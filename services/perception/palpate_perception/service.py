@@ -22,7 +22,7 @@ from palpate_perception.fusion import DepthFusion
 from palpate_perception.messages import FRAME
 from palpate_perception.pipeline import Perceived, PerceivedMesh, Pipeline, Targets
 from palpate_perception.views import Intrinsics
-from palpate_perception.wall import Mode
+from palpate_perception.wall import BreathingMode
 from palpate_perception.watch import LONGEST_S
 
 IMAGE: Final = "camera/depth/image_raw"
@@ -80,7 +80,7 @@ class PerceptionService(Service):
         seen = self._follower.end()
         if burst.wrong or burst.fusion is None or burst.camera is None:
             return {"perception/targets": targets(t, _nothing(burst, inbox))}
-        mode: Mode | None = None
+        mode: BreathingMode | None = None
         if seen is not None:
             wall, times, d = seen
             displacements = np.interp(burst.stamps_s, times, d)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from palpate_models.frames import Array
 from palpate_perception.breath_filter import BreathFilter
-from palpate_perception.wall import Wall
+from palpate_perception.wall import SeenWall
 
 FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
 """How long after an exposure the displacement is forecast for [s]."""
@@ -85,7 +85,7 @@ NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 0.1, np.ze
 class Tracker:
     """Follows one wall."""
 
-    def __init__(self, wall: Wall, t_s: Array, d: Array, corners: Array) -> None:
+    def __init__(self, wall: SeenWall, t_s: Array, d: Array, corners: Array) -> None:
         """A wall displaced by `d` [m] at times `t_s` [s], shape (n,) each; `corners` of the region in A, shape (m, 3)."""
         self.wall = wall
         self._filter = BreathFilter(t_s, d)

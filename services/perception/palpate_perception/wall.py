@@ -53,7 +53,7 @@ class UnseenWallError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Mode:
+class BreathingMode:
     """How far breathing lifts each place, relative to where in the region it lifts most: a polynomial in x and y of A."""
 
     low: Array
@@ -69,7 +69,7 @@ class Mode:
 
 
 @dataclass(frozen=True, slots=True)
-class Wall:
+class SeenWall:
     """The wall as n pixels of the small image see it."""
 
     pixel: NDArray[np.intp]
@@ -84,7 +84,7 @@ class Wall:
     """Places [m], shape (n, 3)."""
     n_A: Array
     """Outward unit normals, shape (n, 3)."""
-    mode: Mode
+    mode: BreathingMode
     lifts: Array
     """The mode at the pixels, shape (n,)."""
     r_W: Array
@@ -120,7 +120,7 @@ def basis(p_A: Array, low: Array, high: Array) -> Array:
     return np.asarray(columns[:, i + j <= DEGREE])
 
 
-def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[Wall, Array]:
+def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[SeenWall, Array]:
     """The wall, and its displacement [m] in each frame, shape (frames,), from small depth images, shape (frames, height, width).
 
     NaN where a pixel is invalid or hidden. Raises UnseenWallError when too few pixels show the wall.
@@ -153,7 +153,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     expired = float(np.quantile(np.convolve(d, np.full(3, 1 / 3), "valid"), EXPIRED)) if len(d) > 2 else float(d.min())
     depth = mean + gain * lifts * expired
     r_W = r_C[keep] @ camera.X_WC[:3, :3].T
-    return Wall(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
+    return SeenWall(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
 
 
 def _steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
@@ -166,7 +166,7 @@ def _steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
     return pixel, np.nanmean(seen, axis=0), np.maximum(sigma, 1e-4)
 
 
-def _mode(outward: Array, certainty: Array, p_A: Array, exam: Exam) -> Mode:
+def _mode(outward: Array, certainty: Array, p_A: Array, exam: Exam) -> BreathingMode:
     """The mode of outward displacements [m], shape (frames, n), whose noise is 1 / `certainty` [1/m], shape (n,)."""
     low, high = p_A[:, :2].min(axis=0), p_A[:, :2].max(axis=0)
     waves = basis(p_A, low, high)
@@ -181,5 +181,5 @@ def _mode(outward: Array, certainty: Array, p_A: Array, exam: Exam) -> Mode:
     if np.std(score[:, 0]) * size[0] * abs(most) < STILL_M:
         level = np.zeros(len(coefficients))
         level[0] = 1.0
-        return Mode(low, high, level)
-    return Mode(low, high, coefficients / most)
+        return BreathingMode(low, high, level)
+    return BreathingMode(low, high, coefficients / most)

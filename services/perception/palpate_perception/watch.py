@@ -13,7 +13,7 @@ from palpate_perception.arm import ArmMask
 from palpate_perception.cloud import RegionBox
 from palpate_perception.fusion import Image
 from palpate_perception.views import Intrinsics
-from palpate_perception.wall import Wall
+from palpate_perception.wall import SeenWall
 
 LONGEST_S: Final = 10.0
 """A watch lasts no longer."""
@@ -62,7 +62,7 @@ class Watch:
         low, high = np.quantile(height, (0.05, 0.95))
         return bool(high - low < STILL_M or rises(height, low, high) > BREATHS)
 
-    def learn(self) -> tuple[Wall, Array, Array]:
+    def learn(self) -> tuple[SeenWall, Array, Array]:
         """The wall, and its displacements [m] at the times [s] of the images. Raises UnseenWallError."""
         if not self._images:
             raise wall.UnseenWallError("no small image has come")

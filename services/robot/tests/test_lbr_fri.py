@@ -8,22 +8,22 @@ import pytest
 from palpate_bus.messages import codec
 from palpate_models import lbr
 from palpate_robot.backends.lbr import idl
-from palpate_robot.backends.lbr.fri import QUALITY_WINDOW, Session
+from palpate_robot.backends.lbr.fri import QUALITY_WINDOW, FriSession
 from palpate_robot.backends.lbr.idl import ConnectionQuality, SessionState
 
 ZERO = np.zeros(7)
 HOME = np.array(lbr.HOME)
 
 
-def active(**options: int) -> Session:
-    session = Session(2, HOME, **options)  # type: ignore[arg-type]
+def active(**options: int) -> FriSession:
+    session = FriSession(2, HOME, **options)  # type: ignore[arg-type]
     while session.state is not SessionState.COMMANDING_ACTIVE:
         session.cycle(HOME, ZERO)
     return session
 
 
 def test_states_come_in_order() -> None:
-    session = Session(2, HOME)
+    session = FriSession(2, HOME)
     seen = [session.state]
     for _ in range(500):
         session.cycle(HOME, ZERO)
@@ -35,11 +35,11 @@ def test_states_come_in_order() -> None:
 @pytest.mark.parametrize("period", [0, 101])
 def test_a_period_that_fri_does_not_have_is_refused(period: int) -> None:
     with pytest.raises(ValueError, match="whole milliseconds"):
-        Session(period, HOME)
+        FriSession(period, HOME)
 
 
 def test_commands_before_commanding_are_passed_over_and_later_ones_kept_for_ever() -> None:
-    session = Session(2, HOME)
+    session = FriSession(2, HOME)
     session.take(HOME, np.ones(7))
     assert not session.cycle(HOME, ZERO).torque.any()
     session = active()

@@ -17,7 +17,7 @@ from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import Breach, Cause, Level, Watch
+from palpate_supervisor.watch import Breach, Cause, Level, LimitWatch
 
 NOWHERE = -1.0
 """Depth [m] while no surface is known."""
@@ -38,7 +38,7 @@ class SupervisorService(Service):
     def __init__(self, known: ExamInput) -> None:
         self._radius = known.robot.indenter_radius_m
         self._sense = ToolSense(known.robot)
-        self._watch = Watch(known.limits, inverse(np.array(known.X_WA)))
+        self._watch = LimitWatch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
         RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it ahead of any deadline
         self._max_age = contract().topics["planning/setpoint"].expiry

@@ -67,7 +67,7 @@ class Breach:
     """How long a soft stop for it may take to help [ns]."""
 
 
-class Watch:
+class LimitWatch:
     """Judges the tool, at every measurement."""
 
     def __init__(self, limits: Limits, X_AW: Array) -> None:

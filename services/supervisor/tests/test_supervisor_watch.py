@@ -11,14 +11,14 @@ from palpate_models.gravity import GRAVITY
 from palpate_models.load import exam_input, load_scenario
 from palpate_models.scenario import Limits
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import Breach, Cause, Level, Watch
+from palpate_supervisor.watch import Breach, Cause, Level, LimitWatch
 
 KNOWN = exam_input(load_scenario("clean"))
 ABOVE = np.array([0.56, 0.0, 1.0])
 
 
 def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth: float | None = None) -> list[Breach]:
-    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     for n in range(20):  # long enough for what needs patience, and without a rate
         found = watch.judge(Tool(p_W, speed, force), depth, n * 10 * MS)
     return found
@@ -57,7 +57,7 @@ def test_what_an_examination_does_is_no_breach(values: dict[str, object]) -> Non
 
 
 def test_a_force_that_rises_fast_is_stopped_before_the_limit() -> None:
-    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     forces = 100.0 * 0.01 * np.arange(60)  # 100 N/s, as on something rigid
     first = next(f for n, f in enumerate(forces) if watch.judge(Tool(ABOVE, 0.0, f), None, n * 10 * MS))
     assert 14.0 < first <= 16.0
@@ -65,19 +65,19 @@ def test_a_force_that_rises_fast_is_stopped_before_the_limit() -> None:
 
 def test_a_hole_in_the_measurements_makes_no_force_rise_faster() -> None:
     """At 20 N/s, slowly enough for planning; 60 ms are missing, which taken for one period would be 120 N/s."""
-    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     times = [n * 10 * MS for n in (*range(80), *range(86, 110))]
     assert not any(watch.judge(Tool(ABOVE, 0.0, 20e-9 * t), None, t) for t in times)
 
 
 def test_a_stamp_that_comes_again_is_nothing_to_take_a_rate_from() -> None:
-    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     stamps = [0, 10, 20, 30, 30, 30, 40]
     assert not any(watch.judge(Tool(ABOVE, 0.0, 0.2 * n), None, t * MS) for n, t in enumerate(stamps))
 
 
 def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
-    watch = Watch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     for n, force in enumerate((*np.linspace(10.0, 24.9, 100), 25.3, 25.4, 25.2, 24.0, 21.0)):
         assert watch.judge(Tool(ABOVE, 0.0, float(force)), None, n * 10 * MS) == []
 

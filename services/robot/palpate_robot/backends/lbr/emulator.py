@@ -42,7 +42,7 @@ from palpate_models.frames import Array
 from palpate_models.load import ScenarioError, load_scenario, plant_input
 from palpate_models.scenario import PlantInput
 from palpate_robot.backends.dart.plant import DartPlant
-from palpate_robot.backends.lbr.fri import Drive, Session
+from palpate_robot.backends.lbr.fri import Drive, FriSession
 from palpate_robot.backends.lbr.idl import (
     STATE,
     TORQUE_COMMAND,
@@ -88,7 +88,7 @@ class Emulator:
         joints, ft, load = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
         self._ft = FtSensor(drawn.force, ft, options.period_ms * 1e-3)
         self._joints = JointSensor(drawn.arm, joints, self._plant.q, self._plant.gravity_torque())
-        self.session = Session(options.period_ms, self._joints.q.copy(), command_timeout_ms=options.command_timeout_ms)
+        self.session = FriSession(options.period_ms, self._joints.q.copy(), command_timeout_ms=options.command_timeout_ms)
         self._radius = known.robot.indenter_radius_m
         self._load_error = load.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
         """What the arm's load data get wrong [N m], constant."""

@@ -47,7 +47,7 @@ class Drive:
     """Overlay [N m], shape (7,)."""
 
 
-class Session:
+class FriSession:
     """One FRI session with the stack behind it."""
 
     def __init__(self, period_ms: int, q: Array, *, pid_p: float = 0.1, command_timeout_ms: int = 0) -> None:

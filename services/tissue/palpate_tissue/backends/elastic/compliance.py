@@ -30,7 +30,7 @@ from palpate_tissue import friction
 from palpate_tissue.backends.elastic import kernel, modulus, solid
 from palpate_tissue.backends.elastic.kernel import LayerKernel
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W, ModulusField
-from palpate_tissue.backends.elastic.solid import Grid, graded_grid, skin_compliance
+from palpate_tissue.backends.elastic.solid import NodeGrid, graded_grid, skin_compliance
 
 Array32 = NDArray[np.float32]
 
@@ -155,11 +155,11 @@ class _Body:
         front = self.model.vertices[self.model.normals[:, 2] > 0.5, :2]
         return np.asarray(np.minimum(np.abs(front).max(axis=0), GRID_HALF_M))
 
-    def _grid(self) -> Grid:
+    def _grid(self) -> NodeGrid:
         half = self._front()
         return graded_grid(-half, half, self.thickness, self.pitch)
 
-    def _grid_about(self, lesion: Lesion) -> Grid:
+    def _grid_about(self, lesion: Lesion) -> NodeGrid:
         """The shallower a lesion begins, the finer are the elements that show it, and the nearer fades what it does."""
         depth = lesion.depth_m or 0.0
         half = self._front()
@@ -184,7 +184,7 @@ def _smoothing(nx: int, ny: int) -> sparse.csr_array:
     return sparse.csr_array(sparse.kron(along(nx), along(ny)))
 
 
-def _interpolation(grid: Grid, vertices: Array, normals: Array) -> sparse.csr_array:
+def _interpolation(grid: NodeGrid, vertices: Array, normals: Array) -> sparse.csr_array:
     """P: bilinear weights of the skin's nodes at vertices (f, 3), shape (f, k); fades away at the grid's rim and the flanks.
 
     Vertices lie over the grid by their x and y. Symmetric use, P (.) P', keeps the matrix positive definite wherever P fades.

@@ -20,7 +20,7 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Grid:
+class NodeGrid:
     """Nodes of the layer: x and y in the plane of the skin, depth below it (0 first, the base last), all ascending [m]."""
 
     x: Array
@@ -36,13 +36,13 @@ class Grid:
         return self.x[self.loaded_x], self.y[self.loaded_y]
 
 
-def graded_grid(low: Array, high: Array, thickness: float, pitch: float) -> Grid:
+def graded_grid(low: Array, high: Array, thickness: float, pitch: float) -> NodeGrid:
     """A grid that is even, of `pitch` [m], between the corners `low` and `high` (2,) [m], and grows coarser beside and below."""
     half = (high - low) / 2
     x, along_x = _axis(float(half[0]), pitch)
     y, along_y = _axis(float(half[1]), pitch)
     centre = (low + high) / 2
-    return Grid(centre[0] + x, centre[1] + y, _layers(thickness, pitch), along_x, along_y)
+    return NodeGrid(centre[0] + x, centre[1] + y, _layers(thickness, pitch), along_x, along_y)
 
 
 def _axis(half: float, pitch: float) -> tuple[Array, slice]:
@@ -87,7 +87,7 @@ def brick_stiffness(size: Array, poisson: float) -> Array:
     return np.asarray(total + bulk * volume[:, None, None] * mean[:, :, None] * mean[:, None, :])
 
 
-def skin_compliance(grid: Grid, young: Callable[[Array], Array], poisson: float) -> Array:
+def skin_compliance(grid: NodeGrid, young: Callable[[Array], Array], poisson: float) -> Array:
     """Normal displacement of the loaded skin nodes by unit normal forces on them [m/N], shape (k, k), symmetric.
 
     `young` gives Young's modulus [Pa], shape (p,), at points (x, y, depth) [m], shape (p, 3). The stiffness matrix is block
@@ -120,7 +120,7 @@ def skin_compliance(grid: Grid, young: Callable[[Array], Array], poisson: float)
     return result
 
 
-def _slab(grid: Grid, young: Callable[[Array], Array], poisson: float, column: int) -> tuple[Array, Array, Array]:
+def _slab(grid: NodeGrid, young: Callable[[Array], Array], poisson: float, column: int) -> tuple[Array, Array, Array]:
     """What the bricks between planes `column` and `column + 1` give to the first plane, to the second, and between them.
 
     Dense matrices on the free unknowns of a plane, ordered by y, depth, axis.
