@@ -20,6 +20,7 @@ HELP = "Autonomous robotic palpation as a co-simulation of independent processes
 GROUPS = {
     "Examine": {
         "run": "palpate.run.command:run",
+        "plan": "palpate.plan.command:plan",
         "scenarios": "palpate.listings:scenarios",
         "stop": "palpate.live.operator:stop",
         "release": "palpate.live.operator:release",

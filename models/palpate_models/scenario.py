@@ -11,23 +11,13 @@ from enum import StrEnum
 from math import dist
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from palpate_models.errors import Errors
 from palpate_models.patient import Phantom
+from palpate_models.patterns.choice import known
 from palpate_models.person import drawn
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
-
-
-class Pattern(StrEnum):
-    """Coverage pattern."""
-
-    LINES = "lines"
-    """There and back, lifted at each line's end."""
-    RASTER = "raster"
-    """All lines one way, lifted at their ends."""
-    SNAKE = "snake"
-    """There and back, line ends joined in contact."""
 
 
 class Mode(StrEnum):
@@ -55,9 +45,9 @@ class Exam(Section):
     """Of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
-    pattern: Pattern = Pattern.LINES
+    pattern: Annotated[str, AfterValidator(known)] = "lines"
     """`lines`: there and back, lifted at each line's end; `raster`: every line from the feet to the head; `snake`: there and
-    back, line ends joined in contact."""
+    back, line ends joined in contact; or a pattern of your own: the path of a Python file that has `scan(exam, surface)`."""
     mode: Mode = Mode.CONTINUOUS
     """`continuous`: slides at depth; `point`: presses, holds and lifts at each point."""
     breathing: Following = Following.FOLLOW

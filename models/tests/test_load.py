@@ -30,7 +30,7 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
             "seed: 1\nexam:\n  depht_m: 0.01\n",
             r"mine\.yaml, line 3: exam\.depht_m = 0\.01: there is no .*mean depth_m\?",
         ),
-        ("exam: {pattern: zigzag}", r"exam\.pattern = 'zigzag': .*'raster' or 'snake'"),
+        ("exam: {pattern: zigzag}", r"exam\.pattern = 'zigzag': .*lines, raster, snake"),
         ("phantom: {lesions: [{contrast: 4}]}", r"phantom\.lesions\.0\.centre_m"),
         ("- exam", r"want a mapping of fields, not list"),
         ("exam: {", r"not YAML"),

@@ -43,7 +43,7 @@ def scenario(source: str | Path | Scenario = "clean", /, *, seed: int | None = N
     --------
     >>> import palpate
     >>> chosen = palpate.scenario("lump", seed=3, exam={"pattern": "raster", "region_m": [0.1, 0.1]})
-    >>> chosen.exam.pattern.value, chosen.exam.region_m, chosen.seed
+    >>> chosen.exam.pattern, chosen.exam.region_m, chosen.seed
     ('raster', (0.1, 0.1), 3)
     >>> palpate.scenario("lump", exam={"dept_m": 0.008})
     Traceback (most recent call last):

@@ -19,8 +19,8 @@ from palpate.quick.patient import PERIOD_S, Patient, seen_lattice
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
+from palpate_models.patterns.scan import scan_of
 from palpate_models.scenario import Following, Mode, Scenario
-from palpate_perception import pattern
 from palpate_planning.breath import Breath
 from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
 from palpate_planning.coverage import strokes, transfer
@@ -138,14 +138,13 @@ class QuickExamination:
 
     def run(self) -> list[Row]:
         """Carries it out: what was measured, and what was true."""
-        x, y = pattern.lattice(self._exam)
-        order = pattern.order(len(x), len(y), self._exam.pattern)
-        xy = pattern.downsample(np.empty((0, 3)), x, y)[0][order]
+        scan = scan_of(self._exam, self._believed.in_A)
+        xy = scan.targets
         rows: list[Row] = []
         usable = np.ones(len(xy), dtype=bool)
         exam = self._exam
         before: Array | None = None
-        for stroke in strokes(xy, (order // len(y)).astype(np.int64), usable, exam.pattern, exam.mode, exam.spacing_m):
+        for stroke in strokes(xy, scan.line_of_target, usable, scan.joined, exam.mode, exam.spacing_m):
             if before is not None:
                 rows += self._travel(self._way(transfer(before, stroke.xy[0]), stroke.targets[:1], contact=False))
             rows += self._stroke(self._way(stroke.xy, stroke.targets, stroke.visits))

@@ -25,8 +25,8 @@ from palpate.truth.tissue import true_tissue
 from palpate_models.frames import Array, inverse, matrix
 from palpate_models.load import seen, true_pose, whole_scenario
 from palpate_models.motion import BodyMotion
+from palpate_models.patterns.lattice import stations
 from palpate_models.scenario import Exam, Scenario
-from palpate_perception import pattern
 from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
 
 PERIOD_S: Final = 0.010
@@ -209,8 +209,7 @@ class Patient:
 def seen_lattice(exam: Exam) -> Array:
     """Where the skin is seen: points over the region and a margin, as perception lays them [m], shape (n, 2)."""
     x, y = (
-        pattern.stations(centre, size + 2 * MESH_MARGIN_M, MESH_STEP_M)
-        for centre, size in zip(exam.centre_m, exam.region_m, strict=True)
+        stations(centre, size + 2 * MESH_MARGIN_M, MESH_STEP_M) for centre, size in zip(exam.centre_m, exam.region_m, strict=True)
     )
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 

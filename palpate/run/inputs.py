@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate.command_line import refuse
+from palpate.plan.body import scan_over, with_whole_path
 from palpate.run.roles import NONE, checked, settings_of
 from palpate_bus.implementations import ChoiceError
 from palpate_models.load import ScenarioError, load_scenario
+from palpate_models.patterns.choice import PatternError
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.scenario import Scenario
 
@@ -26,15 +28,17 @@ def usable(
     """
     try:
         return examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
-    except (ScenarioError, MeshError, ChoiceError) as error:
+    except (ScenarioError, MeshError, PatternError, ChoiceError) as error:
         refuse(error)
 
 
 def examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
     """The scenario, after its phantom could be made and its services were found, unless they run `elsewhere`.
 
-    Raises MeshError for a phantom that cannot be made, ChoiceError for a service that there is not.
+    Raises MeshError for a phantom that cannot be made, PatternError for a scan that cannot be made or leaves the body,
+    ChoiceError for a service that there is not.
     """
+    scenario = with_whole_path(scenario)
     if scenario.services.tissue != NONE:
-        build_phantom(scenario.phantom, scenario.seed)
+        scan_over(scenario, build_phantom(scenario.phantom, scenario.seed))
     return scenario if elsewhere else checked(scenario)

@@ -6,12 +6,17 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from palpate.run.folder import FolderError
 from palpate.run.options import Record
 from palpate_conductor.result import RunProgress, Tell
+from palpate_models.frames import Array
+from palpate_models.patterns.scan import scan_of
 from palpate_models.scenario import Exam, Mode
 
 MB = 1_000_000
@@ -28,20 +33,34 @@ _TOUCH_S = 2.7
 _TOUCH_EVERY_M = 0.07
 _DESCENT_S = 3.0
 """From one line to the next: lifting, going there, touching the skin and pressing."""
-_POINT_S = 2.2
+_POINT_S = 2.8
 """A point that is pressed by itself."""
+_WAY_MPS = 0.17
+"""Above the skin, from the end of a line to the beginning of the next."""
 _MINUTE_S = 60.0
 
 
 def expected_duration(exam: Exam) -> float:
-    """About how long an examination takes, in simulated time [s]: a fit to examinations of three sizes."""
+    """About how long an examination takes, in simulated time [s]: a fit to examinations of several sizes."""
+    scan = scan_of(exam, _flat)
     width, height = exam.region_m
-    lines = width / exam.spacing_m + 1
-    touches = math.ceil(width / _TOUCH_EVERY_M) * math.ceil(height / _TOUCH_EVERY_M)
-    begin = _BEFORE_AND_AFTER_S + _TOUCH_S * touches
+    begin = _BEFORE_AND_AFTER_S + _TOUCH_S * math.ceil(width / _TOUCH_EVERY_M) * math.ceil(height / _TOUCH_EVERY_M)
     if exam.mode is Mode.POINT:
-        return begin + lines * (height / exam.spacing_m + 1) * _POINT_S
-    return begin + lines * (height / exam.speed_mps + _DESCENT_S)
+        return begin + _POINT_S * len(scan.targets)
+    slide = sum(_length(line) for line in scan.lines)
+    between = sum(_length(np.vstack((a[-1], b[0]))) for a, b in pairwise(scan.lines))
+    if scan.joined:
+        return begin + (slide + between) / exam.speed_mps + _DESCENT_S
+    return begin + slide / exam.speed_mps + between / _WAY_MPS + _DESCENT_S * len(scan.lines)
+
+
+def _length(points: Array) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _flat(xy: Array) -> tuple[Array, Array]:
+    """A surface without heights: a scan's length hardly depends on them."""
+    return np.column_stack((xy, np.zeros(len(xy)))), np.tile((0.0, 0.0, 1.0), (len(xy), 1))
 
 
 def expected_mb(exam: Exam, record: Record) -> float:

@@ -1,30 +1,17 @@
 """Steps 4 and 5 of the paper's point-cloud processing: down-sampling to palpation points, and their order.
 
-The points lie on scan lines along y_A (foot to head), which follow each other in x_A from the patient's right to the
-left: along a line the wall curves least, so the tool turns least while it is in contact.
+Which points, and in which order, is the scan pattern's to say (`palpate_models.patterns`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate_models.frames import Array
-from palpate_models.scenario import Exam, Pattern
 
 Index = NDArray[np.intp]
-
-
-def stations(centre: float, length: float, spacing: float) -> Array:
-    """Evenly spread coordinates [m] over `length` about `centre`, both ends included, at most `spacing` apart."""
-    count = int(np.ceil(length / spacing - 1e-9)) + 1
-    return np.linspace(centre - length / 2, centre + length / 2, count)
-
-
-def lattice(exam: Exam) -> tuple[Array, Array]:
-    """Stations of the palpation points in A: x of the lines, y on a line [m]."""
-    (cx, cy), (width, height) = exam.centre_m, exam.region_m
-    return stations(cx, width, exam.spacing_m), stations(cy, height, exam.spacing_m)
 
 
 def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -41,15 +28,13 @@ def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
     return nodes, seen.ravel()
 
 
-def order(lines: int, points: int, pattern: Pattern) -> Index:
-    """Step 5: the order in which nodes (line * points + point) are visited, shape (lines * points,).
+def supported(p: Array, xy: Array, spacing: float) -> NDArray[np.bool_]:
+    """Whether a point of the cloud `p` (in A, shape (n, 3)) lies in the cell of each target, shape (m,).
 
-    Raster: every line foot to head. Else every other line back.
+    `xy`: targets in A [m], shape (m, 2); their cells are squares of the side `spacing` [m].
     """
-    index = np.arange(lines * points).reshape(lines, points)
-    if pattern is not Pattern.RASTER:
-        index[1::2] = index[1::2, ::-1].copy()
-    return index.ravel()
+    distance, _ = cKDTree(p[:, :2]).query(xy, p=np.inf, distance_upper_bound=spacing / 2)
+    return np.isfinite(distance)
 
 
 def _nearest(station: Array, coordinate: Array) -> Index:

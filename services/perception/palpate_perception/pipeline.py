@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.frames import Array, apply, inverse
+from palpate_models.patterns.lattice import stations
+from palpate_models.patterns.scan import scan_of
 from palpate_models.scenario import Exam
 from palpate_models.table import TABLE_TOP_M
 from palpate_perception import cloud, pattern, surface, visibility
@@ -112,11 +114,11 @@ class Pipeline:
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
-        x, y = pattern.lattice(self._exam)
-        nodes, known = pattern.downsample(p_A, x, y)  # 4
-        sequence = pattern.order(len(x), len(y), self._exam.pattern)  # 5
-        p_W, n_W = self._on(field, nodes[sequence])
-        targets = Targets(p_W, n_W, (sequence // len(y)).astype(np.uint32))
+        scan = scan_of(self._exam, lambda xy: _in_A(field, xy))
+        nodes = scan.targets  # 5
+        known = pattern.supported(p_A, nodes, self._exam.spacing_m)  # 4
+        p_W, n_W = self._on(field, nodes)
+        targets = Targets(p_W, n_W, scan.line_of_target.astype(np.uint32))
 
         motion = self._motion(fusion, fused, points, p_A, camera)
         sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
@@ -140,14 +142,14 @@ class Pipeline:
 
     def _on(self, field: surface.HeightField, xy: Array) -> tuple[Array, Array]:
         """Positions and normals in world of the surface at `xy` in A, shape (n, 2)."""
-        p_A = np.column_stack((xy, field.height(xy[:, 0], xy[:, 1])))
-        return apply(self._X_WA, p_A), field.normal(xy[:, 0], xy[:, 1]) @ self._X_WA[:3, :3].T
+        p_A, n_A = _in_A(field, xy)
+        return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
 
     def _mesh(self, field: surface.HeightField, p_A: Array, mode: BreathingMode | None) -> PerceivedMesh:
         """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
-        x = pattern.stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
-        y = pattern.stations(cy, height + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        x = stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        y = stations(cy, height + 2 * MESH_MARGIN_M, MESH_STEP_M)
         nodes, known = pattern.downsample(p_A, x, y)
         keep = _grown(known.reshape(len(x), len(y)), 2).ravel()
         index = np.arange(len(nodes)).reshape(len(x), len(y))
@@ -158,6 +160,11 @@ class Pipeline:
         p_W, n_W = self._on(field, nodes[keep])
         lifts = np.zeros(len(p_W)) if mode is None else mode(nodes[keep])
         return PerceivedMesh(p_W, n_W, new[triangles].astype(np.uint32), lifts)
+
+
+def _in_A(field: surface.HeightField, xy: Array) -> tuple[Array, Array]:
+    """Positions [m] and outward unit normals in A of the surface at `xy` in A [m], shape (n, 2)."""
+    return np.column_stack((xy, field.height(xy[:, 0], xy[:, 1]))), field.normal(xy[:, 0], xy[:, 1])
 
 
 def _remarks(guessed: int, nodes: int, motion: float) -> str:

@@ -17,9 +17,10 @@ from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.frames import apply, inverse, matrix
 from palpate_models.load import exam_input, load_scenario, plant_input, true_pose
+from palpate_models.patterns.lattice import lattice
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Scenario
-from palpate_perception import cloud, pattern
+from palpate_perception import cloud, pattern, pipeline
 from palpate_perception.messages import depth_in_metres
 from palpate_perception.service import PerceptionService, create
 from palpate_perception.tracker import FORECAST_S
@@ -132,7 +133,7 @@ def test_targets_lie_on_the_lattice_and_the_surface_with_unit_outward_normals() 
     targets = default_look()["perception/targets"]
     p_A = apply(inverse(matrix(true_pose(case))), xyz(targets.positions))
     normals = xyz(targets.normals)
-    x, y = pattern.lattice(case.exam)
+    x, y = lattice(case.exam)
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     nodes[1::2] = nodes[1::2, ::-1]
     np.testing.assert_allclose(p_A[:, :2], nodes.reshape(-1, 2), atol=1e-9)
@@ -267,12 +268,12 @@ def test_two_runs_give_the_same_bytes_and_another_seed_does_not() -> None:
 
 def test_the_five_steps_run_in_the_papers_order(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
-    for module, names in ((cloud, ("to_world", "remove_invalid", "crop")), (pattern, ("downsample", "order"))):
+    for module, names in ((cloud, ("to_world", "remove_invalid", "crop")), (pipeline, ("scan_of",)), (pattern, ("supported",))):
         for name in names:
             step = getattr(module, name)
             monkeypatch.setattr(module, name, lambda *a, _s=step, _n=name: calls.append(_n) or _s(*a))
     look(scenario(), 1)
-    assert list(dict.fromkeys(calls)) == ["to_world", "remove_invalid", "crop", "downsample", "order"]
+    assert list(dict.fromkeys(calls)) == ["to_world", "remove_invalid", "crop", "scan_of", "supported"]
 
 
 def test_frames_older_than_the_trigger_do_not_count() -> None:

@@ -1,9 +1,8 @@
-"""Coverage: from targets to strokes, each a smooth curve in the abdomen's xy plane.
+"""Coverage: from the lines of a scan pattern to strokes, each a smooth curve in the abdomen's xy plane.
 
-Lines: a stroke a line, there and back, retracted in between, so that each has a touch and a tare of its own. Raster: the same,
-all of them one way. Snake: lines joined by arcs, one stroke in contact. Mode point: a stroke a target. A skipped target ends a
-stroke: the arm must not slide over what it cannot reach. So does a break: the way between two
-targets that are in reach may itself be out of reach.
+A stroke is a line; where the pattern joins its lines, they are one stroke with arcs in between. Mode point: a stroke a target. A
+skipped target ends a stroke: the arm must not slide over what it cannot reach. So does a break: the way between two targets that
+are in reach may itself be out of reach.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from palpate_models.frames import Array
-from palpate_models.scenario import Mode, Pattern
+from palpate_models.scenario import Mode
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -90,7 +89,7 @@ def strokes(
     xy: Array,
     lines: Ints,
     usable: Bools,
-    pattern: Pattern,
+    joined: bool,
     mode: Mode,
     spacing: float,
     breaks: Set[int] = frozenset(),
@@ -101,7 +100,7 @@ def strokes(
         xy: targets in frame A [m], shape (n, 2), in coverage order.
         lines: index of each target's scan line, shape (n,).
         usable: whether it may be visited, shape (n,).
-        pattern: joins line ends (snake) or not.
+        joined: whether line ends are joined in contact.
         mode: continuous, or a stroke a target.
         spacing: distance of the lines [m].
         breaks: targets after which the stroke ends.
@@ -110,25 +109,25 @@ def strokes(
     for run in _runs(lines, usable, breaks, pointwise=mode is Mode.POINT):
         samples, visits = line_through(xy[run])
         pieces.append(Stroke(samples, run, visits))
-    if pattern is not Pattern.SNAKE or mode is Mode.POINT:
+    if not joined or mode is Mode.POINT:
         return pieces
-    joined: list[Stroke] = []
+    merged: list[Stroke] = []
     for piece in pieces:
-        last = joined[-1] if joined else None
+        last = merged[-1] if merged else None
         near = last is not None and np.linalg.norm(piece.xy[0] - last.xy[-1]) <= JOIN_SPACINGS * spacing
         follows = last is not None and last.targets[-1] == piece.targets[0] - 1 and last.targets[-1] not in breaks
         if last is None or not near or not follows or min(len(last.xy), len(piece.xy)) < 2:
-            joined.append(piece)
+            merged.append(piece)
             continue
         t0, t1 = _direction(last.xy[-2], last.xy[-1]), _direction(piece.xy[0], piece.xy[1])
         bridge = arc(last.xy[-1], t0, piece.xy[0], t1)
         offset = len(last.xy) + len(bridge)
-        joined[-1] = Stroke(
+        merged[-1] = Stroke(
             np.vstack((last.xy, bridge, piece.xy)),
             np.concatenate((last.targets, piece.targets)),
             np.concatenate((last.visits, piece.visits + offset)),
         )
-    return joined
+    return merged
 
 
 def touches(xy: Array, usable: Bools) -> list[Stroke]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.frames import Array, apply, inverse
+from palpate_models.patterns.scan import scan_of
 from palpate_models.placement import plan_redundancy, prepare
 from palpate_models.scenario import ExamInput
 from palpate_planning.coverage import strokes, touches
@@ -97,10 +98,11 @@ class ExamPlanner:
             exam.depth_m,
             lambda q0, q1: self._motion(free, q0, q1),
         )
+        joined = scan_of(exam, perceived.surface.in_A).joined
         breaks: set[int] = set()
         while True:  # ends: each round takes targets or joints away
             usable = np.array([i not in skipped for i in range(len(xy))], dtype=bool)
-            scan = strokes(xy, perceived.lines, usable, exam.pattern, exam.mode, exam.spacing_m, breaks)
+            scan = strokes(xy, perceived.lines, usable, joined, exam.mode, exam.spacing_m, breaks)
             pieces = touches(xy, usable) + scan
             layout = segments.lay(pieces)
             if not layout.troubled:

@@ -113,11 +113,14 @@ class PerceivedSurface:
 
     def at(self, xy_A: Array) -> tuple[Array, Array]:
         """Surface points and outward unit normals over xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""
-        values = self._field(xy_A)
-        p_A = np.column_stack((xy_A, values[:, 0]))
-        n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
-        n_A /= np.linalg.norm(n_A, axis=1, keepdims=True)
+        p_A, n_A = self.in_A(xy_A)
         return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
+
+    def in_A(self, xy_A: Array) -> tuple[Array, Array]:
+        """The same in frame A."""
+        values = self._field(xy_A)
+        n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
+        return np.column_stack((xy_A, values[:, 0])), n_A / np.linalg.norm(n_A, axis=1, keepdims=True)
 
     def xy(self, p_W: Array) -> Array:
         """Where a point of the surface, shape (3,), is in A's xy plane [m], shape (2,)."""

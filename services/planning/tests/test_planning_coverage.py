@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_models.scenario import Mode, Pattern
+from palpate_models.scenario import Mode
 from palpate_planning.coverage import SAMPLE_M, TOUCHES_M, strokes, touches, transfer
 
 SPACING = 0.0125
@@ -25,15 +25,15 @@ def grid(columns: int, rows: int, snake: bool) -> tuple[np.ndarray, np.ndarray]:
 @given(
     st.integers(2, 6),
     st.integers(1, 5),
-    st.sampled_from(list(Pattern)),
+    st.booleans(),
     st.sampled_from(list(Mode)),
     st.integers(0, 2**30 - 1),
 )
 @settings(deadline=None)
-def test_every_usable_target_is_visited_once_in_order(columns: int, rows: int, pattern: Pattern, mode: Mode, mask: int) -> None:
-    xy, lines = grid(columns, rows, pattern is Pattern.SNAKE)
+def test_every_usable_target_is_visited_once_in_order(columns: int, rows: int, joined: bool, mode: Mode, mask: int) -> None:
+    xy, lines = grid(columns, rows, joined)
     usable = np.array([bool(mask >> i & 1) for i in range(len(xy))])
-    pieces = strokes(xy, lines, usable, pattern, mode, SPACING)
+    pieces = strokes(xy, lines, usable, joined, mode, SPACING)
     visited = [int(i) for piece in pieces for i in piece.targets]
     assert visited == np.flatnonzero(usable).tolist()
     for piece in pieces:
@@ -42,7 +42,7 @@ def test_every_usable_target_is_visited_once_in_order(columns: int, rows: int, p
 
 def test_a_snake_is_one_stroke_without_corners() -> None:
     xy, lines = grid(6, 4, snake=True)
-    (stroke,) = strokes(xy, lines, np.ones(len(xy), dtype=bool), Pattern.SNAKE, Mode.CONTINUOUS, SPACING)
+    (stroke,) = strokes(xy, lines, np.ones(len(xy), dtype=bool), True, Mode.CONTINUOUS, SPACING)
     steps = np.diff(stroke.xy, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     assert lengths.max() < 1.5 * SAMPLE_M
@@ -55,22 +55,22 @@ def test_a_skipped_target_breaks_the_stroke() -> None:
     xy, lines = grid(5, 2, snake=True)
     usable = np.ones(len(xy), dtype=bool)
     usable[2] = False
-    pieces = strokes(xy, lines, usable, Pattern.SNAKE, Mode.CONTINUOUS, SPACING)
+    pieces = strokes(xy, lines, usable, True, Mode.CONTINUOUS, SPACING)
     assert [piece.targets.tolist() for piece in pieces] == [[0, 1], [3, 4, 5, 6, 7, 8, 9]]
 
 
 def test_a_break_ends_a_stroke_but_keeps_its_targets() -> None:
     xy, lines = grid(5, 2, snake=True)
     usable = np.ones(len(xy), dtype=bool)
-    pieces = strokes(xy, lines, usable, Pattern.SNAKE, Mode.CONTINUOUS, SPACING, {1, 4})
+    pieces = strokes(xy, lines, usable, True, Mode.CONTINUOUS, SPACING, {1, 4})
     assert [piece.targets.tolist() for piece in pieces] == [[0, 1], [2, 3, 4], [5, 6, 7, 8, 9]]
 
 
 def test_raster_has_a_stroke_a_line_and_point_mode_one_a_target() -> None:
     xy, lines = grid(5, 3, snake=False)
     usable = np.ones(len(xy), dtype=bool)
-    assert len(strokes(xy, lines, usable, Pattern.RASTER, Mode.CONTINUOUS, SPACING)) == 3
-    points = strokes(xy, lines, usable, Pattern.RASTER, Mode.POINT, SPACING)
+    assert len(strokes(xy, lines, usable, False, Mode.CONTINUOUS, SPACING)) == 3
+    points = strokes(xy, lines, usable, False, Mode.POINT, SPACING)
     assert [len(p.xy) for p in points] == [1] * 15
 
 

@@ -9,7 +9,7 @@ import pytest
 from planning_fakes import PERIOD_S, World, hertz, known
 
 from palpate_bus.setpoint import ControlMode
-from palpate_models.scenario import Mode, Pattern, Robot
+from palpate_models.scenario import Mode, Robot
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 
 
@@ -87,8 +87,8 @@ def test_two_runs_are_the_same_to_the_bit() -> None:
         assert np.array_equal(a.F_W, b.F_W)
 
 
-@pytest.mark.parametrize(("pattern", "mode", "strokes"), [(Pattern.RASTER, Mode.CONTINUOUS, 3), (Pattern.SNAKE, Mode.POINT, 6)])
-def test_raster_and_points_lift_between_strokes(pattern: Pattern, mode: Mode, strokes: int) -> None:
+@pytest.mark.parametrize(("pattern", "mode", "strokes"), [("raster", Mode.CONTINUOUS, 3), ("snake", Mode.POINT, 6)])
+def test_raster_and_points_lift_between_strokes(pattern: str, mode: Mode, strokes: int) -> None:
     region = (0.025, 0.0125) if mode is Mode.POINT else (0.025, 0.025)
     world = World(known(pattern=pattern, mode=mode, region_m=region))
     world.run()

@@ -1,0 +1,59 @@
+"""`palpate plan`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from palpate.run.options import Settings
+
+
+def plan(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "clean",
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture, a PNG file.")] = Path("plan.png"),
+    seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
+    settings: Settings = None,
+) -> None:
+    """Draw what an examination is going to do: its targets, their order, the time, and what is out of reach.
+
+    It is planned as in the examination, on the patient's true surface; a camera sees it to within some millimetres.
+
+    [bold]Examples[/]
+
+      palpate plan                                        the default examination
+
+      palpate plan --set exam.pattern=spiral.py           a scan pattern of your own
+
+      palpate plan person --seed 3 --set exam.spacing_m=0.02 -o plan.png
+    """
+    from rich.console import Console  # noqa: PLC0415 - help does not wait for what plans
+
+    from palpate.command_line import refuse  # noqa: PLC0415
+    from palpate.plan.drawing import draw  # noqa: PLC0415
+    from palpate.plan.prospect import NoPathError, prospect  # noqa: PLC0415
+    from palpate.run.inputs import usable  # noqa: PLC0415
+    from palpate_models.patterns.choice import PatternError  # noqa: PLC0415
+    from palpate_models.phantom import build_phantom  # noqa: PLC0415
+
+    chosen = usable(scenario, settings, seed)
+    try:
+        with Console(stderr=True).status("planning: some ten seconds"):
+            phantom = build_phantom(chosen.phantom, chosen.seed)
+            planned = prospect(chosen, phantom)
+            draw(out, chosen, phantom, planned)
+    except (NoPathError, PatternError, OSError) as error:
+        refuse(error)
+    console = Console()
+    targets, lines = len(planned.scan.targets), len(planned.scan.lines)
+    said = [
+        f"{targets} targets in {lines} line{'s' if lines > 1 else ''}, felt in {len(planned.strokes)} strokes",
+        f"{planned.length_m:.2f} m in contact, {len(planned.touches)} touches before",
+        f"about {planned.duration_s:.0f} s of simulated time",
+    ]
+    console.print("; ".join(said), highlight=False, soft_wrap=True)
+    for why, count in sorted(Counter(planned.skipped.values()).items()):
+        console.print(f"{count} targets are left out: {why}", highlight=False, soft_wrap=True)
+    console.print(f"drawn in {out}", highlight=False, soft_wrap=True)

@@ -1,0 +1,66 @@
+"""What the planner makes of an examination on the true surface: strokes, what is out of reach, how long it takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import Delaunay
+
+from palpate.plan.body import scan_over, surface_of
+from palpate.quick.patient import seen_lattice
+from palpate.run.space import expected_duration
+from palpate_models.frames import Array, apply, inverse
+from palpate_models.lbr import HOME
+from palpate_models.load import exam_input
+from palpate_models.patterns.scan import Scan
+from palpate_models.phantom import PhantomModel
+from palpate_models.scenario import Scenario
+from palpate_planning.exam_planner import ExamPlanner, PerceivedAbdomen
+from palpate_planning.motion_planning import NoPathError
+from palpate_planning.surface import PerceivedSurface
+
+PERIOD_S = 0.010
+"""Of the planner's trajectories."""
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """A planned examination."""
+
+    scan: Scan
+    strokes: tuple[Array, ...]
+    """Where the indenter slides at depth or presses, xy in A [m], each (n, 2), in order."""
+    touches: Array
+    """Where the skin is touched before the scan, shape (k, 2)."""
+    skipped: dict[int, str]
+    """Targets that are left out, and why."""
+    duration_s: float
+    """About how long it takes, in simulated time."""
+
+    @property
+    def length_m(self) -> float:
+        """Way in contact [m]."""
+        return float(sum(np.linalg.norm(np.diff(stroke, axis=0), axis=1).sum() for stroke in self.strokes))
+
+
+def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
+    """Plans on the true rest surface, as registered. Raises PatternError, and NoPathError when no target is in reach."""
+    scan = scan_over(scenario, phantom)
+    known = exam_input(scenario)
+    X_WA = np.array(known.X_WA)
+    p_A, n_A = surface_of(phantom).points(seen_lattice(scenario.exam))
+    seen = np.isfinite(p_A).all(axis=1) & np.isfinite(n_A).all(axis=1)
+    p_W, n_W = apply(X_WA, p_A[seen]), n_A[seen] @ X_WA[:3, :3].T
+    triangles = Delaunay(p_A[seen, :2]).simplices.astype(np.int64)
+    surface = PerceivedSurface.from_mesh(p_W, n_W, X_WA)
+    positions, _ = surface.at(scan.targets)
+    seen_abdomen = PerceivedAbdomen(positions, scan.line_of_target, p_W, triangles, surface)
+    plan = ExamPlanner(known, PERIOD_S).examination(seen_abdomen, np.asarray(HOME))
+    contacts = [segment for segment in plan.segments if segment.contact]
+    ways = [apply(inverse(X_WA), segment.path.p)[:, :2] for segment in contacts if not segment.touch]
+    touches = [apply(inverse(X_WA), segment.path.p)[0, :2] for segment in contacts if segment.touch]
+    return Prospect(scan, tuple(ways), np.array(touches).reshape(-1, 2), plan.skipped, expected_duration(scenario.exam))
+
+
+__all__ = ["NoPathError", "Prospect", "prospect"]
