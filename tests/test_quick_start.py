@@ -39,7 +39,7 @@ def commands() -> list[list[str]]:
 def test_the_page_shows_the_files_that_are_tried() -> None:
     shown = re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE, re.DOTALL)
     assert shown == [(EXAMPLES / name).read_text(encoding="utf-8") for name in
-                     ("my_patient.yaml", "make_abdomen.py", "threshold_assessment.py")]  # fmt: skip
+                     ("my_patient.yaml", "spiral.py", "make_abdomen.py", "threshold_assessment.py")]  # fmt: skip
     assert len([line for line in shown[-1].splitlines() if line.strip()]) <= 40
 
 

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 
 from palpate_models.errors import Errors
 from palpate_models.patient import Phantom
-from palpate_models.patterns.choice import known
+from palpate_models.pattern_choice import known
 from palpate_models.person import drawn
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 

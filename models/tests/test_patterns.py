@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from palpate_models.load import ScenarioError, load_scenario
-from palpate_models.patterns.choice import OURS, PatternError
+from palpate_models.pattern_choice import OURS, PatternError
 from palpate_models.patterns.lattice import lattice
 from palpate_models.patterns.scan import Scan, scan_of
 from palpate_models.scenario import Exam

@@ -35,7 +35,7 @@ def plan(
     from palpate.plan.drawing import draw  # noqa: PLC0415
     from palpate.plan.prospect import NoPathError, prospect  # noqa: PLC0415
     from palpate.run.inputs import usable  # noqa: PLC0415
-    from palpate_models.patterns.choice import PatternError  # noqa: PLC0415
+    from palpate_models.pattern_choice import PatternError  # noqa: PLC0415
     from palpate_models.phantom import build_phantom  # noqa: PLC0415
 
     chosen = usable(scenario, settings, seed)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay
 
-from palpate.plan.body import scan_over, surface_of
 from palpate.quick.patient import seen_lattice
+from palpate.run.region import scan_over, surface_of
 from palpate.run.space import expected_duration
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.lbr import HOME

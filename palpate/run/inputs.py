@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate.command_line import refuse
-from palpate.plan.body import scan_over, with_whole_path
+from palpate.run.region import scan_over, with_whole_path
 from palpate.run.roles import NONE, checked, settings_of
 from palpate_bus.implementations import ChoiceError
 from palpate_models.load import ScenarioError, load_scenario
-from palpate_models.patterns.choice import PatternError
+from palpate_models.pattern_choice import PatternError
 from palpate_models.phantom import MeshError, build_phantom
 from palpate_models.scenario import Scenario
 

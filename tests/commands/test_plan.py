@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
-from palpate.plan.body import scan_over
+from palpate.run.region import scan_over
 from palpate_models.load import load_scenario, scenario_names
-from palpate_models.patterns.choice import PatternError
+from palpate_models.pattern_choice import PatternError
 from palpate_models.phantom import build_phantom
 
 SPIRAL = Path(__file__).parents[2] / "docs" / "examples" / "spiral.py"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.frames import Array
-from palpate_models.patterns.choice import PatternError, load, told
+from palpate_models.pattern_choice import PatternError, load, told
 from palpate_models.scenario import Exam
 
 Surface = Callable[[Array], tuple[Array, Array]]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate_models.patterns import choice
-from palpate_models.patterns.choice import PatternError
+from palpate_models import pattern_choice as choice
+from palpate_models.pattern_choice import PatternError
 from palpate_models.patterns.scan import Scan, scan_of
 from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Scenario
