@@ -125,7 +125,8 @@ def _conduct(folder: Path, runtime: str) -> None:
     session = open_session(local.bus["conductor"])
     for process in read_processes(compose_file(), roles).values():
         local.start(process)
-    result = conduct(session, roles, tell, local.ended, timing)
+    with local.as_conductor():
+        result = conduct(session, roles, tell, local.ended, timing)
     print(f"failure: {result.failure}", flush=True)
     close_session(session)
     local.stop()

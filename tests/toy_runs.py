@@ -15,7 +15,7 @@ import zenoh
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
-from palpate_bus.wire.zenoh_config import close_session, mesh, open_session
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.outcome import Patience, RunOutcome
@@ -45,10 +45,15 @@ def run_toys(
     wallclock: bool = False,
     faults: Mapping[str, tuple[str, ...]] | None = None,
     groups: Sequence[tuple[str, ...]] = APART,
+    router: str = "",
 ) -> RunOutcome:
-    """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second); `groups`: who shares a process."""
+    """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second); `groups`: who shares a process;
+    `router`: all are clients of it.
+    """
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
         bus = mesh(("conductor", *(group[0] for group in groups)), Path(folder), lowlatency=("robot", "control", "tissue"))
+        if router:
+            bus = dict.fromkeys(bus, BusOptions(mode="client", router=router))
         session = open_session(bus["conductor"])
         base = {
             **os.environ,

@@ -230,7 +230,8 @@ def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> Fault
             for role in WORKERS:
                 local.start(processes[role])
             watch = _Watch(case, local, target, finding)
-            result = conduct(session, WORKERS, watch.tell, local.ended, timing, PATIENCE)
+            with local.as_conductor():
+                result = conduct(session, WORKERS, watch.tell, local.ended, timing, PATIENCE)
             if result.interrupted:
                 raise KeyboardInterrupt
             _conclude(finding, watch, result)

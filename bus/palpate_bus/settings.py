@@ -83,6 +83,13 @@ class Settings(BaseSettings):
         default=None,
         description="Folder with `ca.pem`, `cert.pem` and `key.pem` (`palpate keys init`). Endpoints: `tls/host:port`.",
     )
+    key: Path | None = Field(
+        default=None,
+        description="File with the run's key, mode 0600: messages that the contract wants tagged are, and others are set aside.",
+    )
+    tags: bool | None = Field(
+        default=None, description="Whether `palpate run` makes such a key for its processes; by default it does."
+    )
     zenoh_config: Path | None = Field(
         default=None,
         description="A zenoh configuration file (JSON5) that is used as it is. The settings above then have no effect.",

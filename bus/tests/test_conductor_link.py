@@ -49,6 +49,9 @@ class Bus:
     def gone(self) -> frozenset[str]:
         return frozenset() if self.token else frozenset({"conductor"})
 
+    def transport_lost(self) -> bool:
+        return False
+
     def say(self, command: int) -> None:
         name = HEARTBEAT if command == RunControl.HEARTBEAT else "palpate/control"
         message = RunControl(command, PID, False, "", home())

@@ -74,7 +74,8 @@ def run_distributed(
             absent.call(out, places)
         try:
             tree = FrameTree(exam_input(scenario))
-            result = conduct(session, roles, tell, local.ended, timing, patience, begin, tree)
+            with local.as_conductor():
+                result = conduct(session, roles, tell, local.ended, timing, patience, begin, tree)
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
             return result

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -17,7 +17,7 @@ from typing import IO, Any
 
 import yaml
 
-from palpate.environment import FIXED
+from palpate.environment import FIXED, given
 from palpate.run.forks import Child, Forks
 from palpate.run.group import GroupMember
 from palpate.run.group import command as group_command
@@ -27,7 +27,8 @@ from palpate.run.secure import SecureBus
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Announcement, Run
 from palpate_bus.runs.run_folder import RunFolder, remove_leftovers
-from palpate_bus.settings import Settings
+from palpate_bus.settings import Settings, variable
+from palpate_bus.wire.tags import make_key
 from palpate_bus.wire.zenoh_config import mesh
 from palpate_conductor.timing import Timing
 from palpate_models.load import view_of
@@ -155,12 +156,16 @@ class LocalProcesses:
         `record` says what the run's recorder keeps; `forks` starts the processes in place of a fresh interpreter each.
         """
         settings = Settings.read()
-        self._given = {"runtime": timing.runtime, "record": record}
+        self._given: dict[str, Any] = {"runtime": timing.runtime, "record": record}
         self._forks = forks
         self._out = out
         remove_leftovers()
         self._own = RunFolder()
         self._folder = self._own.path
+        key = settings.key
+        if key is None and settings.tags is not False:
+            key = make_key(self._folder / "run.key")
+        self._given["key"] = key
         self._scenario_files = {
             role: file if view_of(role) == "scenario" else self._apart(file) for role, file in scenario_files.items()
         }
@@ -211,6 +216,10 @@ class LocalProcesses:
             ).to_env(),
             **self.bus[process.role].to_env(),
         }
+
+    def as_conductor(self) -> AbstractContextManager[None]:
+        """Gives what this process makes meanwhile the run's key, as the services have it."""
+        return given({variable("key"): str(self._given["key"] or "")})
 
     def start(self, *processes: ServiceProcess) -> None:
         """Starts a service, or several that share a process. Raises PlacementError for a program that cannot share one."""

@@ -17,8 +17,9 @@ _HEAD = """\
 Generated from [the contract](../bus/palpate_bus/contract/contract.yaml) by `python -m palpate_bus.contract.doc`; do not edit.
 
 A message goes by the key `<domain>/<topic>/<type>/<hash>`, as rmw_zenoh of ROS 2 Jazzy writes it (the domain is
-`ROS_DOMAIN_ID`, 0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID. Types of `palpation_msgs`
-are in [bus/palpation_msgs](../bus/palpation_msgs/msg). Frames: `world` (on the floor, z up), `abdomen` (origin at the umbilicus,
+`ROS_DOMAIN_ID`, 0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID; where the run has a key, those
+marked so carry [a tag](security.md#without-certificates-the-runs-key) after it. Types of `palpation_msgs` are in
+[bus/palpation_msgs](../bus/palpation_msgs/msg). Frames: `world` (on the floor, z up), `abdomen` (origin at the umbilicus,
 x to the patient's left, y to the head, z outward). Units are SI, as REP 103 has them.
 """
 
@@ -144,6 +145,7 @@ def _facts(topic: Topic) -> list[tuple[str, str]]:
     rows += [("QoS class", f"`{topic.qos}`"), ("read by", readers), ("may be known to", _VISIBILITY[topic.visibility])]
     rows += [("in the run hash", "yes" if topic.hashed else "no")]
     rows += [("may be sent by", "anyone: a ROS 2 node too")] if topic.open else []
+    rows += [("tagged", "where the run has a key")] if topic.tagged else []
     rows += [("stale after", f"{topic.max_age_ms} ms")] if topic.max_age_ms else []
     rows += [("expires after", f"{topic.expiry_ms} ms: the receiver then acts safely")] if topic.expiry_ms else []
     return rows
@@ -162,8 +164,10 @@ def _internal(rules: Contract) -> str:
     for row in rules.internal.values():
         every = "" if row.period_ms is None else f"{row.period_ms} ms"
         deadline = "" if row.deadline_ms is None else f"{row.deadline_ms} ms"
-        rows.append((f"`{row.name}`", f"`{row.type}`", row.producer, row.readers, every, deadline, row.doc))
-    return "## Messages of the runtime\n\n" + _table(("key", "type", "from", "to", "every", "deadline", "what for"), rows)
+        tagged = "yes" if row.tagged else ""
+        rows.append((f"`{row.name}`", f"`{row.type}`", row.producer, row.readers, every, deadline, tagged, row.doc))
+    head = ("key", "type", "from", "to", "every", "deadline", "tagged", "what for")
+    return "## Messages of the runtime\n\n" + _table(head, rows)
 
 
 def main(arguments: Sequence[str]) -> int:

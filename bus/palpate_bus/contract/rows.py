@@ -97,6 +97,8 @@ class Topic(_Row):
     """With --record normal the recorder keeps one message in this time; 0: every one."""
     open: bool = False
     """Whether others than the producer may send on it too."""
+    tagged: bool = False
+    """Whether its messages carry a tag, where a run has a key."""
     doc: str
 
     @property
@@ -142,6 +144,8 @@ class Internal(_Row):
     period_ms: int | None = None
     deadline_ms: int | None = None
     """Its sender is lost when none has come for so long, in wall-clock runs."""
+    tagged: bool = False
+    """Whether its messages carry a tag, where a run has a key."""
     doc: str
 
     @property
@@ -198,6 +202,11 @@ class Contract(_Row):
     def inputs(self, role: str) -> tuple[tuple[Topic, Edge], ...]:
         """Topics that a role reads, with the kind of edge, in contract order."""
         return tuple((topic, topic.readers[role]) for topic in self.topics.values() if role in topic.readers)
+
+    def tagged(self, name: str) -> bool:
+        """Whether messages of this name, a topic's or the runtime's own, carry a tag where a run has a key."""
+        row = self.topics.get(name) or self.internal.get(name) or self.internal.get(f"{name.rpartition('/')[0]}/<role>")
+        return row is not None and row.tagged
 
     def step_order(self, roles: tuple[str, ...]) -> tuple[str, ...]:
         """The roles in an order in which each runs after the producers of its same_tick inputs.

@@ -41,6 +41,9 @@ BUSY_S = 2.0
 """A silent conductor whose process runs all the same has no core: it is lost only after this time."""
 
 
+TRANSPORT_LOST: Final = "the bus is gone: its router does not answer any more"
+
+
 class RunAborted(RuntimeError):
     """The conductor ended the run, or is lost."""
 
@@ -67,6 +70,8 @@ class ConductorLink:
         """The conductor's process, if it is one of this machine that we can look at; else 0."""
         self.lost = ""
         """Why the conductor counts as lost; empty while it lives."""
+        self.told = ""
+        """With which reason a message of the conductor ended the run; empty when none did."""
 
     def poll(self, timeout: float | None = None) -> Any | None:
         """The next control message, or None. Raises RunAborted when told so, or when the conductor was lost for the grace."""
@@ -79,6 +84,7 @@ class ConductorLink:
             self._granted = self._granted or message.command == RunControl.GRANT
             self._heard()
             if message.command == RunControl.ABORT:
+                self.told = message.reason or "no reason given"
                 raise RunAborted(message.reason)
             return message
         self._listen()
@@ -109,7 +115,7 @@ class ConductorLink:
         self._sought = now
         before, self._missed = self._missed, CONDUCTOR in self._member.gone()
         if before and self._missed:
-            self._lose("the conductor is gone")
+            self._lose(TRANSPORT_LOST if self._member.transport_lost() else "the conductor is gone")
         elif self._silent_s > self._patience_s and (self._silent_s > BUSY_S or not (self._pid and runs(self._pid))):
             self._lose(f"nothing heard of the conductor for {self._silent_s:.2f} s")
 
@@ -156,9 +162,14 @@ class Reports:
         """Says that the conductor is lost, for one that comes back."""
         self.say(ServiceReport.PROGRESS, tick, CONDUCTOR, {"lost": why})
 
+    def obey(self, tick: int, why: str) -> None:
+        """Says that the service leaves, because a message in the conductor's name told it to."""
+        self.say(ServiceReport.PROGRESS, tick, "", {"told": why})
+
     def progress(self, tick: int, waiting_for: str = "") -> None:
-        """Reports progress if the last report is old enough."""
+        """Reports progress if the last report is old enough, with what is suspicious about who sends to the service."""
         if monotonic() - self._last > PROGRESS_S:
-            for complaint in self._member.complaints():
+            suspicions = self._member.suspicions()
+            for complaint in (*self._member.complaints(), *suspicions):
                 log.error("%s", complaint)
-            self.say(ServiceReport.PROGRESS, tick, waiting_for)
+            self.say(ServiceReport.PROGRESS, tick, waiting_for, {"suspicions": suspicions} if suspicions else None)

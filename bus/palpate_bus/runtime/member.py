@@ -35,7 +35,9 @@ class Member:
         self.domain = domain
         self.graph = GraphWatch(session, domain)
         self._tokens = NodeTokens(session, role, domain, self.transport.ids)
+        self._heard: list[tuple[str, Subscription]] = []
         self._said: set[str] = set()
+        self._routed = bool(list(session.info.routers_zid()))
         self._checked = 0.0
         self._changed = False
 
@@ -48,7 +50,7 @@ class Member:
         """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
         self._tokens.subscription(topic, self.rules.qos[topic.qos])
         decode = codec.decoder(topic.type) if topic.open else None
-        return self.transport.subscription(topic_key(topic, self.domain), history, decode)
+        return self._listen(topic.name, self.transport.subscription(topic_key(topic, self.domain), history, decode))
 
     def observed(self, topic: Topic) -> str:
         """Declares a subscription that the caller makes; returns the key."""
@@ -62,7 +64,23 @@ class Member:
 
     def internal_subscription(self, name: str, type_name: str) -> Subscription:
         """A subscription to the runtime's own messages."""
-        return self.transport.subscription(message_key(name, type_name, self.domain))
+        return self._listen(name, self.transport.subscription(message_key(name, type_name, self.domain)))
+
+    def _listen(self, name: str, subscription: Subscription) -> Subscription:
+        self._heard.append((name, subscription))
+        return subscription
+
+    def suspicions(self) -> list[str]:
+        """What is new and wrong with who sends what this role hears, a sentence each, said once."""
+        found = (f"{name}: {why}" for name, subscription in self._heard if (why := subscription.suspicion))
+        new = [sentence for sentence in found if sentence not in self._said]
+        self._said.update(new)
+        return new
+
+    def transport_lost(self) -> bool:
+        """Whether all went through a router that is there no more: then nobody's silence says anything of himself."""
+        info = self.session.info
+        return self._routed and not list(info.routers_zid()) and not list(info.peers_zid())
 
     def complaints(self) -> list[str]:
         """New mismatches of message types on the bus, each said once; looks at most every `CHECK_S`."""

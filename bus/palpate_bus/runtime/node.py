@@ -77,6 +77,8 @@ class Node(ABC):
                     seat.output.flush(seat.tick)  # what others have heard belongs in the recording
                 if self._link.lost:
                     seat.reports.miss_conductor(seat.tick, self._link.lost)
+                elif self._link.told:
+                    seat.reports.obey(seat.tick, self._link.told)
                 seat.service.finish()
             raise
         except Exception as error:

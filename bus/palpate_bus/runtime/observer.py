@@ -49,17 +49,23 @@ class _Feed:
         self.sequence = 0
         self.missed = 0
         self.garbage = 0
+        self.forged = 0
+        self._tagger = member.transport.tagger(key)
 
     def drain(self) -> list[tuple[int, bytes, codec.Message]]:
         """Everything that came in since last time: (sequence, payload, message)."""
         received = []
         while (sample := self._try()) is not None:
             try:
-                sequence, _, _ = unpack(sample.attachment.to_bytes())
+                attachment = sample.attachment.to_bytes()
+                sequence, _, _ = unpack(attachment)
             except (WireError, AttributeError):
                 self.garbage += 1
                 continue
             payload = sample.payload.to_bytes()
+            if self._tagger is not None and not self._tagger.holds(attachment, payload):
+                self.forged += 1
+                continue
             message = decoded(self._decode, payload)
             if message is None:  # an observer knows no rightful sender, and must not end with what it gets
                 self.garbage += 1
@@ -117,6 +123,7 @@ class ObservedService:
         """Garbage and missed messages, for the report."""
         return {
             "garbage": sum(feed.garbage for feed in self.feeds),
+            "forged": sum(feed.forged for feed in self.feeds),
             "missed": {feed.topic.name: feed.missed for feed in self.feeds if feed.missed},
         }
 

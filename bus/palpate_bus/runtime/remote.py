@@ -7,7 +7,7 @@ Advance message that closes each of its ticks.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from time import perf_counter_ns
+from time import monotonic, perf_counter_ns
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,13 @@ import numpy as np
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.messages import Advance, codec
 from palpate_bus.runtime.conductor_link import POLL_S
-from palpate_bus.runtime.lockstep import InputBuffer, Received, Stepper
+from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Received, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.wire.transport import ReceivedSample, Sender, Subscription
 
 ADVANCE_TYPE = "palpation_msgs/msg/Advance"
+ANOTHER_S = 0.05
+"""How long it is waited, once a number is wrong, for a message that shows that two senders have one identity."""
 _decode = codec.decoder(ADVANCE_TYPE)
 _encode = codec.encoder(ADVANCE_TYPE)
 
@@ -43,6 +45,8 @@ class RemoteInputs:
         self._observed = tuple(buffer for buffer in remote if buffer.edge is Edge.OBSERVE)
         producers = sorted({b.topic.producer for b in self._awaited if b.edge.blocking and not b.topic.periodic})
         self._advances = {role: member.internal_subscription(f"palpate/advance/{role}", ADVANCE_TYPE) for role in producers}
+        self._last: dict[str, tuple[int, int]] = {}
+        """By topic, number and sending time of its newest message."""
         self._event_topics = {role: event_topics(self._rules, role) for role in producers}
 
     def unheard(self) -> list[str]:
@@ -85,12 +89,30 @@ class RemoteInputs:
             if sample is None:
                 idle(buffer.topic.name)
             elif source is data:
-                buffer.accept(sample.sequence, sample.payload)
+                self._accept(buffer, sample)
             else:
                 self._settle(buffer.topic.producer, sample)
         if waited and sample is not None:
             duration = perf_counter_ns() - begin
             self._stepper.blame.waited(buffer.topic.producer, duration, self._now() - sample.sent)
+
+    def _accept(self, buffer: InputBuffer, sample: ReceivedSample) -> None:
+        """Gives the buffer a message. Where its number is wrong, looks whether two number their messages under one identity."""
+        try:
+            buffer.accept(sample.sequence, sample.payload)
+        except LockstepError as error:
+            last = self._last.get(buffer.topic.name)
+            end = monotonic() + ANOTHER_S
+            doubled = last is not None and sample.sequence <= last[0] and sample.sent != last[1]
+            while not doubled and (later := self._data[buffer.topic.name].get(max(end - monotonic(), 0.0))) is not None:
+                doubled = later.sequence <= sample.sequence and later.sent != sample.sent
+            if doubled:
+                raise LockstepError(
+                    f"{error}; two senders number their messages under one identity: a forged or doubled sender of "
+                    f"{buffer.topic.name}, not a loss of {buffer.topic.producer}"
+                ) from None
+            raise
+        self._last[buffer.topic.name] = (sample.sequence, sample.sent)
 
     def _settle(self, producer: str, sample: ReceivedSample) -> None:
         advance = _decode(sample.payload)
@@ -100,9 +122,9 @@ class RemoteInputs:
                 buffer.advance(advance.tick, int(sequence))
 
     def counts(self) -> dict[str, int]:
-        """Messages that were set aside: `garbage`, and `foreign` ones of another sender."""
+        """Messages that were set aside: `garbage`, `foreign` ones of another sender, and `forged` ones with a wrong tag."""
         subscriptions = (*self._data.values(), *self._advances.values())
-        return {"garbage": sum(s.garbage for s in subscriptions), "foreign": sum(s.foreign for s in subscriptions)}
+        return {kind: sum(getattr(s, kind) for s in subscriptions) for kind in ("garbage", "foreign", "forged")}
 
 
 class Advances:

@@ -199,6 +199,7 @@ class WallClockNode(Node):
             "digests": {},
             "garbage": sum(s.garbage for s in self._data.values()) + self._link.garbage,
             "foreign": sum(s.foreign for s in self._data.values()),
+            "forged": sum(s.forged for s in self._data.values()),
             "gaps": self.gaps,
             "undecodable": self.undecodable,
             "overruns": self.overruns,

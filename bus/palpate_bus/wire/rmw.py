@@ -4,7 +4,8 @@ A topic's key is `<domain>/<topic>/<DDS type>/<RIHS01 hash>`, for example
 `0/ft/wrench/geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_8dc3de...`. Publisher and subscriber meet only when all
 four agree; `any_type_key` is for noticing peers that differ in nothing but the type or its hash.
 
-The attachment is 33 bytes, as zenoh's serializer writes (int64, int64, 16 bytes) since rmw_zenoh_cpp 0.2.4 (Jazzy):
+The attachment is 33 bytes, or 41 with a tag, as zenoh's serializer writes (int64, int64, 16 bytes) since rmw_zenoh_cpp 0.2.4
+(Jazzy):
 
 | offset | size | field |
 |---|---|---|
@@ -12,6 +13,7 @@ The attachment is 33 bytes, as zenoh's serializer writes (int64, int64, 16 bytes
 | 8 | 8 | source time stamp [ns] |
 | 16 | 1 | length of the GID, 16 |
 | 17 | 16 | GID of the publisher (see `liveliness.gid`) |
+| 33 | 8 | our own: the tag, where a run has a key and the contract wants one (see `tags`); ROS 2 reads no further than the GID |
 
 Sources: ros2/rmw_zenoh, `docs/design.md` and, in `rmw_zenoh_cpp/src/detail/`, `attachment_helpers.cpp`,
 `liveliness_utils.cpp` and `type_support_common.cpp`.
@@ -26,6 +28,7 @@ from functools import lru_cache
 
 from palpate_bus.contract import Topic
 from palpate_bus.messages.codec import type_hash
+from palpate_bus.wire.tags import TAG_SIZE
 
 GID_SIZE = 16
 """Bytes in a GID (RMW_GID_STORAGE_SIZE)."""
@@ -138,9 +141,9 @@ class AttachmentWriter:
 
 def unpack(attachment: bytes | bytearray | memoryview) -> tuple[int, int, bytes]:
     """(sequence, source time stamp [ns], GID) of an attachment. Raises WireError if it is none."""
-    if len(attachment) != ATTACHMENT_SIZE:
+    if len(attachment) not in (ATTACHMENT_SIZE, ATTACHMENT_SIZE + TAG_SIZE):
         raise WireError(f"an attachment has {ATTACHMENT_SIZE} bytes, not {len(attachment)}")
-    sequence, stamp, length, gid = _ATTACHMENT.unpack(attachment)
+    sequence, stamp, length, gid = _ATTACHMENT.unpack_from(attachment)
     if length != GID_SIZE:
         raise WireError(f"an attachment's GID has {GID_SIZE} bytes, not {length}")
     return sequence, stamp, gid

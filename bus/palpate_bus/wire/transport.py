@@ -13,9 +13,11 @@ from typing import Any, NamedTuple, Protocol
 
 import zenoh
 
-from palpate_bus.contract import Qos
+from palpate_bus.contract import Qos, contract
 from palpate_bus.messages.codec import CodecError
-from palpate_bus.wire.rmw import AttachmentWriter, WireError, hello_key, unpack
+from palpate_bus.settings import Settings
+from palpate_bus.wire.rmw import AttachmentWriter, WireError, hello_key, parse_key, unpack
+from palpate_bus.wire.tags import Tagger, read_key
 
 HELLO = 0
 """Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""
@@ -46,8 +48,16 @@ class Sender(Protocol):
 class Publisher:
     """Sends on one key with the QoS of the contract."""
 
-    def __init__(self, session: zenoh.Session, key: str, qos: Qos, gid: bytes, now: Callable[[], int] = time_ns) -> None:
-        """`now` gives the wall time [ns] that each message carries."""
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        qos: Qos,
+        gid: bytes,
+        now: Callable[[], int] = time_ns,
+        tagger: Tagger | None = None,
+    ) -> None:
+        """`now` gives the wall time [ns] that each message carries; with a `tagger` it carries a tag, too."""
         self.key = key
         self._session = session
         self._now = now
@@ -64,14 +74,19 @@ class Publisher:
         else:
             self._publisher = session.declare_publisher(key, **options)
         self._pack = AttachmentWriter(gid).pack
+        self._tagger = tagger
 
     def put(self, payload: bytes, sequence: int) -> None:
         """Sends a message."""
-        self._publisher.put(payload, attachment=self._pack(sequence, self._now()))
+        self._publisher.put(payload, attachment=self._attachment(sequence, payload))
 
     def hello(self) -> None:
         """Sends the empty message that tests the edge."""
-        self._session.put(hello_key(self.key), b"", attachment=self._pack(HELLO, self._now()))
+        self._session.put(hello_key(self.key), b"", attachment=self._attachment(HELLO, b""))
+
+    def _attachment(self, sequence: int, payload: bytes) -> bytes:
+        attachment = self._pack(sequence, self._now())
+        return attachment if self._tagger is None else attachment + self._tagger.tag(attachment, payload)
 
     def close(self) -> None:
         """Undeclares the publisher."""
@@ -82,17 +97,29 @@ class Subscription:
     """Receives on one key.
 
     After its hello only the first sender's messages count: bytes without a valid attachment are counted in `garbage`, those of
-    another sender in `foreign`. A topic that is open to all takes every sender's messages, if they can be decoded.
+    another sender in `foreign`, and where messages carry tags, those without the right one in `forged`. A topic that is open to
+    all takes every sender's messages, if they can be decoded.
     """
 
     def __init__(
-        self, session: zenoh.Session, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None
+        self,
+        session: zenoh.Session,
+        key: str,
+        history: bool = False,
+        decode: Callable[[bytes], object] | None = None,
+        tagger: Tagger | None = None,
     ) -> None:
-        """Subscribes. With `history`, what a latched topic sent before is delivered too; `decode` opens the topic to all."""
+        """Subscribes.
+
+        With `history`, what a latched topic sent before is delivered too; `decode` opens the topic to all; with a `tagger` only
+        tagged messages count.
+        """
         self.key = key
         self._decode = decode
         self.garbage = 0
         self.foreign = 0
+        self.forged = 0
+        self._tagger = tagger
         self.heard = False
         self._gid: bytes | None = None
         self._retired: bytes | None = None
@@ -117,17 +144,20 @@ class Subscription:
             except Empty:
                 return None
             try:
-                attachment: Any = raw.attachment
-                sequence, sent, gid = unpack(attachment.to_bytes())
+                attachment: bytes = raw.attachment.to_bytes()  # type: ignore[union-attr]  # none is an AttributeError
+                sequence, sent, gid = unpack(attachment)
             except (WireError, AttributeError):
                 self.garbage += 1
+                continue
+            payload = raw.payload.to_bytes()
+            if self._tagger is not None and not self._tagger.holds(attachment, payload):
+                self.forged += 1
                 continue
             if gid != self._gid:
                 if (self._gid is not None or gid == self._retired) and self._decode is None:
                     self.foreign += 1
                     continue
                 self._gid = gid
-            payload = raw.payload.to_bytes()
             if not payload:
                 self.heard = self.heard or sequence == HELLO
                 continue
@@ -138,6 +168,15 @@ class Subscription:
                 self.garbage += 1
                 continue
             return ReceivedSample(sequence, sent, payload)
+
+    @property
+    def suspicion(self) -> str:
+        """What is wrong with who sends here, empty while nothing is."""
+        if self.forged:
+            return "messages with a wrong tag come and are set aside: somebody forges them, or does not have the run's key"
+        if self.foreign and self._retired is None:
+            return "messages of a second sender come and are set aside"
+        return ""
 
     def hand_over(self) -> None:
         """Forgets the sender: the next one that is another counts from now on, and nothing that still comes from this one."""
@@ -158,6 +197,7 @@ class Transport:
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
+        self._key = read_key(Settings.read().key)
         self.ids = count()
         """Numbers of the entities that members declare."""
 
@@ -167,11 +207,16 @@ class Transport:
 
     def publisher(self, topic: str, key: str, qos: Qos, gid: bytes) -> Sender:
         """The sending end of a topic; `key` is its key on the bus."""
-        return Publisher(self.session, key, qos, gid, self.now)
+        return Publisher(self.session, key, qos, gid, self.now, self.tagger(key))
 
     def subscription(self, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None) -> Subscription:
         """The receiving end of a key, see `Subscription`."""
-        return Subscription(self.session, key, history, decode)
+        return Subscription(self.session, key, history, decode, self.tagger(key))
+
+    def tagger(self, key: str) -> Tagger | None:
+        """What tags and checks the messages of a key; None where they carry no tags."""
+        wanted = self._key is not None and contract().tagged(parse_key(key).topic)
+        return Tagger(self._key, key) if self._key is not None and wanted else None
 
 
 def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:

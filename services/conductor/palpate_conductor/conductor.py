@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from time import monotonic, perf_counter, sleep
 from typing import Any
 
@@ -13,7 +13,7 @@ import zenoh
 from palpate_bus.contract import MS, Contract
 from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import NS, header
-from palpate_bus.runtime.conductor_link import CONDUCTOR
+from palpate_bus.runtime.conductor_link import CONDUCTOR, TRANSPORT_LOST
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservedService
@@ -114,8 +114,17 @@ class Conductor:
             while (sample := subscription.get(0)) is not None:
                 message = self._decode(sample.payload)
                 self.watchdog.report(role, int(message.tick), message.waiting_for)
-                heard.append((role, message, json.loads(message.detail) if message.detail else {}))
+                detail = json.loads(message.detail) if message.detail else {}
+                self._suspect(detail.get("suspicions", ()))
+                heard.append((role, message, detail))
         return heard
+
+    def _suspect(self, sentences: Iterable[str]) -> None:
+        """Passes on, once, what is suspicious about a sender."""
+        for sentence in sentences:
+            if sentence not in self.outcome.trouble:
+                log.error("%s", sentence)
+                self._tell(sentence)
 
     def _diagnose(self) -> list[Any]:
         """Services, then topics, for `diagnostics`."""
@@ -218,6 +227,12 @@ class Conductor:
             for role, message, detail in self._heard():
                 if message.waiting_for == CONDUCTOR:
                     self._missed(role, message.tick, detail.get("lost", ""))
+                if "told" in detail:
+                    when = max(message.tick, 0) / NS
+                    raise RunFailed(
+                        f"{role} was told to end at tick {when:.3f} s ({detail['told']}) in the conductor's name, "
+                        "but not by this conductor: a forged or doubled sender of palpate/control"
+                    )
                 if self._places.take(role):
                     self.watchdog.progress[role].moved = monotonic()  # the time before is nobody's
                     self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
@@ -232,9 +247,7 @@ class Conductor:
             self._lose_frozen(finished)
             for role, how in self._places.expired().items():
                 self._lose(role, f"{how}; nobody took its place within {self._places.patience_s:.0f} s")
-            for complaint in self._member.complaints():
-                log.error("%s", complaint)
-                self.outcome.trouble.append(complaint)
+            self._suspect([*self._member.complaints(), *self._member.suspicions()])
             self._desk.attend(self._collector.collected.supervisor)
             self._contract.attend()
             self._extend()
@@ -272,6 +285,9 @@ class Conductor:
     def _missing(self, died: Callable[[], Mapping[str, str]]) -> dict[str, str]:
         """Roles that are not there, with how they went."""
         ended = {role: how for role, how in died().items() if role not in self._places.taken}
+        if self._member.gone() and self._member.transport_lost():
+            reached = max(progress.tick for progress in self.watchdog.progress.values())
+            raise RunFailed(f"transport lost at tick {max(reached, 0) / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault")
         return {**dict.fromkeys(self._member.gone(), "its connection is gone"), **ended}
 
     def _miss(self, role: str, how: str) -> None:

@@ -1,0 +1,111 @@
+"""Whoever sends in another's name is told from a service that is lost, and with a key of the run not obeyed."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from toy_runs import Running, at, run_toys
+
+from palpate_bus.contract import contract
+from palpate_bus.messages import JointTorqueCommand, RunControl, codec
+from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE
+from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key, unpack
+from palpate_bus.wire.tags import make_key
+
+CONTROL_KEY = message_key("palpate/control", CONTROL_TYPE, 0)
+TORQUE = contract().topics["control/joint_torque"]
+
+
+class Clone:
+    """Learns the identity of a sender in clear, and sends in its name."""
+
+    def __init__(self, key: str, payload: bytes) -> None:
+        self._key, self._payload = key, payload
+        self._heard: list[bytes] = []
+        self._subscriber: object = None
+        self.struck: list[bool] = []
+
+    def listen(self, session: zenoh.Session) -> None:
+        if self._subscriber is None:
+            self._subscriber = session.declare_subscriber(
+                self._key, zenoh.handlers.Callback(lambda s: self._heard.append(s.attachment.to_bytes()), indirect=False)
+            )
+
+    def strike(self, session: zenoh.Session) -> None:
+        sequence, sent, gid = unpack(self._heard[-1])
+        session.put(self._key, self._payload, attachment=AttachmentWriter(gid).pack(sequence + 5, sent + 1))
+
+
+def abort() -> Clone:
+    return Clone(CONTROL_KEY, codec.encode(RunControl(RunControl.ABORT, 0, False, "", "said a stranger"), CONTROL_TYPE))
+
+
+def torque() -> Clone:
+    command = JointTorqueCommand(header(0), np.full(7, 50.0), duration_message(10**9), "")
+    return Clone(topic_key(TORQUE, 0), codec.encode(command, TORQUE.type))
+
+
+def meddling(*clones: Clone) -> Callable[[Running], None]:
+    def meddle(running: Running) -> None:
+        for clone in clones:
+            clone.listen(running.session)
+            if at(running, 0.5, clone.struck):
+                clone.strike(running.session)
+
+    return meddle
+
+
+def composed_hash_of(seconds: int) -> str:
+    program = "import toy_runs; print(toy_runs.composed_hash())"
+    environment = {"TOY_END_S": str(seconds), "PYTHONPATH": str(Path(__file__).parent)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize(("clone", "topic"), [(abort, "palpate/control"), (torque, "control/joint_torque")])
+def test_without_a_key_a_forged_sender_is_named_and_no_service(clone: Callable[[], Clone], topic: str) -> None:
+    outcome = run_toys(meddling(clone()))
+    assert outcome.failure is not None
+    assert f"a forged or doubled sender of {topic}" in outcome.failure, outcome.failure
+
+
+def test_with_a_key_what_is_forged_is_told_and_not_obeyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_KEY", str(make_key(tmp_path / "run.key")))
+    outcome = run_toys(meddling(abort(), torque()), {"TOY_END_S": "3"})
+    assert outcome.failure is None
+    assert outcome.run_hash == composed_hash_of(3)
+    assert outcome.reports["robot"]["forged"] == 1
+    for topic in ("palpate/control", "control/joint_torque"):
+        assert [line for line in outcome.trouble if line.startswith(f"{topic}: messages with a wrong tag")], outcome.trouble
+
+
+def test_a_router_that_is_killed_is_the_transports_loss_and_no_services() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        where = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    words = [sys.executable, "-m", "palpate_bus.wire.router", where]
+    router = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    assert router.stdout is not None
+    router.stdout.readline()
+    done: list[bool] = []
+
+    def kill(running: Running) -> None:
+        if at(running, 0.5, done):
+            router.kill()
+
+    try:
+        outcome = run_toys(kill, router=where)
+    finally:
+        router.kill()
+        router.wait()
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("transport lost at tick"), outcome.failure
+    assert not outcome.lost
