@@ -17,8 +17,8 @@ _HEAD = """\
 Generated from [the contract](../bus/palpate_bus/contract/contract.yaml) by `python -m palpate_bus.contract.doc`; do not edit.
 
 A message goes by the key `<domain>/<topic>/<type>/<hash>`, as rmw_zenoh of ROS 2 Jazzy writes it (the domain is
-`ROS_DOMAIN_ID`, 0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID; where the run has a key, those
-marked so carry [a tag](security.md#without-certificates-the-runs-key) after it. Types of `palpation_msgs` are in
+`ROS_DOMAIN_ID`, 0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID; where the run
+has a key, those marked so carry [a tag](security.md#without-certificates-the-runs-key) after it. Types of `palpation_msgs` are in
 [bus/palpation_msgs](../bus/palpation_msgs/msg). Frames: `world` (on the floor, z up), `abdomen` (origin at the umbilicus,
 x to the patient's left, y to the head, z outward). Units are SI, as REP 103 has them.
 """
