@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from palpate_benchmarks.turns import compared, in_turns
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuInstance
 from palpate_models.frames import Array
-from palpate_models.patient import Lesion, Phantom
+from palpate_models.patient import Lesion, Phantom, Stiffness
 from palpate_models.phantom import PhantomModel, build_phantom
 
 RADIUS_M = 0.015
@@ -66,11 +67,27 @@ def _by_fmpy(path: Path, position: Array, velocity: Array) -> tuple[float, float
     return cost
 
 
+def _stepping(fmu: FmuInstance, position: Array, velocity: Array) -> Callable[[int], None]:
+    """A step along the path by prepared ctypes calls."""
+    motion = fmu.port(["indenter_position", "indenter_velocity"])
+    wrench = fmu.port(["contact_force", "contact_torque"])
+
+    def step(k: int) -> None:
+        motion["indenter_position"][:] = position[k]
+        motion["indenter_velocity"][:] = velocity[k]
+        motion.push()
+        fmu.step(k * STEP_S, STEP_S)
+        wrench.pull()
+
+    return step
+
+
 def measure(steps: int = 3000) -> dict[str, float]:
     """Cost of a step [us] on the default abdomen with a lesion, sliding at 10 mm depth: median and 99th percentile.
 
     Each with setting the motion and reading the wrench: through FMPy's interface and through prepared ctypes calls (what the
-    bus service uses); and the surface's displacement read once. The native tissue's cost is in its own benchmark.
+    bus service uses); and the surface's displacement read once. The native tissue's cost is in its own benchmark. Last,
+    processor time of one whose wall does not stiffen and of this one, stepped in turns, and their ratios.
     """
     phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01)),))
     model = build_phantom(phantom, seed=0)
@@ -79,21 +96,16 @@ def measure(steps: int = 3000) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = build_fmu(phantom, 0, Path(folder) / "abdomen.fmu", 3, [native()], RADIUS_M, model)
         figures["fmpy_us_p50"], figures["fmpy_us_p99"] = _by_fmpy(path, position, velocity)
+        still = phantom.model_copy(update={"stiffness": Stiffness(stiffening_per_m=0.0)})
+        linear_path = build_fmu(still, 0, Path(folder) / "linear.fmu", 3, [native()], RADIUS_M, build_phantom(still, seed=0))
         with FmuInstance(path) as fmu:
-            motion = fmu.port(["indenter_position", "indenter_velocity"])
-            wrench = fmu.port(["contact_force", "contact_torque"])
+            figures["ctypes_us_p50"], figures["ctypes_us_p99"] = _time(_stepping(fmu, position, velocity), steps)
             surface = fmu.port(["surface_displacement"])
-
-            def step(k: int) -> None:
-                motion["indenter_position"][:] = position[k]
-                motion["indenter_velocity"][:] = velocity[k]
-                motion.push()
-                fmu.step(k * STEP_S, STEP_S)
-                wrench.pull()
-
-            figures["ctypes_us_p50"], figures["ctypes_us_p99"] = _time(step, steps)
             figures["surface_us_p50"] = _time(lambda _: surface.pull(), 200)[0]
             figures["contacts"] = float(fmu.get("contacts"))
+        with FmuInstance(linear_path) as linear, FmuInstance(path) as stiffening:
+            ways = [_stepping(body, position, velocity) for body in (linear, stiffening)]
+            figures |= compared(in_turns(ways, steps), ("linear", "stiffening"))
     return figures
 
 

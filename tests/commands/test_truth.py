@@ -101,6 +101,23 @@ def test_of_a_pair_each_is_removed_alone(tmp_path: Path) -> None:
     assert found.alone[0][there] == pytest.approx(single.force[same], rel=1e-6)
 
 
+def test_guarding_is_felt_where_the_muscle_is_and_is_no_lump(tmp_path: Path) -> None:
+    """A lump lies on the other side: what the muscle does and what the lump does are told apart."""
+    muscle = (-0.03, 0.0)
+    guarding = f"{{centre_m: {list(muscle)}, radii_m: [0.03, 0.03], ratio: 2.6, kind: involuntary}}"
+    scenario = load_scenario("clean", [REGION, f"phantom.guarding=[{guarding}]"])
+    lump = LESION.model_copy(update={"centre_m": (0.03, 0.0), "radii_m": (0.01, 0.01)})
+    scenario = scenario.model_copy(update={"phantom": scenario.phantom.model_copy(update={"lesions": (lump,)})})
+    found, what = felt(scenario)
+    at = found.places[:, :2]
+    within, beyond = np.linalg.norm(at - muscle, axis=1) < 0.005, at[:, 0] > 0.02
+    contrast = found.force / found.relaxed
+    assert contrast[within].min() > 1.5
+    assert contrast[beyond].max() < 1.3
+    assert what.inside(what.guarded, np.array([muscle, lump.centre_m])).tolist() == [True, False]
+    assert what.in_lump(np.array([muscle, lump.centre_m])).tolist() == [False, True]
+
+
 def test_a_lump_that_is_hardly_stiffer_is_not_palpable(tmp_path: Path) -> None:
     _, what = felt(flat(tmp_path, LESION.model_copy(update={"contrast": 1.04})))
     (lump,) = what.lumps

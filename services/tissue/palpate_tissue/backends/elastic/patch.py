@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate_models.frames import Array
 from palpate_tissue.backends.elastic.contact import ContactSolver
-from palpate_tissue.backends.elastic.springs import Springs
+from palpate_tissue.backends.elastic.springs import Springs, resistance
 from palpate_tissue.friction import Push
 from palpate_tissue.near import RIM, Near
 
@@ -112,13 +112,13 @@ class SprungPatch(ElasticPatch):
         self._columns = np.ascontiguousarray(self._softened[:, within])
         super().__init__(near, breathing, state, np.ascontiguousarray(self._columns[within]))
         self.vertex, self.within, self.deepest = vertex, within, deepest
-        self._springs = springs
+        self._springs, self._table = springs, springs.table()
 
     def step(self, w: Array, advance: Array, feed: Array, activation: float) -> bool:
         """See `ElasticPatch`."""
         free = advance @ self.state
         u, d = self.state[0], self._lag
-        opposing = self._springs.force(u, activation) + d * (free[0] - u)  # q if nothing but M moved the vertices
+        opposing = resistance(self._table, u, activation) + d * (free[0] - u)  # q if nothing but M moved the vertices
         yielded = self._softened @ opposing
         self.force, _ = self.solver.solve(w - (free[0] - yielded)[self.within])
         moved = self._columns @ self.force - yielded

@@ -29,14 +29,17 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
 from palpate_tissue.backends.elastic.patch import ElasticPatch, SprungPatch
-from palpate_tissue.backends.elastic.springs import Springs
+from palpate_tissue.backends.elastic.springs import MUSCLE, Springs
 from palpate_tissue.friction import Sphere, rub
 from palpate_tissue.near import Search
 
 _MARGIN_M = 0.0025
 """The vertices near the sphere are searched anew when it has moved this far."""
-_BESIDE_M = 0.025
-"""Springs act on the vertices under the sphere and this far beside it: what lies further adds less than 1 % to the force."""
+_BESIDE_M = 0.005
+"""Springs act on the vertices under the sphere and this far beside it: the stiffening of what lies further, where the skin
+sinks in less and its wall is hardly stiffer than at rest, adds less than 1 % to the force."""
+_BESIDE_MUSCLE_M = 0.025
+"""The same where there is muscle, which resists however little it is pressed in."""
 _DEEPER_M = 0.005
 """How much deeper than now the skin may be pressed before the vertices near the sphere are searched anew."""
 PRESS_STEP_S = 0.02
@@ -86,9 +89,10 @@ class ElasticTissue(TissueBackend):
         free = compliance.free
         self._breathing = model.breathing[free]
         self._springs = Springs(
-            compliance.young / YOUNG_OVER_K_W * model.areas[free], model.stiffening[free], model.tension[free]
+            compliance.young / YOUNG_OVER_K_W * model.areas[free], model.stiffening[free], MUSCLE * model.tension[free]
         )
         self._resists = bool(model.stiffening.any() or model.tension.any())
+        self._beside = _BESIDE_MUSCLE_M if model.tension.any() else _BESIDE_M
         self._search = Search(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M)
         self._state = np.zeros((len(self._feed), len(free)))
         """u and y_k of the free vertices as they were `_behind` steps ago."""
@@ -174,7 +178,7 @@ class ElasticTissue(TissueBackend):
         old = self._patch
         deepest = float(old.state[0].max(initial=0.0)) if old is not None else 0.0
         near = self._search.around(p, radius, deepest)
-        index = self._search.around(p, radius + _BESIDE_M, deepest).vertex if self._resists else near.vertex
+        index = self._search.around(p, radius + self._beside, deepest).vertex if self._resists else near.vertex
         state = self._state[:, index].copy()
         local = self._feed[0] * self.compliance.matrix[np.ix_(index, index)].astype(np.float64)
         breathing = self._breathing[near.vertex]
