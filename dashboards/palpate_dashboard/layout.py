@@ -39,9 +39,13 @@ def _scene() -> Any:
     )
 
 
+BESIDE_M = 0.08
+"""What a map's view shows beside the region [m]: the map's margin on both sides, and the legend, whose size is fixed."""
+
+
 def _map(layer: str, name: str, region_m: tuple[float, float], centre_m: tuple[float, float]) -> Any:
     x, y = centre_m[0] + 0.025, centre_m[1]
-    distance = 1.3 * max(region_m)
+    distance = 0.93 * (max(region_m) + BESIDE_M)
     return rrb.Spatial3DView(
         name=name,
         origin=f"/map/{layer}",

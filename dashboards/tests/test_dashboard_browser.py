@@ -61,8 +61,8 @@ def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
     pytest.fail(f"nothing listens at {port} after {PATIENCE_S} s")
 
 
-def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> None:
-    """Opens the page in a headless browser until each colour fills its share: (colour, reach of hue [deg], share)."""
+def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> np.ndarray:
+    """The page in a headless browser, once each colour fills its share: (colour, reach of hue [deg], share)."""
     pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
     if not any(map(shutil.which, BROWSERS)):
         pytest.skip(f"SKIPPED for want of a browser: none of {', '.join(BROWSERS)} is on the PATH")
@@ -73,7 +73,7 @@ def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> N
             image = look(page)
             seen = {name: share(image, color, reach) for name, (color, reach, _) in wanted.items()}
             if all(seen[name] > least for name, (_, _, least) in wanted.items()):
-                return
+                return image
     pytest.fail(f"not drawn within {PATIENCE_S} s: {seen}")
 
 
@@ -95,7 +95,8 @@ def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
     for t, new in run(6.0, Scenario().robot):  # all of it before the viewer joins
         inbox.put(t, new)
         service.step(t, inbox)
-    look_for(port, SCENE | CURVE | {"outline": (palette.TRUTH, 6, 0.0002)})
+    image = look_for(port, SCENE | CURVE)
+    assert share(image, palette.TRUTH, 6) < 0.0002  # nothing of the truth is drawn until it is asked for
     service.finish()
 
 
