@@ -42,9 +42,11 @@ BREATHING_S = 1.0
 """How long what following leaves of breathing stays alike."""
 LEAST_DEPTH_ERROR_M = 0.0001
 """Prior median of the depth's errors for strokes that claim to have none."""
-SURFACE_M, SURFACE_SHARE, COMMON_SHARE = 0.05, 0.5, 0.4
-"""Length of the error that strokes share smoothly, its part of the depth's uncertainty, and the part of the error that all
-share: a scan cannot tell either from stiffness."""
+SURFACE_M, SURFACE_SHARE = 0.025, 1.0
+"""Length of the error that strokes share smoothly, as touches some 70 mm apart leave it, and its part of the depth's uncertainty:
+a scan cannot tell it from stiffness."""
+SLIDE_SD = 0.015
+"""How much a slide may feel of a place otherwise than a press does, beside what it does everywhere, in the logarithm."""
 UNLIKE = 0.1
 """How much a press may feel of a lump otherwise than a slide does, of its log-contrast."""
 TARE_N = 0.05
@@ -115,7 +117,7 @@ def errors(o: Observations) -> list[Array]:
 def fixed(o: Observations, calibration: Calibration) -> Array:
     """Covariance of what a scan cannot tell about itself: level, exponent, surface, sensor; shape (m, m)."""
     lever = np.outer(o.per_metre, o.per_metre)
-    surface = (SURFACE_SHARE * o.depth_uncertainty) ** 2 * lever * _smooth(o.xy, o.xy, SURFACE_M)
+    surface = SURFACE_SHARE**2 * np.outer(o.depth_uncertainty, o.depth_uncertainty) * lever * _smooth(o.xy, o.xy, SURFACE_M)
     covariance = LEVEL_SD**2 + calibration.exponent_sd**2 * np.outer(o.log_depth, o.log_depth) + surface
     covariance += TARE_N**2 * np.outer(o.per_newton, o.per_newton) * o.same_stroke
     covariance[np.diag_indices(len(o.y))] += o.noise**2
@@ -124,7 +126,7 @@ def fixed(o: Observations, calibration: Calibration) -> Array:
 
 def _medians(o: Observations) -> tuple[Array, Array]:
     """Prior of the log-amplitudes: medians' logarithms and standard deviations."""
-    depth = max(o.depth_uncertainty, LEAST_DEPTH_ERROR_M)
+    depth = max(0.5 * float(np.median(o.depth_uncertainty)), LEAST_DEPTH_ERROR_M)
     fields = len(LENGTHS_M) + 1
     medians = [NATURAL_SD] * fields + [BONE_SD, depth, depth, WHITE_SD]
     return np.log(medians), np.array([_SURE] * fields + [_UNSURE] * 4)
@@ -210,8 +212,7 @@ class Regression:
         variances = np.exp(2 * self.log_amplitudes[: len(LENGTHS_M) + 2])
         prior = LEVEL_SD**2 + variances[:-1].sum() + variances[-1] * bone(xy) ** 2
         prior = prior + sum((LUMP_SD * lump(xy)) ** 2 + (LUMP_FREE_SD * lump(xy, 2 * EDGE_M)) ** 2 for lump in self.lumps)
-        variance = np.maximum(prior - (seen**2).sum(axis=0), 1e-8) + self.calibration.conversion_sd**2
-        variance += (COMMON_SHARE * o.depth_uncertainty * float(np.median(o.per_metre))) ** 2
+        variance = np.maximum(prior - (seen**2).sum(axis=0), 1e-8) + self.calibration.conversion_sd**2 + SLIDE_SD**2
         if self.lumps:
             variance += (UNLIKE * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2
         return self.level + self.whitened @ seen, np.sqrt(variance)

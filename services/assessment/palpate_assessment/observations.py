@@ -40,8 +40,8 @@ class Observations:
     must not explain itself."""
     noise: Array
     """Standard deviation of the force's white noise, over the force [1]."""
-    depth_uncertainty: float
-    """One sigma of the depth, the median of what the samples say [m]."""
+    depth_uncertainty: Array
+    """One sigma of the depth, as the examination tells it [m], shape (m,)."""
     limited: NDArray[np.bool_]
     """Whether depth yielded to the force limit."""
 
@@ -54,7 +54,7 @@ class Observations:
         """Some of the samples."""
         arrays = {name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray) and value.ndim < 3}
         arrays.pop("same_stroke", None)
-        return Observations(**arrays, depth_uncertainty=self.depth_uncertainty)
+        return Observations(**arrays)
 
 
 def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observations | None:
@@ -75,6 +75,6 @@ def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observa
         per_metre=calibration.exponent / depth,
         per_newton=np.array([1.0 / usual[int(one)] for one in stroke]),
         noise=np.array([s.force_noise for s in good]) / force,
-        depth_uncertainty=float(np.median([s.depth_uncertainty for s in good])),
+        depth_uncertainty=np.array([s.depth_uncertainty for s in good]),
         limited=np.array([s.force_limited for s in good]),
     )

@@ -1,18 +1,23 @@
 """How wrong the perceived surface is, learned from touches: a Gaussian process over the abdomen's xy plane.
 
 The surface lies c(x) outward of where the camera saw it. Camera and arm agree to centimetres, yet what is wrong is smooth: an
-offset, a tilt, and a field that varies over a few centimetres,
+offset, a tilt, a field that varies over several centimetres and one that varies over two,
 
-    k(x, x') = OFFSET_M^2 + TILT_RAD^2 x.x' + FIELD_M^2 exp(-|x - x'|^2 / (2 FIELD_LENGTH_M^2)).
+    k(x, x') = OFFSET_M^2 + TILT_RAD^2 x.x' + a^2 [FIELD_M^2 g(x - x'; FIELD_LENGTH_M) + FINE_M^2 g(x - x'; FINE_LENGTH_M)],
+    g(d; l) = exp(-|d|^2 / (2 l^2)).
 
 Each touch measures c at its place with an error of its own, and from n of them (Rasmussen and Williams 2006, eq. 2.25 and 2.26)
 
     c(x) = k(x)^T (K + S)^-1 y,     var c(x) = k(x, x) - k(x)^T (K + S)^-1 k(x).
+
+How rough the error is, a, is the touches' to tell: of a few values the one that makes them most probable, given a prior about 1
+(their eq. 2.30). A camera without error leaves a small a, and a surface that is known within what a touch gets wrong.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -23,10 +28,15 @@ OFFSET_M = 0.012
 """Standard deviations before any touch, after `docs/errors.md`: camera and its calibration, arm and warming up together [C];"""
 TILT_RAD = 0.010
 """hand-eye and arm about two axes [C];"""
-FIELD_M = 0.002
-"""the camera's bias field and wander [A],"""
-FIELD_LENGTH_M = 0.050
-"""which a bias field varies over [A]."""
+FIELD_M, FIELD_LENGTH_M = 0.0012, 0.080
+"""the camera's bias field, 3 mm where it is largest, and what it varies over [C];"""
+FINE_M, FINE_LENGTH_M = 0.0008, 0.022
+"""the camera's wander, which outlasts the frames that are fused, and its width in the image, seen from 1 m, as the fit of the
+surface leaves it [C]."""
+ROUGHNESSES = 2.0 ** np.arange(-5, 2)
+"""What a may be, ..."""
+ROUGHNESS_SD = 0.5
+"""... and the standard deviation of its logarithm about 0 [A]."""
 
 
 class SurfaceCorrection:
@@ -34,31 +44,56 @@ class SurfaceCorrection:
 
     def __init__(self) -> None:
         self._places = np.empty((0, 2))
-        self._heights, self._variances, self._weights = np.empty(0), np.empty(0), np.empty(0)
-        self._precision: Array = np.empty((0, 0))
-        """(K + S)^-1 [1/m^2]: places are asked about at every step, and touched seldom."""
+        self._heights, self._variances = np.empty(0), np.empty(0)
+        self._fit = _Fit(1.0, np.empty((0, 0)), np.empty(0), 0.0)
+
+    @property
+    def roughness(self) -> float:
+        """How rough the error is, over what it is expected to be: a."""
+        return self._fit.roughness
 
     def touch(self, xy_A: Array, height: float, sigma: float) -> None:
         """The surface was felt at `xy_A`, shape (2,), `height` [m] outward of where it was perceived, within `sigma` [m]."""
         self._places = np.vstack((self._places, xy_A))
         self._heights = np.append(self._heights, height)
         self._variances = np.append(self._variances, sigma**2)
-        factor = cho_factor(_covariance(self._places, self._places) + np.diag(self._variances), lower=True)
-        self._weights = cho_solve(factor, self._heights)
-        self._precision = cho_solve(factor, np.eye(len(self._heights)))
+        fits = (_fit(float(a), self._places, self._heights, self._variances) for a in ROUGHNESSES)
+        self._fit = max(fits, key=lambda fit: fit.log_probability)
 
     def height(self, xy_A: Array) -> float:
         """C [m] at a place, shape (2,)."""
-        return float(_covariance(xy_A, self._places) @ self._weights)
+        return float(_covariance(xy_A, self._places, self._fit.roughness) @ self._fit.weights)
 
     def sigma(self, xy_A: Array) -> float:
         """Standard deviation of c [m] at a place, shape (2,)."""
-        prior = OFFSET_M**2 + TILT_RAD**2 * float(xy_A @ xy_A) + FIELD_M**2
-        k = _covariance(xy_A, self._places)
-        return math.sqrt(max(prior - float(k @ self._precision @ k), 0.0))
+        prior = OFFSET_M**2 + TILT_RAD**2 * float(xy_A @ xy_A) + self._fit.roughness**2 * (FIELD_M**2 + FINE_M**2)
+        k = _covariance(xy_A, self._places, self._fit.roughness)
+        return math.sqrt(max(prior - float(k @ self._fit.precision @ k), 0.0))
 
 
-def _covariance(a: Array, b: Array) -> Array:
+class _Fit(NamedTuple):
+    """The process given the touches, for one roughness."""
+
+    roughness: float
+    precision: Array
+    """(K + S)^-1 [1/m^2]: places are asked about at every step, and touched seldom."""
+    weights: Array
+    """(K + S)^-1 y [1/m]."""
+    log_probability: float
+    """Of the touches and the roughness, but for a constant."""
+
+
+def _fit(roughness: float, places: Array, heights: Array, variances: Array) -> _Fit:
+    """The process given touches at places (n, 2) of heights (n,) [m], known within variances (n,) [m^2]."""
+    factor = cho_factor(_covariance(places, places, roughness) + np.diag(variances), lower=True)
+    weights = cho_solve(factor, heights)
+    prior = -0.5 * (math.log(roughness) / ROUGHNESS_SD) ** 2
+    evidence = -0.5 * float(heights @ weights) - float(np.log(np.diag(factor[0])).sum())
+    return _Fit(roughness, cho_solve(factor, np.eye(len(heights))), weights, prior + evidence)
+
+
+def _covariance(a: Array, b: Array, roughness: float) -> Array:
     """The covariance of places a, shape (..., 2), with places b, shape (n, 2): shape (..., n)."""
     apart = ((a[..., None, :] - b) ** 2).sum(axis=-1)
-    return np.asarray(OFFSET_M**2 + TILT_RAD**2 * (a @ b.T) + FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)))
+    field = FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)) + FINE_M**2 * np.exp(-apart / (2 * FINE_LENGTH_M**2))
+    return np.asarray(OFFSET_M**2 + TILT_RAD**2 * (a @ b.T) + roughness**2 * field)
