@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_planning.surface_correction import FIELD_M, OFFSET_M, SurfaceCorrection
+from palpate_planning.surface_correction import (
+    FIELD_LENGTH_M,
+    FIELD_M,
+    FINE_LENGTH_M,
+    FINE_M,
+    OFFSET_M,
+    TILT_RAD,
+    SurfaceCorrection,
+)
 
 PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
 BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])
@@ -19,7 +27,7 @@ def tilted(xy: np.ndarray) -> np.ndarray:
 def test_untouched_it_is_nothing_and_unsure() -> None:
     correction = SurfaceCorrection()
     assert correction.height(np.zeros(2)) == 0.0
-    assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(OFFSET_M, FIELD_M))
+    assert correction.sigma(np.zeros(2)) == pytest.approx(np.sqrt(OFFSET_M**2 + FIELD_M**2 + FINE_M**2))
 
 
 def test_offset_and_tilt_are_found_in_between() -> None:
@@ -44,7 +52,8 @@ def test_its_errors_are_as_large_as_it_says() -> None:
     rng = np.random.default_rng(3)
     everywhere = np.vstack((PLACES, BETWEEN))
     apart = np.sum((everywhere[:, None] - everywhere) ** 2, axis=-1)
-    covariance = OFFSET_M**2 + 0.010**2 * everywhere @ everywhere.T + FIELD_M**2 * np.exp(-apart / (2 * 0.05**2))
+    covariance = OFFSET_M**2 + TILT_RAD**2 * everywhere @ everywhere.T
+    covariance += FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)) + FINE_M**2 * np.exp(-apart / (2 * FINE_LENGTH_M**2))
     scores = []
     for _ in range(50):
         truth = rng.multivariate_normal(np.zeros(len(everywhere)), covariance)
@@ -53,3 +62,16 @@ def test_its_errors_are_as_large_as_it_says() -> None:
             correction.touch(place, float(height + 4e-4 * rng.standard_normal()), 4e-4)
         scores += [(correction.height(p) - h) / correction.sigma(p) for p, h in zip(BETWEEN, truth[len(PLACES) :], strict=True)]
     assert np.std(scores) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("rough_m", "most_m", "roughness"), [(0.0, 0.3e-3, (0.0, 0.3)), (1.2e-3, 1.5e-3, (0.5, 2.0))])
+def test_touches_tell_how_rough_the_error_is(rough_m: float, most_m: float, roughness: tuple[float, float]) -> None:
+    """25 touches: a surface that they agree about is known within what a touch gets wrong, another one is not."""
+    rng = np.random.default_rng(5)
+    places = np.array([(x, y) for x in np.linspace(-0.09, 0.09, 5) for y in np.linspace(-0.09, 0.09, 5)])
+    correction = SurfaceCorrection()
+    for place in places:
+        height = tilted(place) + rough_m * rng.standard_normal() + 2e-4 * rng.standard_normal()
+        correction.touch(place, float(height), 2.5e-4)
+    assert roughness[0] <= correction.roughness <= roughness[1]
+    assert correction.sigma(np.array((0.02, 0.02))) < most_m
