@@ -1,6 +1,9 @@
-# `make run` and `make test` do all the set-up they need: Python 3.11 to 3.13 with venv is enough. PYTHON=... says which.
+# `make run` and `make test` do all the set-up they need: Python 3.11 to 3.13 with venv is enough. PYTHON=... says which. `make run`
+# installs what the default examination needs; everything else installs all of it, and the tools of the workspace.
 VENV := .venv
 BIN := $(VENV)/bin
+# What pip says of packages that are there already is of no use to anybody.
+PIP = $(BIN)/python -m pip install --disable-pip-version-check --progress-bar on -c constraints.txt
 PYTHON ?= python3
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
@@ -8,9 +11,9 @@ export PYTHONHASHSEED := 0
 # Two processes share the tests out; what belongs together, tests/conftest.py says.
 TWO_WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: run test test-slow test-docker test-browser lint format bench docs install clean
+.PHONY: run test test-slow test-docker test-browser lint format bench docs install venv clean
 
-run: install  ## the default examination, as processes on this machine
+run: $(VENV)/.examines  ## the default examination, as processes on this machine
 	$(BIN)/palpate run $(ARGS)
 
 test: install  ## everything but the slow, Docker, browser and page tests; whole examinations (tests/test_gate.py) too
@@ -53,12 +56,23 @@ docs: install  ## the pages that are made from contract, tables and models; then
 
 install: $(VENV)/.installed
 
+# Where all is installed, what the examination needs is, too.
+$(VENV)/.examines: pyproject.toml constraints.txt $(wildcard $(VENV)/.installed)
+	@test -e $(VENV)/.installed || { $(MAKE) --no-print-directory venv && \
+	echo "installing what an examination needs, about 1.5 GB; the dashboard by: $(BIN)/pip install -c constraints.txt -e '.[dashboard]'" && \
+	$(PIP) -e '.[run]'; }
+	@touch $@
+
 $(VENV)/.installed: pyproject.toml constraints.txt requirements-dev.txt
+	@$(MAKE) --no-print-directory venv
+	@echo "installing all implementations and the tools of the workspace, about 3.5 GB"
+	@$(PIP) -r requirements-dev.txt -e '.[all]'
+	@touch $@
+
+venv:
 	@test -x $(BIN)/python || $(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
 	{ echo "Palpate needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version 2>&1). Name another: make PYTHON=python3.12"; exit 1; }
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-dev.txt -e .[all]
-	touch $@
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 
 clean:
 	rm -rf $(VENV) out

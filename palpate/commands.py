@@ -59,6 +59,17 @@ GROUPS = {
     },
 }
 """The words of the commands by what they are for, and where each is: a function, or a Typer app of several commands."""
+EXTRAS = {
+    "dashboard": "dashboard",
+    "fmu": "fmu",
+    "study": "study",
+    "validate": "benchmarks",
+    "reproduce": "benchmarks",
+    "bench": "benchmarks",
+    "faults": "benchmarks",
+    "fuzz": "fuzz",
+}
+"""What installs the libraries of a command that the default examination does not need."""
 COMMANDS = {word: where for group in GROUPS.values() for word, where in group.items()}
 
 
@@ -113,7 +124,8 @@ def _add(app: typer.Typer, word: str) -> None:
     try:
         command = getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
-        print(f"palpate: the command {word} needs the module {error.name}; pip install 'palpate[all]'", file=sys.stderr)
+        extra = EXTRAS.get(word, "run")
+        print(f"palpate: the command {word} needs the module {error.name}; pip install 'palpate[{extra}]'", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
     except ValueError as error:  # a contract of one's own that cannot be used
         print(f"palpate: {error}", file=sys.stderr)

@@ -27,6 +27,7 @@ EXTRA_OF = {
     "palpate.interface": "library",
     "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
+    "palpate.live.dashboard": "all",  # the command line on what the dashboard draws
     "palpate.fuzz": "fuzz",
     "palpate.search": "library",
     "palpate.study": "study",

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_camera.backends.kinect.open3d_loader import open3d as o3d
+from palpate_reproduction.open3d_loader import open3d as o3d
 
 Array = NDArray[np.floating[Any]]
 LAMP = np.array((0.45, -0.55, 1.0)) / np.linalg.norm((0.45, -0.55, 1.0))

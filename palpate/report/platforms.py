@@ -14,7 +14,6 @@ PACKAGES = (
     "dartpy",
     "pin",
     "coal",
-    "open3d-cpu",
     "casadi",
     "ompl",
     "ruckig",

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 
 from palpate.command_line import fail, refuse, say
 from palpate.environment import given
@@ -22,10 +23,10 @@ from palpate.run.placement import Groups, PlacementError, placement
 from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
-from palpate.run.roles import NONE, OBSERVERS, workers, write_scenario_files
+from palpate.run.roles import NONE, OBSERVERS, choice, workers, write_scenario_files
 from palpate.run.secure import SecureBus
 from palpate.run.space import WatchedRoom, another_folder, check_room, megabytes_of, what_it_takes
-from palpate_bus.implementations import ChoiceError
+from palpate_bus.implementations import ChoiceError, check_libraries
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.zenoh_config import close_session, open_session
@@ -60,10 +61,19 @@ class How:
     quiet: bool
     as_json: bool
 
-    @property
-    def observers(self) -> tuple[str, ...]:
-        """Recorder and dashboard, unless nothing is recorded."""
-        return OBSERVERS if self.record != "none" else ()
+
+def _observers(scenario: Scenario, how: How, console: Console) -> tuple[str, ...]:
+    """Recorder and dashboard, unless nothing is recorded; the dashboard only where its libraries are."""
+    if how.record == "none":
+        return ()
+    try:
+        check_libraries("dashboard", choice(scenario, "dashboard"))
+    except ChoiceError as error:
+        console.print(
+            f"[dim]without a drawing of the run, recording.rrd: {escape(str(error))}[/]", highlight=False, soft_wrap=True
+        )
+        return tuple(role for role in OBSERVERS if role != "dashboard")
+    return OBSERVERS
 
 
 def examine(scenario: Scenario, how: How) -> None:
@@ -73,7 +83,8 @@ def examine(scenario: Scenario, how: How) -> None:
     _refuse_contradictions(scenario, how)
     try:
         absent = Absent(how.without, how.wait_s, partial(console.print, highlight=False, soft_wrap=True))
-        groups = placement((*workers(scenario), *how.observers), how.group, how.processes)
+        observers = _observers(scenario, how, Console(stderr=True, quiet=quiet))
+        groups = placement((*workers(scenario), *observers), how.group, how.processes)
     except (PlaceError, PlacementError) as error:
         refuse(error)
     folder = how.out or usual_folder(scenario.name)
@@ -87,7 +98,7 @@ def examine(scenario: Scenario, how: How) -> None:
             check_room(folder, scenario.exam, how.record)
             with RunDisplay(console, quiet) as display, given({"PALPATE_RECORD": how.record}):
                 tell = WatchedRoom(folder, display.tell, say).tell
-                result = _run(scenario, folder.resolve(), tell, how, absent, groups)
+                result = _run(scenario, folder.resolve(), tell, how, observers, absent, groups)
             conclude(console, folder, scenario, result, quiet, how.as_json)
     except (ProcessListError, ChoiceError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
@@ -117,12 +128,14 @@ def _refuse_contradictions(scenario: Scenario, how: How) -> None:
             refuse(why)
 
 
-def _run(scenario: Scenario, folder: Path, tell: Tell, how: How, absent: Absent, groups: Groups) -> RunResult:
+def _run(
+    scenario: Scenario, folder: Path, tell: Tell, how: How, observers: tuple[str, ...], absent: Absent, groups: Groups
+) -> RunResult:
     if how.composed:
-        return run_composed(scenario, folder, tell, how.observers)
+        return run_composed(scenario, folder, tell, observers)
     timing = Timing(how.wallclock, 1.0 if how.realtime else None, handover_s=how.handover_s)
     with SecureBus(how.keys) if how.secure else nullcontext() as bus:
-        return run_distributed(scenario, folder, tell, how.observers, timing, bus, absent, groups)
+        return run_distributed(scenario, folder, tell, observers, timing, bus, absent, groups)
 
 
 def conclude(

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import version
 
+import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
+from palpate import commands
 from palpate.commands import COMMANDS, app_for
+from palpate.run import examine
+from palpate_bus.implementations import ChoiceError
+from palpate_models.load import load_scenario
 
 
 def names(word: str) -> set[str]:
@@ -40,6 +47,33 @@ def test_the_help_of_the_command_that_examines_does_not_wait_for_what_examines()
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_command_that_lacks_its_libraries_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named {name}", name="fmpy")
+
+    monkeypatch.setattr(commands, "import_module", absent)
+    with pytest.raises(SystemExit), pytest.MonkeyPatch.context() as patch:
+        said: list[str] = []
+        patch.setattr("builtins.print", lambda text, **_: said.append(text))
+        app_for("fmu")
+    assert said == ["palpate: the command fmu needs the module fmpy; pip install 'palpate[fmu]'"]
+
+
+def test_a_run_does_without_the_dashboard_where_its_libraries_are_not(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lacking(role: str, choice: str) -> None:
+        raise ChoiceError(f"services.{role} = {choice!r}: the module rerun is not installed; pip install 'palpate[dashboard]'")
+
+    how = examine.How(None, False, True, (), None, False, False, 0.0, (), 1.0, "normal", False, None, False, False)
+    console = Console(stderr=True)
+    assert examine._observers(load_scenario("clean"), how, console) == ("dashboard", "recorder")
+    monkeypatch.setattr(examine, "check_libraries", lacking)
+    assert examine._observers(load_scenario("clean"), how, console) == ("recorder",)
+    assert "pip install 'palpate[dashboard]'" in capsys.readouterr().err
+    assert examine._observers(load_scenario("clean"), replace(how, record="none"), console) == ()
 
 
 def test_the_version_is_that_of_the_package() -> None:

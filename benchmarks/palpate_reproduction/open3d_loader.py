@@ -1,6 +1,6 @@
 """Open3D, with the libusb-1.0 that it links against taken from a wheel, so that no system package is needed.
 
-`from palpate_camera.backends.kinect.open3d_loader import open3d` is the only way in which this package imports Open3D.
+`from palpate_reproduction.open3d_loader import open3d` is the only way in which this package imports Open3D.
 """
 
 from __future__ import annotations
