@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.command_line import fail, refuse, say
+from palpate.command_line import EXIT_FAILED, fail, refuse, say
 from palpate.environment import given
 from palpate.report.page import write_page
-from palpate.report.results import print_findings, write_results
+from palpate.report.results import assemble, print_findings, truth_of_run, write_results
+from palpate.report.rows import Report
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
 from palpate.run.folder import FolderError, results_folder, usual_folder
@@ -143,26 +146,43 @@ def conclude(
 ) -> None:
     """Writes the results, prints the findings, and leaves with status 3 when the run failed or its folder took no results."""
     with nullcontext() if quiet else console.status("writing report and maps"):
-        trouble = ""
-        try:
-            report = write_results(folder, scenario, result)
-            page = write_page(folder)
-        except OSError as error:
-            trouble = f"{folder}: the results cannot be written there ({error.strerror})"
-            folder = another_folder()
-            write_scenario_files(scenario, folder)
-            report = write_results(folder, scenario, result)
-            page = write_page(folder)
+        report, page, trouble = _written(folder, scenario, result)
     if as_json:
         print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
     else:
         print_findings(Console(), report)
-    if not quiet or trouble:
-        console.print(f"to read: {page} ({megabytes_of(folder):.0f} MB in {folder})", highlight=False, soft_wrap=True)
+    if page is not None and (trouble or not quiet):
+        console.print(f"to read: {page} ({megabytes_of(page.parent):.0f} MB in {page.parent})", highlight=False, soft_wrap=True)
+    if trouble:
+        say(trouble)
     if result.failure:
         fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
     if trouble:
-        fail(f"{trouble}; they are in {folder}")
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:
+    """Writes the results into a folder, or into another where that takes none: the report, its page, and what went wrong.
+
+    Where no folder takes them there is no page, and the report is all the same.
+    """
+    try:
+        report = write_results(folder, scenario, result)
+        return report, write_page(folder), ""
+    except OSError as error:
+        trouble = f"{folder}: the results cannot be written there ({error.strerror})"
+    try:
+        other = another_folder()
+        write_scenario_files(scenario, other)
+        report = write_results(other, scenario, result)
+        return report, write_page(other), f"{trouble}; they are in {other}"
+    except OSError as error:
+        report = assemble(scenario, result, truth_of_run(scenario, result.collected))
+        return (
+            report,
+            None,
+            f"{trouble}, nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here",
+        )
 
 
 def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallclock: bool, quiet: bool) -> None:

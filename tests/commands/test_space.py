@@ -76,3 +76,17 @@ def test_what_a_folder_does_not_take_is_written_to_another(
     assert "RLQ" in out
     assert str(other) in err.replace("\n", "")
     assert another_folder() != other
+
+
+def test_findings_are_printed_even_if_no_folder_takes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nor here"))
+    with pytest.raises(typer.Exit) as left:
+        conclude(
+            Console(quiet=True), tmp_path / "gone", load_scenario("clean", SETTINGS, seed=3), result(collected()), quiet=True
+        )
+    assert left.value.exit_code == EXIT_FAILED
+    out, err = capsys.readouterr()
+    assert "RLQ" in out
+    assert "nothing is kept but what is printed here" in err.replace("\n", "")

@@ -32,6 +32,9 @@ _decode_clock = codec.decoder("rosgraph_msgs/msg/Clock")
 class RawRecorder(Protocol):
     """A service that wants every message as bytes."""
 
+    trouble: str
+    """Why it records no more; empty while it does."""
+
     def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
         """Takes one message: its row, CDR bytes, simulated stamp [ns] and sequence number."""
 
@@ -59,6 +62,7 @@ class RecorderNode:
         self._lost: set[str] = set()
         self._messages = 0
         self._garbage = 0
+        self._told = ""
 
     @property
     def covered(self) -> int:
@@ -75,7 +79,7 @@ class RecorderNode:
                     if not busy:
                         self._producers.leave_with_them(self._link.lost)
                         sleep(IDLE_S)
-                    self._reports.progress(self.covered)
+                    self._report()
                 elif message.command == RunControl.HELLO:
                     self._drain()
                     missing = [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.heard]
@@ -99,6 +103,13 @@ class RecorderNode:
             "garbage": self._garbage + sum(chunk.garbage for chunk in self._chunks.values()),
         }
         self._reports.say(ServiceReport.FINISHED, max(self._covered.values()), detail=detail)
+
+    def _report(self) -> None:
+        """Reports progress, and at once, and once, that nothing is recorded any more."""
+        if self._recorder.trouble != self._told:
+            self._told = self._recorder.trouble
+            self._reports.say(ServiceReport.PROGRESS, self.covered, detail={"suspicions": [self._told]})
+        self._reports.progress(self.covered)
 
     def _drain(self) -> bool:
         busy = False

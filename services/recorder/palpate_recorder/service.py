@@ -6,7 +6,10 @@ bytes as they came, so that nothing is decoded and none is skipped.
 
 from __future__ import annotations
 
+import logging
+import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +21,14 @@ from palpate_bus.settings import Settings
 from palpate_models.scenario import Scenario
 from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
 
+log = logging.getLogger(__name__)
+
 FOLDER = "recording_mcap"
 """Name of the rosbag2 folder within the folder of the run."""
+SPARE_BYTES = 10_000_000
+"""With less than this left on the disk the recording ends: report, page and map need it."""
+LOOK_NS = 200_000_000
+"""How often it looks how much is left, in simulated time [ns]."""
 
 
 def channels(rows: Contract, *, full: bool) -> list[Channel]:
@@ -50,19 +59,47 @@ class RecorderService(Service):
         """
         self._bag = BagWriter(folder, channels(contract(), full=full), run=run_of(folder.parent), file_bytes=file_bytes)
         self._names = {topic.name: f"/{topic.name}" for topic, _ in contract().inputs(self.role)}
-        self._unexpected = 0
+        self._unexpected = self._unwritten = 0
+        self._look_at = 0
+        self.trouble = ""
+        """Why nothing is written any more; empty while all is."""
 
     def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
         """Takes one message as it was sent: CDR bytes, simulated time [ns] and sequence number.
 
         The runtime calls it for every message, in any order of topics. A topic that the contract does not give to the
-        recorder is counted and left out.
+        recorder is counted and left out. A disk that has no more room than the report needs ends the recording, never the run.
         """
         name = self._names.get(topic.name)
         if name is None:
             self._unexpected += 1
             return
-        self._bag.write(name, payload, stamp, sequence)
+        if not self.trouble and stamp >= self._look_at:
+            self._look_at = stamp + LOOK_NS
+            self._check_room(stamp)
+        if self.trouble:
+            self._unwritten += 1
+            return
+        try:
+            self._bag.write(name, payload, stamp, sequence)
+        except OSError as error:
+            self._stop(stamp, f"it cannot be written: {error.strerror}")
+
+    def _check_room(self, stamp: int) -> None:
+        try:
+            left = shutil.disk_usage(self._bag.folder).free
+        except OSError as error:
+            self._stop(stamp, f"its folder is lost: {error.strerror}")
+            return
+        if left < SPARE_BYTES:
+            self._stop(stamp, f"{left / 1e6:.0f} MB are left on its disk, which the report needs")
+
+    def _stop(self, stamp: int, why: str) -> None:
+        """Completes the recording as far as it came."""
+        self.trouble = f"recorder: the recording ends at {stamp / 1e9:.3f} s: {why}"
+        log.error("%s", self.trouble)
+        with suppress(OSError):
+            self._bag.close()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Nothing to do: messages come by `record`, and are flushed by their own stamps."""
@@ -70,16 +107,23 @@ class RecorderService(Service):
 
     def finish(self) -> Mapping[str, Any]:
         """Completes the recording; returns what is in it."""
-        self._bag.close()
+        if not self.trouble:
+            try:
+                self._bag.close()
+            except OSError as error:
+                self.trouble = f"recorder: the recording is not completed: {error.strerror}"
+                log.error("%s", self.trouble)
         counts = self._bag.counts
         return {
             "folder": self._bag.folder.name,
             "files": len(self._bag.paths),
-            "file_bytes": sum(path.stat().st_size for path in self._bag.paths),
+            "file_bytes": sum(path.stat().st_size for path in self._bag.paths if path.is_file()),
             "messages": sum(count.messages for count in counts.values()),
             "message_bytes": sum(count.bytes for count in counts.values()),
             "missing": {topic: count.missing for topic, count in counts.items() if count.missing},
             "unexpected": self._unexpected,
+            "unwritten": self._unwritten,
+            "trouble": self.trouble,
             "topics": {topic: count.messages for topic, count in counts.items()},
         }
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+from collections import namedtuple
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -280,3 +283,62 @@ def test_create_reads_the_run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("PALPATE_RECORD_FILE_MB", "0")
     with pytest.raises(ValueError, match="PALPATE_RECORD_FILE_MB is '0'"):
         create(Scenario())
+
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def test_a_disk_that_fills_up_ends_the_recording_whole_and_not_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 9_000_000))
+    service.record(TOPICS["joint_states"], joint_states(1000 * MS), 1000 * MS, 1000)
+    service.record(TOPICS["joint_states"], joint_states(1001 * MS), 1001 * MS, 1001)
+    facts = service.finish()
+    assert facts["trouble"] == "recorder: the recording ends at 1.000 s: 9 MB are left on its disk, which the report needs"
+    assert facts["unwritten"] == 2
+    with Reader(tmp_path / FOLDER) as reader:
+        assert reader.message_count == 1020
+
+
+def test_a_folder_that_is_lost_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 100)
+    shutil.rmtree(tmp_path / FOLDER)
+    service.record(TOPICS["joint_states"], joint_states(300 * MS), 300 * MS, 300)
+    facts = service.finish()
+    assert facts["trouble"] == "recorder: the recording ends at 0.300 s: its folder is lost: No such file or directory"
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 14 MB of its own."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=14m", "tmpfs", folder], capture_output=True, check=False).returncode:
+        pytest.skip("only root can mount a small disk here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_on_a_small_disk_room_is_left_for_the_report(small_disk: Path) -> None:
+    service = RecorderService(small_disk / FOLDER)
+    record(service, 60_000)
+    facts = service.finish()
+    assert "are left on its disk" in facts["trouble"]
+    assert facts["unwritten"] > 0
+    assert shutil.disk_usage(small_disk).free > 5_000_000
+    with Reader(small_disk / FOLDER) as reader:
+        assert reader.message_count == facts["messages"]
+
+
+def test_what_the_disk_does_not_take_ends_the_recording_and_not_the_run(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As above, but it fills up faster than anybody looks."""
+    monkeypatch.setattr("palpate_recorder.service.SPARE_BYTES", 0)
+    service = RecorderService(small_disk / FOLDER)
+    record(service, 10_000)
+    (small_disk / "ballast").write_bytes(bytes(shutil.disk_usage(small_disk).free - 100_000))
+    record(service, 60_000)
+    assert service.finish()["trouble"].endswith("it cannot be written: No space left on device")
