@@ -123,7 +123,6 @@ class Conductor:
         """Passes on, once, what is suspicious about a sender."""
         for sentence in sentences:
             if sentence not in self.outcome.trouble:
-                log.error("%s", sentence)
                 self._tell(sentence)
 
     def _diagnose(self) -> list[Any]:
