@@ -9,17 +9,17 @@ import palpate
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import Trial, search
 from palpate_search.choice import policy
-from palpate_search.presses import Budget
 
 CENTRE = (0.04, -0.03)
-LUMP = {"lesions": [{"centre_m": CENTRE, "radii_m": [0.02, 0.02], "contrast": 6}], "breathing": {"kind": "none"}}
+STILL = {"breathing": {"kind": "none"}}
+LUMP = {"lesions": [{"centre_m": CENTRE, "radii_m": [0.02, 0.02], "contrast": 6}], **STILL}
 
 
 def trial(hand: type[PatientHand] | type[SurrogateHand], lump: bool, presses: int, name: str = "informed") -> Trial:
-    region = {"region_m": [0.14, 0.14]}
-    patient = LUMP if lump else {"breathing": {"kind": "none"}}
+    region = {"region_m": [0.14, 0.14], "budget": {"presses": presses}}
+    patient = LUMP if lump else STILL
     scenario = palpate.scenario("person", seed=3, phantom=patient, exam=region, errors="none")
-    return search(hand(scenario, Budget(presses, 600.0)), policy(name))
+    return search(hand(scenario), policy(name))
 
 
 @pytest.mark.parametrize("hand", [PatientHand, SurrogateHand])
@@ -36,13 +36,12 @@ def test_a_search_is_repeatable_and_keeps_to_its_budget() -> None:
     first, again = (trial(SurrogateHand, True, 8, "upper-confidence-bound") for _ in range(2))
     np.testing.assert_array_equal(first.force, again.force)
     assert len(first.xy) == 8
-    scenario = palpate.scenario("person", seed=3, errors="none", phantom={"breathing": {"kind": "none"}})
-    assert search(SurrogateHand(scenario, Budget(100, 10.0)), policy("raster")).seconds[-2] < 10.0
+    scenario = palpate.scenario("person", seed=3, errors="none", phantom=STILL, exam={"budget": {"seconds": 10.0}})
+    assert search(SurrogateHand(scenario), policy("raster")).seconds[-2] < 10.0
 
 
 def test_a_hand_refuses_what_is_out_of_reach() -> None:
-    scenario = palpate.scenario("person", seed=3, errors="none", phantom={"breathing": {"kind": "none"}})
-    hand = SurrogateHand(scenario, Budget(3, 60.0))
+    hand = SurrogateHand(palpate.scenario("person", seed=3, errors="none", phantom=STILL))
     with pytest.raises(ValueError, match=r"place = .* want one within"):
         hand.press(np.array((0.3, 0.0)), 0.01)
     with pytest.raises(ValueError, match=r"depth = 0.1 m: want more than 0 and at most"):

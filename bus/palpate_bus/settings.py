@@ -112,6 +112,9 @@ class Settings(BaseSettings):
     periods: Annotated[dict[str, int], NoDecode] = Field(
         default={}, description="Other periods of roles [ms] for an experiment, such as `control=5`, separated by commas."
     )
+    absent: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(), description="Optional roles of the contract that do not take part in the run, separated by commas."
+    )
     runs: Path | None = Field(
         default=None,
         description="Folder where runs are announced; by default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`.",
@@ -123,7 +126,7 @@ class Settings(BaseSettings):
     fmu_map: Path | None = Field(default=None, description="The file that ties the FMU's variables to topics.")
     log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = Field(default="INFO", description="What a service logs.")
 
-    @field_validator("listen", "connect", mode="before")
+    @field_validator("listen", "connect", "absent", mode="before")
     @classmethod
     def _endpoints(cls, value: Any) -> Any:
         return _split(value, ",")
@@ -234,7 +237,7 @@ def allowed(name: str) -> str:
     if typing.get_origin(kinds[0]) is dict:
         return "ROLE=MILLISECONDS, ..."
     if typing.get_origin(kinds[0]) is tuple:
-        return "files" if Path in typing.get_args(kinds[0]) else "endpoints"
+        return "roles" if name == "absent" else "files" if Path in typing.get_args(kinds[0]) else "endpoints"
     return "a path" if kinds[0] is Path else "text"
 
 

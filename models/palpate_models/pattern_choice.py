@@ -15,7 +15,8 @@ from pathlib import Path
 from traceback import extract_tb
 from typing import Any, Final
 
-OURS: Final = ("lines", "raster", "snake")
+SEARCH: Final = "search"
+OURS: Final = ("lines", "raster", "snake", SEARCH)
 """Functions of `palpate_models.patterns.lattice`."""
 _GROUP: Final = "palpate.pattern"
 _FUNCTION: Final = "scan"

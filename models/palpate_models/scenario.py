@@ -15,7 +15,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 
 from palpate_models.errors import Errors
 from palpate_models.patient import Phantom
-from palpate_models.pattern_choice import known
+from palpate_models.pattern_choice import SEARCH, known
 from palpate_models.person import drawn
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 
@@ -38,6 +38,24 @@ class Following(StrEnum):
     """It does not follow, as if the patient did not breathe."""
 
 
+class Budget(Section):
+    """How much a search may take."""
+
+    presses: Annotated[int, Field(ge=1, le=1000)] = 60
+    seconds: Annotated[float, Field(gt=0, le=3600)] = 300.0
+    """From its first request on."""
+
+
+class Search(Section):
+    """How a search presses, and when it is over. It takes part where `exam.pattern` is `search`."""
+
+    policy: str = "informed"
+    """What chooses the next press: `informed`, `raster`, `random`, `latin-hypercube`, `expected-improvement`,
+    `upper-confidence-bound`, `straddle`, `garg-2016`, `yan-pan-2021`, or a Python file with `next_press(posterior, budget)`."""
+    missed: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    """It is over when a lump that was not found is less probable than this, or the budget is spent."""
+
+
 class Exam(Section):
     """What is examined, and how."""
 
@@ -47,7 +65,7 @@ class Exam(Section):
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Annotated[str, AfterValidator(known)] = "lines"
     """`lines`: there and back, lifted at each line's end; `raster`: every line from the feet to the head; `snake`: there and
-    back, line ends joined in contact; or a pattern of your own: the path of a Python file that has `scan(exam, surface)`."""
+    back, line ends joined in contact; `search`: presses where the role `search` asks for them; or a pattern of your own: the path of a Python file that has `scan(exam, surface)`."""
     mode: Mode = Mode.CONTINUOUS
     """`continuous`: slides at depth; `point`: presses, holds and lifts at each point."""
     breathing: Following = Following.FOLLOW
@@ -63,8 +81,15 @@ class Exam(Section):
     """Width (x) and height (y) of the examined region about `centre_m`."""
     centre_m: Vec2 = (0.0, 0.0)
     """Centre of the region in the abdomen frame."""
+    budget: Budget = Budget()
+    """Of a search."""
     false_findings: Annotated[float, Field(ge=1e-4, le=0.5)] = 0.02
     """The operating point: how probable a finding may be in a healthy examination. Less of it misses more."""
+
+    @property
+    def searched(self) -> bool:
+        """Whether the role `search` says what is pressed."""
+        return self.pattern == SEARCH
 
 
 class LbrConnection(Section):
@@ -219,6 +244,7 @@ class Services(Section):
     control: str = "default"
     assessment: str = "default"
     supervisor: str = "default"
+    search: str = "default"
     dashboard: str = "default"
     recorder: str = "default"
 
@@ -235,6 +261,7 @@ class Scenario(Section):
     phantom: Phantom = Phantom()
     errors: Errors = Errors()
     exam: Exam = Exam()
+    search: Search = Search()
     robot: Robot = Robot()
     camera: Camera = Camera()
     limits: Limits = Limits()

@@ -7,7 +7,7 @@ from pathlib import Path
 from time import perf_counter
 
 from palpate.environment import given
-from palpate.run.roles import OBSERVERS, WORKERS, choice, kept, write_scenario_files
+from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.collection import rare_collections
@@ -40,7 +40,9 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
-    run = Composed([*load_services(scenario, WORKERS), *viewers, collector], taps=[recorder.record for recorder in recorders])
+    run = Composed(
+        [*load_services(scenario, workers(scenario)), *viewers, collector], taps=[recorder.record for recorder in recorders]
+    )
     start = perf_counter()
     failure = None
     last = 0

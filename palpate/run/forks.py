@@ -16,6 +16,8 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Protocol
 
+from palpate_bus.contract import contract
+
 
 class Child(Protocol):
     """What is asked of a service's process, as of `subprocess.Popen`."""
@@ -93,6 +95,7 @@ def _become(words: Sequence[str], environment: Mapping[str, str], log: str) -> N
     os.setpgid(0, 0)
     os.environ.clear()
     os.environ.update(environment)
+    contract.cache_clear()  # the fork server may have read it for another run
     with Path(log).open("wb") as file:
         os.dup2(file.fileno(), sys.stdout.fileno())
         os.dup2(file.fileno(), sys.stderr.fileno())

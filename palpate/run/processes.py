@@ -156,7 +156,9 @@ class LocalProcesses:
         `record` says what the run's recorder keeps; `forks` starts the processes in place of a fresh interpreter each.
         """
         settings = Settings.read()
-        self._given: dict[str, Any] = {"runtime": timing.runtime, "record": record}
+        taking_part = {role for group in groups for role in group}
+        absent = tuple(name for name, role in contract().roles.items() if role.optional and name not in taking_part)
+        self._given: dict[str, Any] = {"runtime": timing.runtime, "record": record, "absent": absent}
         self._forks = forks
         self._out = out
         remove_leftovers()

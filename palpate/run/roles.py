@@ -14,9 +14,11 @@ from palpate_bus.runs.run_name import name_run
 from palpate_bus.settings import Settings
 from palpate_models.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario import Scenario, Services
+from palpate_search.choice import PolicyError, findable
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
-WORKERS = tuple(name for name, role in _ROLES.items() if not role.observer)
+WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or role.optional))
+"""The roles of every examination."""
 OBSERVERS = tuple(name for name, role in _ROLES.items() if role.observer)
 NONE = "none"
 """`services.tissue: none`: nothing plays the tissue, since what is examined is real."""
@@ -25,8 +27,9 @@ RESULTS = ("report.json", "report.html", "map.png", "samples.csv", "evidence.npz
 
 
 def workers(scenario: Scenario) -> tuple[str, ...]:
-    """The roles that a run of this scenario cannot do without: all, except for the tissue where what is examined is real."""
-    return tuple(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE)
+    """The roles that a run of this scenario cannot do without: the search where one is made, no tissue where it is real."""
+    searching = ("search",) if scenario.exam.searched else ()
+    return (*(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE), *searching)
 
 
 def kept(observers: Sequence[str]) -> Record:
@@ -63,7 +66,7 @@ def checked(scenario: Scenario) -> Scenario:
         if role not in _ROLES:
             raise ChoiceError(f"{scenario.name}: services.{role}: the contract has no such role; it has {', '.join(_ROLES)}")
     for role, name in services.items():
-        if (role, name) == ("tissue", NONE):
+        if (role, name) == ("tissue", NONE) or (name == "default" and _ROLES[role].optional and role not in workers(scenario)):
             continue
         try:
             implementations.check(role, name)
@@ -71,7 +74,13 @@ def checked(scenario: Scenario) -> Scenario:
             raise ChoiceError(f"{scenario.name}: {error}") from error
         if implementations.is_file(name):
             services[role] = str(Path(name).resolve())
-    return scenario.model_copy(update={"services": Services.model_validate(services)})
+    search = scenario.search
+    if scenario.exam.searched:
+        try:
+            search = search.model_copy(update={"policy": findable(search.policy)})
+        except PolicyError as error:
+            raise ChoiceError(f"{scenario.name}: {error}") from error
+    return scenario.model_copy(update={"services": Services.model_validate(services), "search": search})
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
@@ -86,4 +95,4 @@ def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
     for view in HIDDEN:
         text = dump_scenario(scenario, view)
         (out / f"{view}.yaml").write_text(named + text if view == "scenario" else text, encoding="utf-8")
-    return {role: out / f"{view_of(role)}.yaml" for role in (*WORKERS, *OBSERVERS)}
+    return {role: out / f"{view_of(role)}.yaml" for role in _ROLES}

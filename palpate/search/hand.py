@@ -19,7 +19,7 @@ from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import Scenario
 from palpate_models.seeds import generator
-from palpate_search.presses import Budget, Press, Task, seconds
+from palpate_search.presses import Press, Task, seconds
 
 DESCENT_MPS: Final = 0.030
 HOLD_S: Final = 0.3
@@ -46,9 +46,9 @@ class Hand(Protocol):
 class _Timed:
     """What both hands have: the examination's errors and the time."""
 
-    def __init__(self, scenario: Scenario, budget: Budget, errors: LoopErrors | None) -> None:
+    def __init__(self, scenario: Scenario, errors: LoopErrors | None) -> None:
         self._errors = errors or loop_errors(scenario)
-        self.task = replace(Task.of(exam_input(scenario), budget), depth_uncertainty=self._errors.uncertainty_m)
+        self.task = replace(Task.of(exam_input(scenario)), depth_uncertainty=self._errors.uncertainty_m)
         self._loop = Loop(scenario, self._errors)
         self.spent = 0.0
         self._here: Array | None = None
@@ -73,9 +73,9 @@ class _Timed:
 class PatientHand(_Timed):
     """Presses the true tissue."""
 
-    def __init__(self, scenario: Scenario, budget: Budget, errors: LoopErrors | None = None) -> None:
+    def __init__(self, scenario: Scenario, errors: LoopErrors | None = None) -> None:
         """`errors`: None for those of loop.yaml. Raises what `Patient` does, and UnknownLoopError where it has none."""
-        super().__init__(scenario, budget, errors)
+        super().__init__(scenario, errors)
         self.patient = Patient(scenario, time=self._loop.begin_s)
         self._begin_s = self._loop.begin_s
         self._breathing = self.patient.surface.between(self.patient.tissue.model.breathing)
@@ -120,11 +120,9 @@ class PatientHand(_Timed):
 class SurrogateHand(_Timed):
     """Presses what the standard press feels of the wall; it knows nothing of relaxation, friction or earlier presses."""
 
-    def __init__(
-        self, scenario: Scenario, budget: Budget, errors: LoopErrors | None = None, felt: FeltPatient | None = None
-    ) -> None:
+    def __init__(self, scenario: Scenario, errors: LoopErrors | None = None, felt: FeltPatient | None = None) -> None:
         """`errors` as of the other hand; `felt`: of the scenario's patient, who is made where there is none."""
-        super().__init__(scenario, budget, errors)
+        super().__init__(scenario, errors)
         self.felt = felt or felt_patient(scenario.phantom, scenario.seed)
         self._breathing = BreathingCurve(scenario.phantom.breathing, scenario.seed)
         self._rng = generator(scenario.seed, "surrogate")

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import StrEnum
 from functools import cache
 from importlib import resources
@@ -54,6 +54,8 @@ class Role(_Row):
     period_ms: Annotated[int, Field(ge=1)]
     critical: bool = False
     observer: bool = False
+    optional: bool = False
+    """Whether it takes part in some runs alone."""
     doc: str
 
     @property
@@ -253,9 +255,27 @@ def with_periods(text: str, periods: Mapping[str, int]) -> str:
     return yaml.safe_dump(document, sort_keys=False)
 
 
+def without(text: str, absent: Collection[str]) -> str:
+    """A contract's text without some optional roles, what they send, and what they would read.
+
+    Raises ValueError that names a role that is not optional.
+    """
+    document = yaml.safe_load(text)
+    for role in absent:
+        if not document["roles"].get(role, {}).get("optional"):
+            optional = [name for name, row in document["roles"].items() if row.get("optional")]
+            raise ValueError(f"PALPATE_ABSENT: {role!r} is no optional role; those are {', '.join(optional)}")
+        del document["roles"][role]
+        document["topics"] = {name: topic for name, topic in document["topics"].items() if topic["producer"] != role}
+        for topic in document["topics"].values():
+            topic["readers"].pop(role, None)
+    return yaml.safe_dump(document, sort_keys=False)
+
+
 @cache
 def contract() -> Contract:
-    """The contract of this installation; PALPATE_PERIODS may set other periods, see `with_periods`."""
+    """The contract of this installation; PALPATE_PERIODS may set other periods, PALPATE_ABSENT leave optional roles out."""
     text = resources.files("palpate_bus.contract").joinpath("contract.yaml").read_text(encoding="utf-8")
-    periods = Settings.read().periods
-    return parse(with_periods(text, periods) if periods else text)
+    settings = Settings.read()
+    text = with_periods(text, settings.periods) if settings.periods else text
+    return parse(without(text, settings.absent) if settings.absent else text)

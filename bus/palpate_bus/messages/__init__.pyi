@@ -326,6 +326,19 @@ class RunControl:
     reason: str
 
 @dataclass
+class SearchRequest:
+    __msgtype__: ClassVar[str]
+    PRESS: ClassVar[int]
+    DONE: ClassVar[int]
+    header: Header
+    number: int
+    request: int
+    place: Point
+    depth: float
+    lump: float
+    reason: str
+
+@dataclass
 class ServiceReport:
     __msgtype__: ClassVar[str]
     READY: ClassVar[int]

@@ -13,8 +13,8 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "palpation_msgs": (
         "Advance", "CameraTrigger", "ExamState", "Finding", "Findings", "ImpedanceSetpoint", "IndentationTruth",
         "JointTorqueCommand", "OperatorRequest", "PalpationSample", "PalpationTargets", "PatientTruth", "PhantomTruth",
-        "RecordChunk", "RobotStatus", "RunControl", "ServiceReport", "SkinTouch", "StiffnessMap", "SupervisorState",
-        "SurfaceMesh", "SurfaceMotion", "ToolState",
+        "RecordChunk", "RobotStatus", "RunControl", "SearchRequest", "ServiceReport", "SkinTouch", "StiffnessMap",
+        "SupervisorState", "SurfaceMesh", "SurfaceMotion", "ToolState",
     ),
     "rosgraph_msgs": ("Clock",),
     "sensor_msgs": ("CameraInfo", "Image", "JointState", "PointCloud2", "PointField", "RegionOfInterest"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from palpate_bus.contract import contract
 from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.monitor.health import SeenViolation, TopicHealth
@@ -46,7 +47,9 @@ def _judged(row: TopicHealth, found: list[SeenViolation], now: float) -> tuple[i
             return DiagnosticStatus.ERROR, str(worst.violation)
         return DiagnosticStatus.WARN, f"was: {worst.violation} ({_how_often(worst)})"
     if not row.senders:
-        return DiagnosticStatus.STALE, "nobody sends it"
+        producer = contract().roles.get(row.topic.producer)
+        optional = producer is not None and producer.optional
+        return (DiagnosticStatus.OK if optional else DiagnosticStatus.STALE), "nobody sends it"
     if not row.heard:
         return DiagnosticStatus.OK, "sent; not listened to"
     rests = row.alive is None and not row.rate_hz

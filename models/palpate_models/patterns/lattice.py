@@ -30,6 +30,11 @@ def snake(exam: Exam, surface: Surface) -> Scan:
     return Scan(_alternating(exam), joined=True)
 
 
+def search(exam: Exam, surface: Surface) -> Scan:
+    """The places that a search may ask for."""
+    return lines(exam, surface)
+
+
 def stations(centre: float, length: float, spacing: float) -> Array:
     """Evenly spread coordinates [m] over `length` about `centre`, both ends included, at most `spacing` apart."""
     count = int(np.ceil(length / spacing - 1e-9)) + 1

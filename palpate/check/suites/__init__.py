@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Rig
-from palpate.check.suites import assessment, camera, common, control, perception, planning, robot, supervisor, tissue
+from palpate.check.suites import assessment, camera, common, control, perception, planning, robot, search, supervisor, tissue
 
 SUITES: dict[str, Callable[[Rig, ConformanceReport], None]] = {
     "robot": robot.suite,
@@ -16,6 +16,7 @@ SUITES: dict[str, Callable[[Rig, ConformanceReport], None]] = {
     "camera": camera.suite,
     "perception": perception.suite,
     "assessment": assessment.suite,
+    "search": search.suite,
     "supervisor": supervisor.suite,
 }
 """The suite of each role."""

@@ -16,6 +16,7 @@ from palpate_planning.coverage import strokes, touches
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.motion_planning import NoPathError, timed_motion
 from palpate_planning.poses import centre, pose
+from palpate_planning.requests import PressPlanner
 from palpate_planning.scene import CollisionScene
 from palpate_planning.segments import REACH, Segment, SegmentPlanner
 from palpate_planning.surface import PerceivedSurface
@@ -49,6 +50,8 @@ class ExamPlan:
     """Alternating: contact, way, contact, ..."""
     skipped: dict[int, str]
     """Reason by target."""
+    presses: PressPlanner | None = None
+    """Of the presses that a search asks for; None where there is no search."""
 
     def poses(self, radius: float, depth: float) -> Array:
         """Poses of the indenter at depth along all strokes, about 5 mm apart, shape (n, 4, 4)."""
@@ -102,7 +105,7 @@ class ExamPlanner:
         breaks: set[int] = set()
         while True:  # ends: each round takes targets or joints away
             usable = np.array([i not in skipped for i in range(len(xy))], dtype=bool)
-            scan = strokes(xy, perceived.lines, usable, joined, exam.mode, exam.spacing_m, breaks)
+            scan = [] if exam.searched else strokes(xy, perceived.lines, usable, joined, exam.mode, exam.spacing_m, breaks)
             pieces = touches(xy, usable) + scan
             layout = segments.lay(pieces)
             if not layout.troubled:
@@ -114,7 +117,9 @@ class ExamPlanner:
             raise NoPathError(f"no target is left of {len(xy)}: {reasons}")
         start = segments.hover(pieces[0], 0)
         assert start is not None, "a stroke that cannot be hovered over is trouble"
-        return ExamPlan(self._motion(free, q_now, start), tuple(layout.segments), skipped)
+        approach = self._motion(free, q_now, start)
+        presses = PressPlanner(segments, xy, usable, pieces[-1]) if exam.searched else None
+        return ExamPlan(approach, tuple(layout.segments), skipped, presses)
 
     def _motion(self, scene: CollisionScene, q0: Array, q1: Array) -> JointTrajectory:
         return timed_motion(scene, self._kinematics, self._known.limits, q0, q1, self._known.exam.seed, self._period_s)

@@ -21,6 +21,8 @@ from palpate_planning.motion_planning import NoPathError
 from palpate_planning.palpation import Palpation, PalpationStep, StrokeStage
 from palpate_planning.path import compile_ahead
 from palpate_planning.periods import MS, SECOND, Periods
+from palpate_planning.requests import PLANNING_TIME
+from palpate_planning.segments import Segment
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import Stops
@@ -33,7 +35,7 @@ REST = 200 * MS
 """Time at rest before looking [ns]: the arm's oscillations fade."""
 LOOK_PATIENCE = 12 * SECOND
 """Time that perception may take beyond the burst [ns]: it watches about two breaths."""
-PLANNING_TIME = 2 * SECOND
+EXAM_PLANNING_TIME = 2 * SECOND
 """Simulated time that planning the examination takes [ns]."""
 ASSESS_PATIENCE = 30 * SECOND
 """Time that the assessment may take for its final findings [ns]."""
@@ -81,6 +83,10 @@ class ExamSequence:
         self._asked: int | None = None
         """When the camera was asked for the burst that perception is to answer [ns]."""
         self._planning: BackgroundTask[ExamPlan] | None = None
+        self._pressing: BackgroundTask[tuple[Segment, ...]] | None = None
+        """The press that is being laid."""
+        self._requested = self._pressed = 0
+        """Numbers of the search's requests: the latest, and the latest that is over."""
         self._skipped: dict[int, str] = {}
         self._trigger = False
         self._path: Array | None = None
@@ -166,7 +172,7 @@ class ExamSequence:
             perceived, start = course.perceived, course.arm.q.copy()
             assert perceived is not None
             self._planning = BackgroundTask(
-                now.t, PLANNING_TIME, lambda: self._planner.examination(perceived, start), lockstep=self._lockstep
+                now.t, EXAM_PLANNING_TIME, lambda: self._planner.examination(perceived, start), lockstep=self._lockstep
             )
         elif self._planning.due(now.t):
             try:
@@ -194,6 +200,7 @@ class ExamSequence:
                 self._known.robot.indenter_radius_m,
                 self._periods.step_s,
                 self._sense.wall,
+                more=course.plan.presses is not None,
             )
             return self._palpate(now)
         return None
@@ -203,6 +210,7 @@ class ExamSequence:
     def _palpate(self, now: Observation) -> Setpoint | None:
         course = self._course
         assert course.palpation is not None and now.reading is not None
+        self._search(now, course.palpation)
         step = course.palpation.step(now.t, course.contact, course.rate)
         self._report(step, course.palpation, now.t)
         if step.taring:
@@ -213,13 +221,32 @@ class ExamSequence:
             course.go_home(now, course.palpation.failed)
         return step.setpoint
 
+    def _search(self, now: Observation, palpation: Palpation) -> None:
+        """Has the press laid that the search asks for, one at a time, and counts those that are over as targets."""
+        plan = self._course.plan
+        if plan is None or plan.presses is None:
+            return
+        if now.request is not None:
+            request, presses = now.request, plan.presses
+            if request.xy is None:
+                palpation.close()
+            else:
+                self._pressing = BackgroundTask(now.t, PLANNING_TIME, lambda: presses.press(request), lockstep=self._lockstep)
+                self._requested = request.number
+        elif self._pressing is not None and self._pressing.due(now.t):
+            palpation.extend(self._pressing.result())
+            self._pressing = None
+        elif self._pressing is None and palpation.waiting:
+            self._pressed = self._requested
+
     def _report(self, step: PalpationStep, palpation: Palpation, t: int) -> None:
         status = self.status
         self._skipped |= palpation.skipped
         self._touched, status.stroke = step.touched, palpation.stroke
         status.patient_moved = self._sense.wall.breath.moved
         status.steady, status.force_limited = step.steady, step.limited
-        status.depth_setpoint, status.target_index = step.depth_setpoint, step.target
+        searched = self._known.exam.searched
+        status.depth_setpoint, status.target_index = step.depth_setpoint, self._pressed if searched else step.target
         status.targets_skipped = len(self._skipped)
         phase, message = PHASE_OF[step.stage], palpation.failed or palpation.left or step.stage.value
         if phase is not status.phase or message != status.message:

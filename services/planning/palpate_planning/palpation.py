@@ -47,6 +47,7 @@ class StrokeStage(Enum):
     HOLD = "holding at depth"
     LIFT = "lifting"
     TRANSFER = "moving to the next stroke"
+    WAIT = "waiting for the next stroke"
     DONE = "done"
 
 
@@ -85,8 +86,13 @@ class Palpation:
         radius: float,
         period_s: float,
         wall: Wall,
+        *,
+        more: bool = False,
     ) -> None:
-        """`radius` of the sphere [m]; `wall`: what is pressed, and learns from every touch."""
+        """`radius` of the sphere [m]; `wall`: what is pressed, and learns from every touch; `more`: whether it waits for further
+        segments after the last (`extend`, `close`).
+        """
+        self._more = more
         self._segments, self._exam, self._limits, self._period_s = segments, exam, limits, period_s
         self._watch = WallWatch(wall.breath, exam.breathing, period_s)
         self.left = ""
@@ -119,6 +125,19 @@ class Palpation:
         """Where the free motion under way ends [rad], shape (7,); None on a path."""
         free = self._motion.segment.free
         return None if free is None or self.failed or self.stage is StrokeStage.DONE else np.asarray(free.q[-1])
+
+    @property
+    def waiting(self) -> bool:
+        """Whether it waits for further segments."""
+        return self.stage is StrokeStage.WAIT and len(self._segments) == self._number + 1
+
+    def extend(self, segments: tuple[Segment, ...]) -> None:
+        """Further segments, which begin where the last one ends."""
+        self._segments += segments
+
+    def close(self) -> None:
+        """There are no further segments."""
+        self._more = False
 
     # --- interruptions ------------------------------------------------------------------------------------------------
 
@@ -192,6 +211,8 @@ class Palpation:
             self._settle(contact)
         elif self.stage is StrokeStage.HOLD:
             self._hold()
+        elif self.stage is StrokeStage.WAIT:
+            self._wait()
         self._motion.regulate(contact, in_contact=contact.touching and self.stage is not StrokeStage.LIFT)
         return self._report(t, contact, rate)
 
@@ -214,13 +235,21 @@ class Palpation:
 
     def _next_segment(self) -> None:
         if self._number + 1 == len(self._segments):
-            self._enter(StrokeStage.DONE)
+            self._enter(StrokeStage.WAIT if self._more else StrokeStage.DONE)
             return
         self._number += 1
         segment = self._segments[self._number]
         self._motion.start(segment)
         self._joined = self._joined and segment.free is None
         self._enter(StrokeStage.REST if segment.contact else StrokeStage.TRANSFER)
+
+    def _wait(self) -> None:
+        """Above the skin, until it is known what comes next."""
+        self._motion.depth.step(-HOVER_M, LIFT_MPS)
+        if self.failed or self.left:
+            self._enter(StrokeStage.DONE)
+        elif not self._recovery.paused and (len(self._segments) > self._number + 1 or not self._more):
+            self._next_segment()
 
     def _rest(self, contact: ContactMeasurement) -> None:
         """Above the skin, in free air, until the sensor is tared."""

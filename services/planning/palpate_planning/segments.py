@@ -39,6 +39,8 @@ class Segment:
     """At depth; else above the surface, on the way to the next stroke."""
     touch: bool = False
     """Whether the skin is only touched, not pressed."""
+    depth_m: float | None = None
+    """How deep it is pressed; None for the examination's depth."""
     free: JointTrajectory | None = None
     """A free motion, where the straight way above the surface cannot be taken."""
 
@@ -105,6 +107,14 @@ class SegmentPlanner:
                     layout.segments.append(segment)
             layout.segments.append(Segment(path, contact=True, touch=piece.touch))
         return layout
+
+    def after(self, before: Stroke, press: Stroke, depth: float) -> tuple[Segment, ...]:
+        """A press to `depth` [m], and the way there from above the end of the stroke before; empty where the arm cannot do it."""
+        path, troubles = self._path(press, depth)
+        if troubles or self.hover(press, 0) is None:
+            return ()
+        way, _ = self._way(before, press)
+        return () if way is None else (way, Segment(path, contact=True, depth_m=depth))
 
     def hover(self, piece: Stroke, end: int) -> Array | None:
         """Posture above the stroke's first (0) or last (-1) target [rad], shape (7,); None out of reach or in collision."""

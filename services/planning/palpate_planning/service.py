@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SearchRequest, SupervisorState
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import vector, wrench
 from palpate_bus.messages.stamps import header
@@ -25,6 +25,7 @@ from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
 from palpate_planning.messages import motion_of, path_message, state_message, touch_message
 from palpate_planning.periods import Periods
+from palpate_planning.requests import PressRequest
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 from palpate_planning.surface import PerceivedSurface
 
@@ -72,6 +73,7 @@ class PlanningService(Service):
                 soft=soft,
                 end=_end(requests),
                 lost=self._lost(t, inbox),
+                request=self._request(inbox),
             )
         )
         if step.contact is not None and step.contact.touching:
@@ -143,9 +145,20 @@ class PlanningService(Service):
         heard = [motion_of(message) for message in inbox.new("perception/motion")]
         return heard[-1] if heard and self._known.exam.breathing is not Following.IGNORE else None
 
+    def _request(self, inbox: Inbox) -> PressRequest | None:
+        """What the search asks for, if it has just asked."""
+        if not self._known.exam.searched:
+            return None
+        for message in inbox.new("exam/request"):
+            over = message.request == SearchRequest.DONE
+            xy = None if over else np.array((message.place.x, message.place.y))
+            return PressRequest(int(message.number), xy, float(message.depth), message.reason)
+        return None
+
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
         """Roles that are needed and gone. A supervisor silent for longer than a set-point is valid is gone, too."""
-        needed = NEEDED_TO_SEE if self._exam.status.phase in SEEING else NEEDED
+        searching = ("search",) if self._known.exam.searched else ()
+        needed = (*(NEEDED_TO_SEE if self._exam.status.phase in SEEING else NEEDED), *searching)
         gone = tuple([role for role in needed if inbox.lost(role)])
         heard = inbox.stamp("supervisor/state")
         if heard is not None and t - heard > self._supervisor_silence:

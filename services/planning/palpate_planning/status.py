@@ -12,6 +12,7 @@ from palpate_planning.breath import Motion
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.palpation import StrokeStage
+from palpate_planning.requests import PressRequest
 from palpate_planning.wall import TouchedSkin
 
 
@@ -40,6 +41,7 @@ PHASE_OF: Final = {
     StrokeStage.HOLD: Phase.SCAN,
     StrokeStage.LIFT: Phase.RETRACT,
     StrokeStage.TRANSFER: Phase.RETRACT,
+    StrokeStage.WAIT: Phase.RETRACT,
     StrokeStage.DONE: Phase.RETRACT,
 }
 """The phase to which each stage of a stroke belongs."""
@@ -76,6 +78,8 @@ class Observation(NamedTuple):
     end: str = ""
     """Why the exam is to go home and end; given at one step only."""
     lost: tuple[str, ...] = ()
+    request: PressRequest | None = None
+    """What the search asks for, at the step at which it came."""
     """Roles whose services are gone."""
 
 

@@ -78,6 +78,7 @@ class StrokeMotion:
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0
+        self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m
 
     def restart(self, contact: ContactMeasurement) -> None:
         """At rest where the segment was left, at the depth at which the arm is now."""
@@ -117,7 +118,7 @@ class StrokeMotion:
 
     def deepen(self) -> bool:
         """Sinks towards full depth, the slower the nearer the force is to its limit; returns whether it is there."""
-        return self.depth.step(self._exam.depth_m, PLUNGE_MPS * self.slowdown(0.7, 1.0, 0.01))
+        return self.depth.step(self._deepest, PLUNGE_MPS * self.slowdown(0.7, 1.0, 0.01))
 
     def slide(self) -> bool:
         """Follows the path in contact, slower where force rises; returns whether it is at its end."""
@@ -147,7 +148,7 @@ class StrokeMotion:
     @property
     def short_of_depth(self) -> bool:
         """Whether the target depth has not reached the depth of the examination."""
-        return self.depth.position < self._exam.depth_m - LIMITED_M
+        return self.depth.position < self._deepest - LIMITED_M
 
     def setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
         """The set-point at `t` [ns]; a free motion goes on by `rate` samples a period."""

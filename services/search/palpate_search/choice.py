@@ -29,6 +29,12 @@ def policies() -> tuple[str, ...]:
     return tuple(sorted({point.name for point in entry_points(group=GROUP)}))
 
 
+def findable(choice: str) -> str:
+    """The choice, a file by its absolute path. Raises PolicyError where there is no such policy."""
+    policy(choice)
+    return str(Path(choice).resolve()) if choice.endswith(".py") else choice
+
+
 def policy(choice: str) -> Policy:
     """The policy of a name or file. Raises PolicyError."""
     if choice.endswith(".py"):

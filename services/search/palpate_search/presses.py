@@ -14,9 +14,11 @@ PLACES_M = 0.010
 """Distance of the places that are weighed."""
 BORDER_M = 0.010
 """Presses keep so far from the edge of the region, in which the arm's reach and the skin are known."""
+DEEPER = 1.4
+"""The deepest press, of the usual one."""
 TRAVEL_MPS = 0.12
 """Mean speed of a hop from one place to the next."""
-PRESS_S = 2.2
+PRESS_S = 3.2
 """What a press takes besides the hop: rest and tare in the air, descent, settling, hold and lift."""
 
 
@@ -75,10 +77,11 @@ class Task:
     """Of what a policy draws."""
 
     @classmethod
-    def of(cls, known: ExamInput, budget: Budget) -> Task:
+    def of(cls, known: ExamInput) -> Task:
         """The task of an examination."""
         exam, limits = known.exam, known.limits
-        deepest = min(1.4 * exam.depth_m, limits.depth_m)
+        deepest = min(DEEPER * exam.depth_m, limits.depth_m)
+        budget = Budget(exam.budget.presses, exam.budget.seconds)
         return cls(exam.centre_m, exam.region_m, exam.depth_m, deepest, limits.force_working_n, budget=budget, seed=exam.seed)
 
     @cached_property

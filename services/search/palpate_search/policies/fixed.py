@@ -25,13 +25,13 @@ def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
 def random(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     """Anywhere, every place as probable as any other."""
     task = posterior.task
-    rng = np.random.default_rng((task.seed, len(posterior.presses)))
+    rng = np.random.Generator(np.random.PCG64((task.seed, len(posterior.presses))))
     return rng.uniform(task.low, task.high), task.depth
 
 
 def latin_hypercube(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     """McKay, Beckman and Conover 1979: so many strata along x and along y as the budget has presses, each met once."""
     task = posterior.task
-    sampler = qmc.LatinHypercube(d=2, rng=np.random.default_rng(task.seed))
+    sampler = qmc.LatinHypercube(d=2, rng=np.random.Generator(np.random.PCG64(task.seed)))
     share = sampler.random(task.budget.presses)[len(posterior.presses) % task.budget.presses]
     return task.low + share * (task.high - task.low), task.depth

@@ -1,0 +1,82 @@
+"""Role search: the suite plays an examination that presses wherever it is asked to, on a belly with one stiff area."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import Rig
+from palpate_bus.messages import ExamState, PalpationSample, Point, SearchRequest, Vector3
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import header
+
+REQUEST: Final = "exam/request"
+STIFF_M: Final = 0.020
+FORCE_N: Final = 4.0
+CONTRAST: Final = 3.0
+PRESS_S: Final = 0.3
+MOST: Final = 40
+
+
+class Play:
+    """The states of an examination; `over` is the number of the latest request that is carried out."""
+
+    def __init__(self) -> None:
+        self.phase, self.over = ExamState.PHASE_PLAN, 0
+
+    def state(self, t: int) -> Any:
+        """The state at `t` [ns]."""
+        return ExamState(
+            header(t, "world"), self.phase, "conformance check", self.over, 0, 0, False, False, False, False, -0.01, -0.01, 0.0,
+            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0005, 0.0, self.over, False,
+        )  # fmt: skip
+
+
+def suite(rig: Rig, report: ConformanceReport) -> None:
+    """Silence before contact, one request at a time, inside the region, and an end in good time."""
+    exam = rig.settings.scenario.exam
+    stiff_at = np.array(exam.centre_m) + 0.2 * np.array(exam.region_m)
+    play = Play()
+    report.section("requests")
+    rig.run(0.2, {"exam/state": play.state})
+    report.expect("asks for nothing before contact", not rig.log[REQUEST], "no request", len(rig.log[REQUEST]))
+    play.phase = ExamState.PHASE_RETRACT
+    rig.run(0.5, {"exam/state": play.state})
+    report.expect("asks once, and waits", len(rig.log[REQUEST]) == 1, "1 request", len(rig.log[REQUEST]))
+    while rig.log[REQUEST] and rig.last(REQUEST).request == SearchRequest.PRESS and play.over < MOST:
+        asked = rig.last(REQUEST)
+        if asked.number <= play.over:
+            break
+        rig.send("assessment/samples", _sample(rig.t, asked, stiff_at))
+        rig.run(PRESS_S / 2, {"exam/state": play.state})
+        play.over = int(asked.number)
+        rig.run(PRESS_S / 2, {"exam/state": play.state})
+    heard = [item.message for item in rig.log[REQUEST]]
+    numbers = [int(message.number) for message in heard]
+    report.expect("numbers its requests", numbers == list(range(1, len(numbers) + 1)), "1, 2, 3, ...", numbers[:5])
+    presses = [message for message in heard if message.request == SearchRequest.PRESS]
+    xy = np.array([(message.place.x, message.place.y) for message in presses]).reshape(-1, 2)
+    inside = bool(np.all(np.abs(xy - exam.centre_m) <= 0.5 * np.array(exam.region_m) + 1e-9))
+    report.expect("presses inside the region", inside, f"{exam.region_m} m about {exam.centre_m} m", f"{len(xy)} places")
+    deepest = rig.settings.scenario.limits.depth_m
+    ok = all(0 < message.depth <= deepest for message in presses)
+    report.expect("presses no deeper than it may", ok, f"up to {deepest} m", max((m.depth for m in presses), default=0.0))
+    done = bool(heard) and heard[-1].request == SearchRequest.DONE
+    on_budget = len(presses) <= exam.budget.presses
+    report.expect("keeps to its budget", on_budget, f"{exam.budget.presses} presses", len(presses))
+    if done:
+        report.expect("says why it ends", bool(heard[-1].reason), "a reason", heard[-1].reason)
+    else:
+        report.skip("an end", f"it went on beyond {len(presses)} presses")
+
+
+def _sample(t: int, asked: Any, stiff_at: Any) -> Message:
+    """What a press of the belly is felt like."""
+    xy = np.array((asked.place.x, asked.place.y))
+    bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - STIFF_M) / 0.004)))
+    force = FORCE_N * CONTRAST**bump * (asked.depth / 0.010) ** 1.3
+    place = Point(float(xy[0]), float(xy[1]), 0.0)
+    up = Vector3(0.0, 0.0, 1.0)
+    return PalpationSample(header(t, "abdomen"), place, up, float(asked.depth), float(force), 0.0, 0.5, False, 1, 0.0005)

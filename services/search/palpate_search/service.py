@@ -1,0 +1,114 @@
+"""Search as a service: samples in, the next press out, until the budget is spent or nothing is likely to be missed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from palpate_bus.contract import contract
+from palpate_bus.messages import ExamState, Point, SearchRequest
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.load import exam_input
+from palpate_models.scenario import Scenario
+from palpate_search.choice import policy
+from palpate_search.posterior import Posterior
+from palpate_search.presses import Press, Task
+
+FRAME: Final = contract().topics["assessment/map"].frame or ""
+PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
+FOUND: Final = 0.95
+"""A lump that is so probable counts as found; others are sought beside it."""
+FEWEST: Final = 12
+"""So many presses at least: with fewer the assessment says nothing."""
+
+
+class SearchService(Service):
+    """Asks for one press after the other. It begins when the arm first palpates, and goes on when the press before is over."""
+
+    role: ClassVar[str] = "search"
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Of the examination's view of a scenario. Raises PolicyError for a policy that there is not."""
+        self._posterior = Posterior(Task.of(exam_input(scenario)))
+        self._policy = policy(scenario.search.policy)
+        self._missed = scenario.search.missed
+        self._begin: int | None = None
+        """When the first press was asked for [ns]."""
+        self._number = 0
+        """Of the latest request."""
+        self._felt: list[Press] = []
+        """Samples since that."""
+        self._ended = ""
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """A request when the examination is ready for one."""
+        self._felt += [_press(sample) for sample in inbox.new("assessment/samples")]
+        state = inbox.latest("exam/state")
+        if state is None or state.phase not in PALPATING or self._ended or state.target_index != self._number:
+            return {}
+        if self._begin is None:
+            self._begin = t
+            self._posterior = Posterior(replace(self._posterior.task, depth_uncertainty=max(state.depth_uncertainty, 0.0002)))
+        for press in self._felt:
+            self._posterior.add(press)
+        self._felt.clear()
+        while self._posterior.at[1] >= FOUND:
+            self._posterior = self._posterior.accept(self._posterior.best)
+        self._number += 1
+        return {"exam/request": self._request(t, (t - self._begin) / NS)}
+
+    def finish(self) -> Mapping[str, Any]:
+        """How much was asked for, what was found, and why it ended."""
+        return {
+            "requests": self._number,
+            "presses": len(self._posterior.presses),
+            "found_m": [[round(bump.x, 4), round(bump.y, 4)] for bump in self._posterior.accepted],
+            "missed": round(self._posterior.lump, 4),
+            "ended": self._ended or "with the examination",
+        }
+
+    def _request(self, t: int, spent_s: float) -> Message:
+        posterior = self._posterior
+        self._ended = self._over(spent_s)
+        place, depth = (np.zeros(2), 0.0) if self._ended else self._policy(posterior, posterior.left(spent_s))
+        return SearchRequest(
+            header(t, FRAME),
+            self._number,
+            SearchRequest.DONE if self._ended else SearchRequest.PRESS,
+            Point(float(place[0]), float(place[1]), 0.0),
+            float(depth),
+            posterior.lump,
+            self._ended,
+        )
+
+    def _over(self, spent_s: float) -> str:
+        """Why the search is over; empty while it is not."""
+        posterior, left = self._posterior, self._posterior.left(spent_s)
+        if posterior.lump < self._missed and len(posterior.presses) >= FEWEST:
+            return f"a lump that was not found has a probability of {posterior.lump:.3f}"
+        if self._number > self._posterior.task.budget.presses:
+            return f"{posterior.task.budget.presses} presses are made"
+        if left.seconds <= 0:
+            return f"{posterior.task.budget.seconds:g} s are over"
+        return ""
+
+
+def _press(sample: Message) -> Press:
+    return Press(
+        sample.position.x,
+        sample.position.y,
+        sample.depth,
+        sample.normal_force,
+        nanoseconds(sample.header.stamp) / NS,
+        limited=sample.force_limited,
+    )
+
+
+def create(scenario: Scenario) -> Service:
+    """The search of a scenario; it knows nothing of the patient."""
+    return SearchService(scenario)

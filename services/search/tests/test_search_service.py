@@ -1,0 +1,56 @@
+"""The service asks for one press after the other, and says when it is over."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import RigSettings, ServiceRig
+from palpate.check.suites.search import REQUEST, Play, suite
+from palpate_bus.messages import ExamState, SearchRequest
+from palpate_models.scenario import Budget, Exam, Scenario, Search
+from palpate_search.service import FEWEST, create
+
+
+def played(**exam: Any) -> tuple[ServiceRig, ConformanceReport]:
+    """The conformance suite's examination, of a small region."""
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", **exam))
+    rig, report = ServiceRig(create(scenario), RigSettings(scenario)), ConformanceReport("search")
+    suite(rig, report)
+    return rig, report
+
+
+def test_it_finds_the_stiff_area_and_ends() -> None:
+    rig, report = played()
+    assert report.passed
+    requests = [item.message for item in rig.log[REQUEST]]
+    assert requests[-1].request == SearchRequest.DONE
+    assert requests[-1].lump < Search().missed
+    assert FEWEST < len(requests) < 40
+    places = np.array([(message.place.x, message.place.y) for message in requests[:-1]])
+    assert (np.linalg.norm(places - 0.02, axis=1) < 0.025).sum() >= 3
+
+
+def test_it_keeps_to_the_budget_of_presses() -> None:
+    rig, report = played(budget=Budget(presses=5))
+    assert report.passed
+    assert [item.message.request for item in rig.log[REQUEST]] == [SearchRequest.PRESS] * 5 + [SearchRequest.DONE]
+    assert "5 presses are made" in rig.last(REQUEST).reason
+
+
+def test_it_keeps_to_the_budget_of_time() -> None:
+    rig, _ = played(budget=Budget(seconds=2.0))
+    assert rig.last(REQUEST).request == SearchRequest.DONE
+    assert rig.last(REQUEST).reason == "2 s are over"
+
+
+@pytest.mark.parametrize("phase", [ExamState.PHASE_HELD, ExamState.PHASE_ASSESS])
+def test_it_asks_for_nothing_while_nobody_palpates(phase: int) -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search"))
+    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
+    play.phase = phase
+    rig.run(0.3, {"exam/state": play.state})
+    assert not rig.log[REQUEST]
