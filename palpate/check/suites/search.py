@@ -45,15 +45,20 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     play.phase = ExamState.PHASE_RETRACT
     rig.run(0.5, {"exam/state": play.state})
     report.expect("asks once, and waits", len(rig.log[REQUEST]) == 1, "1 request", len(rig.log[REQUEST]))
+    early = 0
     while rig.log[REQUEST] and rig.last(REQUEST).request == SearchRequest.PRESS and play.over < MOST:
         asked = rig.last(REQUEST)
         if asked.number <= play.over:
             break
         rig.send("assessment/samples", _sample(rig.t, asked, stiff_at))
-        rig.run(PRESS_S / 2, {"exam/state": play.state})
+        early += len(rig.run(PRESS_S / 2, {"exam/state": play.state})[REQUEST])
         play.over = int(asked.number)
         rig.run(PRESS_S / 2, {"exam/state": play.state})
     heard = [item.message for item in rig.log[REQUEST]]
+    report.expect("waits until a press is over", early == 0, "no request meanwhile", early)
+    report.expect("goes on then", len(heard) == play.over + 1, f"{play.over + 1} requests", len(heard))
+    told = all(0 <= message.lump <= 1 for message in heard)
+    report.expect("tells how probable a lump is", told, "0 to 1", heard[-1].lump if heard else "nothing")
     numbers = [int(message.number) for message in heard]
     report.expect("numbers its requests", numbers == list(range(1, len(numbers) + 1)), "1, 2, 3, ...", numbers[:5])
     presses = [message for message in heard if message.request == SearchRequest.PRESS]
