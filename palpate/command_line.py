@@ -34,8 +34,11 @@ def fail(why: object) -> NoReturn:
     raise typer.Exit(EXIT_FAILED) from None
 
 
-def output_file(words: str) -> typer.models.OptionInfo:
-    """The option of a command for the file that it writes in the end; before it measures, the file's folder is made."""
+def output_file(words: str, *names: str) -> typer.models.OptionInfo:
+    """The option of a command for the file that it writes in the end; before it measures, the file's folder is made.
+
+    `names` are the option's, where it has others than its parameter.
+    """
 
     def check(path: Path | None) -> Path | None:
         if path is not None:
@@ -44,7 +47,7 @@ def output_file(words: str) -> typer.models.OptionInfo:
                 raise typer.BadParameter(f"{path}: is no file that can be written")
         return path
 
-    return _option(words, check)
+    return _option(words, check, *names)
 
 
 def output_folder(words: str, *names: str) -> typer.models.OptionInfo:

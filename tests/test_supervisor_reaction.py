@@ -1,6 +1,6 @@
 """How soon the supervisor stops what planning should never have done: measured on the real services, in simulated time.
 
-Run as a program it prints the table of docs/faults.md, or writes it there: `python tests/test_supervisor_reaction.py --doc FILE`.
+Run as a program it prints the table of docs/faults.md, or writes it there: `python tests/test_supervisor_reaction.py --docs FILE`.
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ def table() -> str:
 if __name__ == "__main__":
     measured = table()
     print(measured)
-    if sys.argv[1:2] == ["--doc"]:
+    if sys.argv[1:2] == ["--docs"]:
         doc = Path(sys.argv[2])
         before, _, rest = doc.read_text(encoding="utf-8").partition(BEGIN)
         doc.write_text(f"{before}{BEGIN}{measured}{END}{rest.partition(END)[2]}", encoding="utf-8")

@@ -19,7 +19,7 @@ WIDE = 160
 
 def bench(
     scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "clean",
-    out: Annotated[Path, output_file("File for the figures.")] = Path("bench.json"),
+    out: Annotated[Path, output_file("File for the figures.", "--out", "-o")] = Path("bench.json"),
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only.")] = False,
 ) -> None:

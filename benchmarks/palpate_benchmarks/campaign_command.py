@@ -14,9 +14,9 @@ from rich.markup import escape
 from palpate.case_display import CaseDisplay
 from palpate.command_line import EXIT_FAILED, output_file, refuse
 from palpate.report.files import write_text
-from palpate.report.marked import doc_option, write_part
+from palpate.report.marked import docs_option, write_part
 from palpate_benchmarks.campaign import KINDS, FaultFinding, as_json, cases, forks, run_case
-from palpate_benchmarks.campaign_tables import markdown, table
+from palpate_benchmarks.campaign_tables import csv_text, markdown, table
 
 WIDE = 200
 
@@ -27,8 +27,10 @@ def faults(
     mode: Annotated[list[str] | None, typer.Option(help="lockstep, wallclock; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"Out of {', '.join(KINDS)}; all by default.")] = None,
     only: Listed = None,
-    out: Annotated[Path, output_file("File for the findings; those that it holds are not run again.")] = Path("faults.json"),
-    doc: Annotated[Path | None, doc_option("faults")] = None,
+    out: Annotated[Path, output_file("File for the findings; those that it holds are not run again.", "--out", "-o")] = Path(
+        "faults.json"
+    ),
+    docs: Annotated[Path | None, docs_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
 ) -> None:
@@ -57,8 +59,9 @@ def faults(
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
             display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDE, Console().width)).print(table(found))
-    if doc is not None:
-        write_part(doc, "faults", markdown(found))
+    if docs is not None:
+        write_part(docs, "faults", markdown(found))
+        write_text(docs.with_suffix(".csv"), csv_text(found))
     if any(not finding.good for finding in found):
         raise typer.Exit(EXIT_FAILED)
 

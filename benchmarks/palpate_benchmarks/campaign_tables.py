@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
+from io import StringIO
 from statistics import median
 
 from rich.markup import escape
@@ -32,14 +34,22 @@ def table(findings: Sequence[FaultFinding]) -> Table:
 
 
 def markdown(findings: Sequence[FaultFinding]) -> str:
-    """For the documentation: a summary, and every case folded away."""
+    """For the documentation: a summary of one screen; `csv_text` has every case."""
     good = sum(f.good for f in findings)
     largest = max((f.peak_force_n or 0.0 for f in findings), default=0.0)
     lines = [f"{good} of {len(findings)} as they should be; the largest force was {largest:.1f} N.", ""]
     lines += _markdown_table(SUMMARY, _summary(findings))
-    lines += ["", "<details><summary>Every case</summary>", ""]
-    lines += _markdown_table(("", *COLUMNS), [("" if f.good else "**!**", *_row(f)) for f in _sorted(findings)])
-    return "\n".join([*lines, "", "</details>"]) + "\n"
+    bad = [f"**!** {f.mode}, {f.kind} {f.where}: {f.ended}" for f in _sorted(findings) if not f.good]
+    return "\n".join([*lines, *([""] if bad else []), *bad]) + "\n"
+
+
+def csv_text(findings: Sequence[FaultFinding]) -> str:
+    """Every case, a row each, as CSV."""
+    file = StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(("as it should be", *COLUMNS))
+    writer.writerows(("yes" if f.good else "no", *_row(f)) for f in _sorted(findings))
+    return file.getvalue()
 
 
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -76,8 +86,8 @@ def _summary(findings: Sequence[FaultFinding]) -> list[tuple[str, ...]]:
 
 def _row(finding: FaultFinding) -> tuple[str, ...]:
     after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
-    after = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
-    force = f"{finding.peak_force_before_n:.1f}, {after}"
+    peak = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
+    force = f"{finding.peak_force_before_n:.1f}, {peak}"
     return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
 
 

@@ -51,7 +51,7 @@ class _Steps:
 
 
 def reproduce(
-    out: Annotated[Path, output_folder("Folder of the runs; finished ones are used again.")] = Path("out/reproduction"),
+    out: Annotated[Path, output_folder("Folder of the runs; finished ones are kept.", "--out", "-o")] = Path("out/reproduction"),
     docs: Annotated[Path | None, output_file("The page; by default reproduction.md in the folder of the runs.")] = None,
     every: Annotated[bool, typer.Option("--all", help="Also raster continuous and snake point, to see what each gains.")] = False,
     again: Annotated[bool, typer.Option("--again", help="Run what is finished again.")] = False,

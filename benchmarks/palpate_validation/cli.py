@@ -44,7 +44,7 @@ def run_section(name: str) -> PageSection:
 
 @app.callback()
 def validate(
-    out: Annotated[Path, output_folder("Folder for validate.json and the plots.")] = Path("out/validation"),
+    out: Annotated[Path, output_folder("Folder for validate.json and the plots.", "--out", "-o")] = Path("out/validation"),
     only: Annotated[
         list[str] | None, typer.Option("--only", metavar="SECTION", help=f"One of: {', '.join(SECTIONS)}. May be repeated.")
     ] = None,

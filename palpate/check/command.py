@@ -38,7 +38,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
     scenario: Annotated[str, typer.Option(help="What it was configured with; its patient holds the breath.")] = "clean",
     motion: Annotated[bool, typer.Option("--motion", help="It may move: needed for most of the robot's checks.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
-    slack: Annotated[float, typer.Option(help="Milliseconds that transport and scheduler may add to a reaction.")] = 150.0,
+    slack: Annotated[float, typer.Option(min=0, help="Seconds that transport and scheduler may add to a reaction.")] = 0.15,
     wait: Annotated[float, typer.Option(help="Seconds to wait for it to join.")] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     failures: Annotated[bool, typer.Option("--failures", help="Print only what failed.")] = False,
@@ -52,7 +52,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
         if role not in SUITES:
             raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
         try:
-            settings = RigSettings(load_scenario(scenario, STILL), slack, motion or role != "robot" or service is not None)
+            settings = RigSettings(load_scenario(scenario, STILL), 1e3 * slack, motion or role != "robot" or service is not None)
             report = None if service is None else _check_here(role, service, settings)
         except (ScenarioError, ChoiceError) as error:
             refuse(error)

@@ -10,15 +10,15 @@ import typer
 from palpate.report.files import write_text
 
 
-def doc_option(name: str) -> Any:
-    """The option `--doc` of a command; its file is looked at before anything is measured."""
+def docs_option(name: str) -> Any:
+    """The option `--docs` of a command; its file is looked at before anything is measured."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None:
             _around(path, name)
         return path
 
-    return typer.Option(help="A Markdown file whose marked part is replaced.", callback=check)
+    return typer.Option(help="A page whose marked part is replaced; every row goes to a CSV file beside it.", callback=check)
 
 
 def write_part(path: Path, name: str, text: str) -> None:

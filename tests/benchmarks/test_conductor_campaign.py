@@ -9,7 +9,7 @@ import pytest
 from conductor_messages import collected, result
 
 from palpate_benchmarks.campaign import COMPLETE, WENT_ON, CaseOver, FaultCase, FaultFinding, _conclude, _Watch
-from palpate_benchmarks.campaign_tables import markdown
+from palpate_benchmarks.campaign_tables import csv_text, markdown
 from palpate_bus.messages import ExamState
 from palpate_conductor.result import RunProgress
 
@@ -63,4 +63,9 @@ def test_the_page_sums_up_and_marks_what_is_bad() -> None:
     page = markdown([fine, slow])
     assert "1 of 2 as they should be; the largest force was 26.0 N." in page
     assert "| lockstep | kill | 2 | 1 | 2 | 30, 40 | 26.0 | run ended 2 |" in page
-    assert "| **!** | lockstep | kill | tissue |" in page
+    assert "**!** lockstep, kill tissue: tissue lost" in page
+    assert "robot lost" not in page
+    assert csv_text([fine, slow]).splitlines()[1:] == [
+        'yes,lockstep,kill,robot,20 ms,robot lost,run ended,"5.0, 5.5 N",robot lost',
+        'no,lockstep,kill,tissue,40 ms,tissue lost,run ended,"5.0, 26.0 N",tissue lost',
+    ]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
 
+import click
 import pytest
+import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -95,3 +99,26 @@ def test_help_and_unknown_words_know_them_all() -> None:
     assert {"run", "stop", "pause", "doctor", "topic", "reproduce"} <= names("--help")
     assert names("nonsense") == names("--help") == set(COMMANDS)
     assert names("run") == {"run"}
+
+
+def walked(command: click.Command, path: str) -> Iterator[tuple[str, click.Command]]:
+    """A command and those within it, by their words."""
+    if isinstance(command, click.Group):
+        for name, inner in command.commands.items():
+            yield from walked(inner, f"{path} {name}".strip())
+    else:
+        yield path, command
+
+
+@pytest.mark.parametrize("word", sorted(COMMANDS))
+def test_options_are_alike_everywhere(word: str) -> None:
+    for path, command in walked(typer.main.get_command(app_for(word)), ""):
+        options = {name: option for option in command.params if isinstance(option, click.Option) for name in option.opts}
+        assert command.help, path
+        assert "--doc" not in options, path
+        if "--out" in options:
+            assert "-o" in options["--out"].opts, path
+        if "--quiet" in options:
+            assert "-q" in options["--quiet"].opts, path
+        for name, option in options.items():
+            assert not re.search(r"\bms\b|[Mm]illisecond", option.help or ""), f"{path} {name}: times are in seconds"

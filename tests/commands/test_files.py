@@ -51,7 +51,7 @@ def test_a_document_without_both_marks_is_refused_and_kept(tmp_path: Path, text:
 def test_a_document_is_looked_at_before_anything_is_measured(tmp_path: Path) -> None:
     path = tmp_path / "doc.md"
     path.write_text("no marks\n")
-    done = CliRunner().invoke(app_for("faults"), ["faults", "--doc", str(path)])
+    done = CliRunner().invoke(app_for("faults"), ["faults", "--docs", str(path)])
     assert done.exit_code == 2
     words = " ".join(done.output.replace("│", " ").split())  # without the box
     assert "wants the lines" in words
