@@ -1,6 +1,7 @@
 """How soon the supervisor stops what planning should never have done: measured on the real services, in simulated time.
 
-Run as a program it prints the table of docs/faults.md, or writes it there: `python tests/test_supervisor_reaction.py --docs FILE`.
+Run as a program it prints the table of docs/faults.md, or writes it there:
+`python tests/test_supervisor_reaction.py --docs FILE`.
 """
 
 from __future__ import annotations
