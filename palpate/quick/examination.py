@@ -245,7 +245,7 @@ class QuickExamination:
         """The indenter follows the motion for a period, with this examination's errors."""
         motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
         self._count += 1
-        measured = (self._depth, self._force, self._touching)
+        measured = (self._depth, self._force, (_NOWHERE, _NOWHERE), self._touching)
         contact = ContactMeasurement(_NOWHERE, _NOWHERE, _FOOT, 0.0, 0.0, loop.uncertainty_m, *measured)
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT)
         at = int(motion.along.position * way.per_m + 0.5)

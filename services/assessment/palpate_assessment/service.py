@@ -72,6 +72,7 @@ class AssessmentService(Service):
             if state.patient_moved:
                 self._forget_motion(nanoseconds(state.header.stamp) / NS)
                 continue
+            self._moved_at = None
             sample = self._sampler.add(self._state(state))
             if sample is not None:
                 new.append(sample)
@@ -99,6 +100,8 @@ class AssessmentService(Service):
         wanted = contract().topics["perception/surface"].frame
         if message.header.frame_id != wanted:
             raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
+        if self._samples:
+            return  # a look at a patient who has moved: all is told where the first look saw it
         p_W = np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3)
         self._surface = apply(self._X_AW, p_W)
         self._coarse = self._grid(GROWING_PITCH)

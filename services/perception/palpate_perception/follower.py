@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Robot
 from palpate_perception.arm import ArmMask
 from palpate_perception.fusion import Image
+from palpate_perception.registration import shift_between
 from palpate_perception.tracker import NOTHING, Followed, Tracker
 from palpate_perception.views import Intrinsics
 from palpate_perception.wall import SeenWall, UnseenWallError
@@ -24,6 +27,8 @@ class Follower:
         self._watching = False
         self._asked_s = 0.0
         self._tracker: Tracker | None = None
+        self.shift = np.zeros(2)
+        """How far the patient, as the latest look shows, lies from where the first did, along the table in A [m]."""
         self.counts = dict.fromkeys(("quiet", "spoiled", "moved", "lost"), 0)
         """How many images said so."""
 
@@ -38,7 +43,7 @@ class Follower:
             self._look(t_s, depth, camera, q)
             followed = self._follow(t_s, depth, q)
         self.counts[followed.state.name.lower()] += 1
-        return followed
+        return replace(followed, shift=followed.shift + np.append(self.shift, 0.0))
 
     @property
     def watched(self) -> bool:
@@ -59,6 +64,8 @@ class Follower:
             return None
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         corners = np.array([(cx + i * width / 2, cy + j * height / 2, 0.0) for i in (-1, 1) for j in (-1, 1)])
+        if self._tracker is not None and self._tracker.moved:
+            self.shift = self.shift + shift_between(self._tracker.wall, wall, corners.mean(axis=0))
         self._tracker = Tracker(wall, times, d, corners)
         return wall, times, d
 

@@ -26,6 +26,8 @@ MESH_MARGIN_M: Final = 0.025
 MESH_STEP_M: Final = 0.005
 MOTION_M: Final = 5e-4
 """A standard deviation over the frames above this is worth a remark: noise alone gives less than a tenth of it."""
+HERE: Final[Array] = np.zeros(2)
+"""The shift of a patient who has not moved."""
 MIN_COVERAGE: Final = 0.95
 """With less of the region in view there are no targets."""
 
@@ -93,8 +95,13 @@ class Pipeline:
         X_CA = inverse(camera.X_WC) @ self._X_WA
         return DepthFusion(cloud.window(self._box, X_CA, camera.K, camera.shape))
 
-    def perceive(self, fusion: DepthFusion, camera: Intrinsics, mode: BreathingMode | None = None) -> Perceived:
-        """Runs the five steps on the fused frames; `mode` is the breathing's, if it is known."""
+    def perceive(
+        self, fusion: DepthFusion, camera: Intrinsics, mode: BreathingMode | None = None, shift: Array = HERE
+    ) -> Perceived:
+        """Runs the five steps on the fused frames; `mode` is the breathing's, if it is known.
+
+        Targets and mesh lie where a patient has them who was shifted by `shift` in A [m], shape (2,).
+        """
         fused = fusion.fused()
         origin = (fusion.window[0].start, fusion.window[1].start)
         depth = np.asarray(fused.depth, np.float64)
@@ -114,8 +121,8 @@ class Pipeline:
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
-        scan = scan_of(self._exam, lambda xy: _in_A(field, xy))
-        nodes = scan.targets  # 5
+        scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
+        nodes = scan.targets + shift  # 5
         known = pattern.supported(p_A, nodes, self._exam.spacing_m)  # 4
         p_W, n_W = self._on(field, nodes)
         targets = Targets(p_W, n_W, scan.line_of_target.astype(np.uint32))
@@ -123,7 +130,7 @@ class Pipeline:
         motion = self._motion(fusion, fused, points, p_A, camera)
         sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
         message = _remarks(int(np.count_nonzero(~known)), len(nodes), motion)
-        return Perceived(points, self._mesh(field, p_A, mode), targets, sigma, fused.frames, coverage, message)
+        return Perceived(points, self._mesh(field, p_A, mode, shift), targets, sigma, fused.frames, coverage, message)
 
     def _reasons(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> str:
         """Why the region's other cells were not seen."""
@@ -145,11 +152,11 @@ class Pipeline:
         p_A, n_A = _in_A(field, xy)
         return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
 
-    def _mesh(self, field: surface.HeightField, p_A: Array, mode: BreathingMode | None) -> PerceivedMesh:
+    def _mesh(self, field: surface.HeightField, p_A: Array, mode: BreathingMode | None, shift: Array) -> PerceivedMesh:
         """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
-        x = stations(cx, width + 2 * MESH_MARGIN_M, MESH_STEP_M)
-        y = stations(cy, height + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        x = stations(cx + shift[0], width + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        y = stations(cy + shift[1], height + 2 * MESH_MARGIN_M, MESH_STEP_M)
         nodes, known = pattern.downsample(p_A, x, y)
         keep = _grown(known.reshape(len(x), len(y)), 2).ravel()
         index = np.arange(len(nodes)).reshape(len(x), len(y))

@@ -86,7 +86,7 @@ class PerceptionService(Service):
             displacements = np.interp(burst.stamps_s, times, d)
             burst.fusion.level(displacements, wall.depth_per_metre(burst.camera, burst.fusion.window))
             mode = wall.mode
-        perceived = self._pipeline.perceive(burst.fusion, burst.camera, mode)
+        perceived = self._pipeline.perceive(burst.fusion, burst.camera, mode, self._follower.shift)
         self._last = perceived
         outbox: dict[str, Message | list[Message]] = {
             "perception/points": points(t, perceived.cloud.p_W),

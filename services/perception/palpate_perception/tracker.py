@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from palpate_models.frames import Array
 from palpate_perception.breath_filter import BreathFilter
+from palpate_perception.registration import PRIOR, reasons
 from palpate_perception.wall import SeenWall
 
 FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
@@ -39,8 +40,6 @@ DEEP: Final = 2.2
 """A breath so many times as deep as usual is a deep one."""
 CALM_S: Final = 0.6
 """So long after the last surprise the wall is as expected again."""
-PRIOR: Final = (0.010, 0.015, 0.015, 0.05)
-"""Standard deviations of what is left of the breath [m], s_x, s_y [m] and theta [rad]."""
 KEPT: Final = 0.7
 """Part of what was left over that counts on at the next image. Over the six images that count so, white noise falls to what
 neighbours and successive images share, which does not fall: their mean is about as certain as one image's white noise says."""
@@ -75,7 +74,7 @@ class Followed:
     sigma: float
     """Standard deviation of the displacement [m]."""
     shift: Array
-    """Of the body, in A [m], shape (3,); zero unless MOVED."""
+    """Of the body since the first look, in A [m], shape (3,)."""
 
 
 NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 0.1, np.zeros(3))
@@ -90,9 +89,7 @@ class Tracker:
         self.wall = wall
         self._filter = BreathFilter(t_s, d)
         middle = corners.mean(axis=0)
-        arm = wall.p_A - middle
-        turn = arm[:, 2] * wall.n_A[:, 0] - arm[:, 0] * wall.n_A[:, 2]  # n . (e_y x p)
-        self._reasons = np.column_stack((wall.lifts, wall.n_A[:, :2], turn))
+        self._reasons = reasons(wall.lifts, wall.n_A, wall.p_A - middle)
         self._corners = corners - middle
         self._certainty = (wall.gain / wall.sigma) ** 2
         self._whole = float(self._certainty @ wall.lifts**2)
@@ -104,6 +101,11 @@ class Tracker:
         self._last_s = float(t_s[-1])
         self._votes = 0
         self._moved = False
+
+    @property
+    def moved(self) -> bool:
+        """Whether the patient lies elsewhere than where the wall was learnt."""
+        return self._moved
 
     def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> Followed:
         """Takes the wall's pixels of an image exposed at `t_s` [s]: depth [m], and whether the arm may hide it, (n,) each."""

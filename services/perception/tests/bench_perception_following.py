@@ -107,12 +107,13 @@ class Run:
     told: list[Array] = field(default_factory=list)
     uncertainty: list[float] = field(default_factory=list)
     cost_s: list[float] = field(default_factory=list)
+    shift: list[Array] = field(default_factory=list)
     surface: Any = None
     answered_s: float = np.nan
 
 
-def run(case: Scenario, seconds: float, arm_in_view: bool = True) -> tuple[Run, Patient]:
-    """A look, then `seconds` [s] of strokes over the region."""
+def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float = 0.0) -> tuple[Run, Patient]:
+    """A look, then `seconds` [s] of strokes over the region, and a second look at `again_s` [s]."""
     patient, result = Patient(case), Run()
     camera, perception = CameraService(plant_input(case)), PerceptionService(exam_input(case))
     seen, heard = HandedInbox(), HandedInbox().receive(camera.start())
@@ -124,7 +125,8 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True) -> tuple[Run, 
     q = home
     for k in range(round((LOOK_S + seconds) * 10)):
         t = k * TICK
-        trigger = {"planning/camera_trigger": CameraTrigger(header(t), case.camera.frames)} if k == 2 else {}
+        looks = (2, round(10 * again_s)) if again_s else (2,)
+        trigger = {"planning/camera_trigger": CameraTrigger(header(t), case.camera.frames)} if k in looks else {}
         if arm_in_view and t > LOOK_S * NS:
             phase = (t / NS - LOOK_S) / 8.0  # a line of 8 s, to and fro
             p = np.array((cx + width * ((0.1 * phase) % 1 - 0.5), cy + height * (abs(2 * (phase % 1) - 1) - 0.5), 0.01))
@@ -149,6 +151,7 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True) -> tuple[Run, 
         result.state.append(message.state)
         result.told.append(np.array((message.displacement, *message.forecast[1:])))
         result.uncertainty.append(message.uncertainty)
+        result.shift.append(np.array((message.shift.x, message.shift.y)))
         result.cost_s.append(cost)
     return result, patient
 

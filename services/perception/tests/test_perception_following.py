@@ -7,8 +7,9 @@ import pytest
 from bench_perception_following import READY, Patient, Run, run
 
 from palpate_bus.messages import SurfaceMotion
+from palpate_models.frames import apply, inverse
 from palpate_models.lbr_kinematics import tool_pose
-from palpate_models.load import load_scenario
+from palpate_models.load import exam_input, load_scenario
 from palpate_models.scenario import Robot
 from palpate_perception.arm import ArmMask, passes
 from palpate_perception.breath_filter import BreathFilter, strongest_rate
@@ -93,3 +94,18 @@ def test_a_patient_who_moves_is_noticed_within_a_second(kind: str) -> None:
     moved = t[state == SurfaceMotion.MOVED]
     assert len(moved)
     assert patient.motion.at_s < moved[0] <= patient.motion.at_s + 1.0
+
+
+@pytest.mark.parametrize("kind", ["shift", "turn"])
+def test_a_second_look_tells_where_the_patient_who_moved_lies(kind: str) -> None:
+    case = load_scenario("restless", ("exam.region_m=[0.1, 0.1]", f"phantom.motion.kind={kind}", "phantom.motion.at_s=14"), 3)
+    result, patient = run(case, seconds=18.0, arm_in_view=False, again_s=16.0)
+    assert result.state[-1] == SurfaceMotion.QUIET
+    X = patient.motion.pose(20.0)
+    middle = np.append(case.exam.centre_m, 0.0)
+    moved = (X[:3, :3] @ middle + X[:3, 3] - middle)[:2]
+    assert np.abs(result.shift[-1] - moved)[0] < 1.5e-3
+    assert np.abs(result.shift[-1] - moved)[1] < 4e-3, "along the body the wall is flat"
+    p_A = apply(inverse(np.array(exam_input(case).X_WA)), np.asarray(result.surface.vertices, np.float64).reshape(-1, 3))
+    centre = (p_A[:, :2].min(axis=0) + p_A[:, :2].max(axis=0)) / 2
+    assert np.abs(centre - case.exam.centre_m - result.shift[-1]).max() < 3e-3, "the mesh lies where the body lies"

@@ -48,6 +48,8 @@ class ContactMeasurement(NamedTuple):
     """Radius less the signed distance of the sphere's centre from the unpressed skin, where it is now [m]; negative: gap."""
     force: float
     """Normal force [N], positive when the tissue is pressed."""
+    skin: tuple[Array, Array]
+    """The point of the skin under the indenter and its outward normal, where the first look saw them (`Wall.skin`)."""
     touching: bool
     """Whether the tissue is felt; before the first tare the sensor's bias would pass for it, and nothing is."""
 
@@ -83,5 +85,6 @@ class ContactSensing:
             wall.sigma(foot.xy_A, t),
             self._radius - foot.distance + correction + displacement,
             force,
+            wall.skin(foot, correction),
             self._touching,
         )

@@ -27,10 +27,10 @@ TARE_S = 0.25
 class Descent:
     """Takes one stroke after another down to the skin; `start` before each."""
 
-    def __init__(self, motion: StrokeMotion, depth: float, period_s: float) -> None:
-        """`depth` [m]: so far below the skin, at least, force is felt."""
+    def __init__(self, motion: StrokeMotion, depth: float, period_s: float, before: int = 0) -> None:
+        """`depth` [m]: so far below the skin, at least, force is felt. There were `before` descents before."""
         self._motion, self._depth, self._period_s = motion, depth, period_s
-        self.stroke = 0
+        self.stroke = before
         """Number of the descent under way or last made, from 1 on."""
         self.taring = False
         """Whether the arm is at rest in free air, so that what the sensor reads is bias and weight."""
@@ -43,7 +43,9 @@ class Descent:
     def start(self) -> None:
         """Before a descent: at rest, soon, above the skin."""
         self._rested = 0.0
-        self._onset: Onset | None = Onset()
+        self._onset = Onset()
+        self._felt = self._sure = False
+        """Whether the skin has been touched, and whether where is known as surely as it will be."""
 
     def rest(self, height: float, speed: float) -> bool:
         """Rests `height` [m] above the skin, getting there at `speed` [m/s]; returns whether it has rested and tared."""
@@ -57,7 +59,7 @@ class Descent:
 
     def probe(self, contact: ContactMeasurement, t: int) -> bool:
         """Sinks towards the skin at `t` [ns]; returns whether it has been touched, at this step or before."""
-        if self._onset is None:
+        if self._felt:
             return True
         motion = self._motion
         unsure = SIGMAS * contact.uncertainty
@@ -65,11 +67,20 @@ class Descent:
         near = motion.depth.position > -unsure - ALLOWANCE_M - braking
         deepest = motion.depth.step(unsure + self._depth, PROBE_MPS if near else DESCEND_MPS)
         if near:
-            self._onset.add(contact.depth, contact.force)
+            self._onset.add(contact.depth, contact.force, t, contact.displacement)
         if contact.force >= FELT_N or (deepest and contact.touching):
             self.touched, outward = motion.wall.touched(contact.foot, self._onset.touch(), self.stroke, t)
             motion.shift(outward)
-            self._onset = None
+            self._felt = True
         elif deepest:
             self.missed = f"no tissue felt down to {(unsure + self._depth) * 1e3:.0f} mm below where it is believed to be"
-        return self._onset is None
+        return self._felt
+
+    def make_sure(self) -> None:
+        """Finds the touch anew as soon as perception has seen how the wall moved in it: before the indenter is at its depth."""
+        if self._sure or not self._felt:
+            return
+        outward = self._motion.wall.revise(self._onset)
+        if outward is not None:
+            self._motion.shift(outward)
+            self._sure = True

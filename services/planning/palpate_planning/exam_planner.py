@@ -86,8 +86,11 @@ class ExamPlanner:
         mesh = None if perceived is None else (perceived.vertices, perceived.triangles)
         return self._motion(CollisionScene(self._kinematics, self._known.robot, mesh), q0, q1)
 
-    def examination(self, perceived: PerceivedAbdomen, q_now: Array) -> ExamPlan:
-        """The whole examination. Raises NoPathError if no target is left or there is no way to the first."""
+    def examination(self, perceived: PerceivedAbdomen, q_now: Array, wanted: frozenset[int] | None = None) -> ExamPlan:
+        """The examination of the targets that are `wanted`, of all if None.
+
+        Raises NoPathError if none of them can be reached or there is no way to the first.
+        """
         known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)
         free, contact = (CollisionScene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
         xy = apply(inverse(np.array(known.X_WA)), perceived.positions)[:, :2]
@@ -104,7 +107,7 @@ class ExamPlanner:
         joined = scan_of(exam, perceived.surface.in_A).joined
         breaks: set[int] = set()
         while True:  # ends: each round takes targets or joints away
-            usable = np.array([i not in skipped for i in range(len(xy))], dtype=bool)
+            usable = np.array([i not in skipped and (wanted is None or i in wanted) for i in range(len(xy))], dtype=bool)
             scan = [] if exam.searched else strokes(xy, perceived.lines, usable, joined, exam.mode, exam.spacing_m, breaks)
             pieces = touches(xy, usable) + scan
             layout = segments.lay(pieces)
@@ -117,9 +120,10 @@ class ExamPlanner:
             raise NoPathError(f"no target is left of {len(xy)}: {reasons}")
         start = segments.hover(pieces[0], 0)
         assert start is not None, "a stroke that cannot be hovered over is trouble"
+        missed = {i: why for i, why in skipped.items() if wanted is None or i in wanted}
         approach = self._motion(free, q_now, start)
         presses = PressPlanner(segments, xy, usable, pieces[-1]) if exam.searched else None
-        return ExamPlan(approach, tuple(layout.segments), skipped, presses)
+        return ExamPlan(approach, tuple(layout.segments), missed, presses)
 
     def _motion(self, scene: CollisionScene, q0: Array, q1: Array) -> JointTrajectory:
         return timed_motion(scene, self._kinematics, self._known.limits, q0, q1, self._known.exam.seed, self._period_s)

@@ -31,6 +31,8 @@ from palpate_planning.tool_weight import ToolWeight
 from palpate_planning.wall import TouchedSkin, Wall, plane
 
 LOOKS_MAX = 3
+MOVES_MAX = 2
+"""A patient who moves more often is not looked at again."""
 REST = 200 * MS
 """Time at rest before looking [ns]: the arm's oscillations fade."""
 LOOK_PATIENCE = 12 * SECOND
@@ -87,6 +89,10 @@ class ExamSequence:
         """The press that is being laid."""
         self._requested = self._pressed = 0
         """Numbers of the search's requests: the latest, and the latest that is over."""
+        self._moves = 0
+        """How often the patient was looked at again, having moved."""
+        self._wanted: frozenset[int] | None = None
+        """The targets that were left then; None: all are wanted."""
         self._skipped: dict[int, str] = {}
         self._trigger = False
         self._path: Array | None = None
@@ -149,7 +155,8 @@ class ExamSequence:
                 self._look_again(now, f"look posture cannot be reached: {error}")
         elif isinstance(now.perceived, PerceivedAbdomen):
             course.perceived = now.perceived
-            self._sense.wall = Wall(now.perceived.surface, self._sense.wall.breath)
+            wall, surface = self._sense.wall, now.perceived.surface
+            self._sense.wall = wall.seen_again(surface) if self._moves else Wall(surface, wall.breath)
             self.status.target_count, self.status.view_blocked = len(now.perceived.positions), False
             course.enter(Phase.PLAN, now.t, f"planning over {self.status.target_count} targets")
         elif isinstance(now.perceived, PerceptionFailure):
@@ -164,7 +171,14 @@ class ExamSequence:
         self.status.view_blocked = "blocked" in why
         self.status.message = why
         if self._looked >= min(LOOKS_MAX, len(self._looks)):
-            self._course.abort(now, f"gave up after {self._looked} looks: {why}")
+            self._give_up(now, f"gave up after {self._looked} looks: {why}")
+
+    def _give_up(self, now: Observation, why: str) -> None:
+        """Ends an examination before it has begun; what was felt before a patient moved is assessed all the same."""
+        if self._moves:
+            self._course.go_home(now, "")
+        else:
+            self._course.abort(now, why)
 
     def _plan(self, now: Observation) -> Setpoint | None:
         course = self._course
@@ -172,15 +186,20 @@ class ExamSequence:
             perceived, start = course.perceived, course.arm.q.copy()
             assert perceived is not None
             self._planning = BackgroundTask(
-                now.t, EXAM_PLANNING_TIME, lambda: self._planner.examination(perceived, start), lockstep=self._lockstep
+                now.t,
+                EXAM_PLANNING_TIME,
+                lambda: self._planner.examination(perceived, start, self._wanted),
+                lockstep=self._lockstep,
             )
         elif self._planning.due(now.t):
+            task, self._planning = self._planning, None
             try:
-                plan = course.plan = self._planning.result()
+                plan = course.plan = task.result()
             except NoPathError as error:
-                course.abort(now, str(error))
+                self._give_up(now, str(error))
                 return None
-            self._skipped = dict(plan.skipped)
+            self._skipped = {i: why for i, why in self._skipped.items() if i not in (self._wanted or ())} | plan.skipped
+            self._sense.wall.shift_A = self._sense.wall.breath.shift_A
             self._path = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m)
             course.arm.start(plan.approach)
             self.status.targets_skipped = len(self._skipped)
@@ -200,6 +219,7 @@ class ExamSequence:
                 self._known.robot.indenter_radius_m,
                 self._periods.step_s,
                 self._sense.wall,
+                strokes=self.status.stroke,
                 more=course.plan.presses is not None,
             )
             return self._palpate(now)
@@ -218,8 +238,19 @@ class ExamSequence:
         else:
             self._sense.weight.start_tare()
         if step.stage is StrokeStage.DONE:
-            course.go_home(now, course.palpation.failed)
+            self._end_strokes(now, course.palpation)
         return step.setpoint
+
+    def _end_strokes(self, now: Observation, palpation: Palpation) -> None:
+        """Goes home; but where a patient has moved before all was felt, looks at him again, to go on with what is left."""
+        if not (palpation.moved and palpation.ahead and self._moves < MOVES_MAX):
+            self._course.go_home(now, palpation.failed)
+            return
+        assert now.reading is not None
+        self._moves, self._wanted = self._moves + 1, palpation.ahead
+        self._asked, self._looked = None, 0
+        self._course.arm.hold(now.reading.q)
+        self._course.enter(Phase.LOOK, now.t, "the patient has moved: looking again")
 
     def _search(self, now: Observation, palpation: Palpation) -> None:
         """Has the press laid that the search asks for, one at a time, and counts those that are over as targets."""

@@ -19,8 +19,7 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
     """`palpation_msgs/ExamState`; without a contact (the robot has not been heard of) nothing is measured."""
     p, n = np.zeros(3), np.array((0.0, 0.0, 1.0))
     if contact is not None:
-        n = contact.foot.n_W
-        p = contact.foot.p_W + contact.correction * n
+        p, n = contact.skin
     return ExamState(
         header=header(t, "world"),
         phase=int(status.phase),
@@ -63,4 +62,5 @@ def motion_of(message: Message) -> Motion:
     hidden = message.state == SurfaceMotion.LOST and message.uncertainty < HIDDEN_M
     calm = message.state == SurfaceMotion.QUIET or hidden
     moved = bool(message.state == SurfaceMotion.MOVED)
-    return Motion(nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved)
+    shift = (float(message.shift.x), float(message.shift.y))
+    return Motion(nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved, shift)

@@ -33,6 +33,8 @@ STEADY_FRACTION = 0.5
 """Samples count from this part of the path's speed on."""
 STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
+UNNOTICED_M = 0.03
+"""So much of the stroke before a patient was seen to have moved does not count: it is noticed after a second."""
 REPEAT_M = 0.010
 """So much of the stroke before the interruption is repeated: it is noticed after about 0.2 s."""
 
@@ -87,19 +89,22 @@ class Palpation:
         period_s: float,
         wall: Wall,
         *,
+        strokes: int = 0,
         more: bool = False,
     ) -> None:
-        """`radius` of the sphere [m]; `wall`: what is pressed, and learns from every touch; `more`: whether it waits for further
-        segments after the last (`extend`, `close`).
+        """`radius` of the sphere [m]; `wall`: what is pressed, and learns from every touch; `strokes`: descents made before;
+        `more`: whether it waits for further segments after the last (`extend`, `close`).
         """
         self._more = more
         self._segments, self._exam, self._limits, self._period_s = segments, exam, limits, period_s
         self._watch = WallWatch(wall.breath, exam.breathing, period_s)
         self.left = ""
         """Why the strokes end early, in good order; empty if they do not."""
+        self.ahead: frozenset[int] = frozenset()
+        """The targets that are then left."""
         self._motion = StrokeMotion(exam, limits, radius, period_s, wall)
         self._recovery = Recovery(exam, limits, period_s)
-        self._descent = Descent(self._motion, exam.depth_m, period_s)
+        self._descent = Descent(self._motion, exam.depth_m, period_s, strokes)
         self._number = -1
         self._joined = False
         """Whether the commanded depth is where the arm is; after a free motion it is measured first."""
@@ -119,6 +124,11 @@ class Palpation:
     def failed(self) -> str:
         """Why the palpation gave up; empty if it did not."""
         return self._recovery.failed
+
+    @property
+    def moved(self) -> bool:
+        """Whether the strokes ended because the patient has moved: what is `ahead` can be gone on with after a look."""
+        return self._watch.moved and not self.failed
 
     @property
     def free_goal(self) -> Array | None:
@@ -152,10 +162,14 @@ class Palpation:
         if self.left or self.stage is StrokeStage.DONE:
             return
         self.left = why
-        ahead = [i for segment in self._segments[self._number + 1 :] for i in segment.path.targets if segment.contact]
+        strokes = [s.path for s in self._segments[self._number + 1 :] if s.contact and not s.touch]
+        ahead = [int(i) for path in strokes for i in path.targets]
         path = self._motion.segment.path
-        ahead += list(path.targets[path.visits > self._motion.along.position]) if self._motion.segment.contact else []
-        self._recovery.skipped |= {int(i): why for i in ahead}
+        if self._motion.segment.contact and not self._motion.segment.touch:
+            behind = UNNOTICED_M if self._watch.moved else 0.0
+            ahead += [int(i) for i in path.targets[path.visits > self._motion.along.position - behind]]
+        self.ahead = frozenset(ahead)
+        self._recovery.skipped |= dict.fromkeys(self.ahead, why)
         if self.stage is not StrokeStage.LIFT:
             self._enter(StrokeStage.LIFT)
 
@@ -193,6 +207,8 @@ class Palpation:
         self._time += self._period_s
         self._descent.taring, self._descent.touched = False, None
         self._recovery.return_to_path(contact)
+        if self.stage not in (StrokeStage.SLIDE, StrokeStage.HOLD):
+            self._descent.make_sure()
         if contact.force > self._limits.force_soft_stop_n and self.stage in PRESSING:
             self._recovery.soft_stop(contact.force, self._motion.segment.path, self._motion.along.position)
             self._enter(StrokeStage.LIFT)

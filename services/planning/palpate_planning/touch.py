@@ -48,14 +48,27 @@ class Onset:
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, float]] = []
+        self._moving: list[tuple[int, float]] = []
 
-    def add(self, depth: float, force: float) -> None:
-        """Takes measured depth [m] and normal force [N]."""
+    def add(self, depth: float, force: float, t: int, displacement: float) -> None:
+        """Takes depth [m] and normal force [N] measured at `t` [ns], and the wall's displacement that is in this depth [m]."""
         self._rows.append((depth, force))
+        self._moving.append((t, displacement))
 
     def touch(self) -> Touch:
         """The touch in what was collected."""
         return find_touch(np.array(self._rows))
+
+    @property
+    def times(self) -> Array:
+        """When it was collected [ns], shape (n,)."""
+        return np.array([t for t, _ in self._moving])
+
+    def touch_again(self, displacement: Array) -> Touch:
+        """The touch, had the wall been displaced as is known by now [m], shape (n,)."""
+        rows = np.array(self._rows)
+        rows[:, 0] += displacement - np.array([lifted for _, lifted in self._moving])
+        return find_touch(rows)
 
 
 def find_touch(rows: Array) -> Touch:

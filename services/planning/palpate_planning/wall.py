@@ -19,7 +19,7 @@ from palpate_models.frames import Array
 from palpate_planning.breath import Breath
 from palpate_planning.surface import Foot, PerceivedSurface
 from palpate_planning.surface_correction import SurfaceCorrection
-from palpate_planning.touch import Touch
+from palpate_planning.touch import Onset, Touch
 
 
 class TouchedSkin(NamedTuple):
@@ -45,6 +45,28 @@ class Wall:
         """Uncorrected until it is touched."""
         self.perceived, self.breath = perceived, breath
         self.correction = SurfaceCorrection()
+        self.shift_A = np.zeros(2)
+        """How far the body lies from where the first look saw it, along the table in A [m], shape (2,)."""
+        self._first = perceived
+        self._touched: tuple[Foot, float] | None = None
+        """Where the latest touch was, and the correction there before it [m]."""
+
+    def seen_again(self, perceived: PerceivedSurface) -> Wall:
+        """The wall as a later look sees it; what the touches told of camera and arm holds on."""
+        wall = Wall(perceived, self.breath)
+        wall.correction, wall._first = self.correction, self._first
+        wall.correction.blur()
+        return wall
+
+    def skin(self, foot: Foot, correction: float) -> tuple[Array, Array]:
+        """The point of the skin [m] that is now `correction` [m] above `foot`, and its outward normal, shape (3,) each.
+
+        Both as the body lay at the first look, at the end of expiration: there all that is felt is in one frame.
+        """
+        if not self.shift_A.any():
+            return foot.p_W + correction * foot.n_W, foot.n_W
+        p, n = self._first.at((foot.xy_A - self.shift_A)[None])
+        return p[0] + correction * n[0], n[0]
 
     def outward(self, p_W: Array, t: int) -> float:
         """How far the wall lies outward of the perceived surface at its point p_W, shape (3,), at `t` [ns]; in metres."""
@@ -65,8 +87,23 @@ class Wall:
         sigma = math.hypot(touch.sigma, self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t))
         felt = before - touch.depth
         self.correction.touch(foot.xy_A, felt, sigma)
+        self._touched = foot, before
         observed = TouchedSkin(foot.p_W, stroke, felt, sigma, before, before_sigma)
         return observed, self.correction.height(foot.xy_A) - before
+
+    def revise(self, onset: Onset) -> float | None:
+        """Finds the latest touch anew, once the wall's motion in it was seen; how far that moves the wall there outward [m].
+
+        None while it has not been seen: by the forecast a touch errs by 0.5 to 1.2 mm, by what is seen by half of that.
+        """
+        seen = self.breath.seen(onset.times)
+        if seen is None or self._touched is None:
+            return None
+        foot, before = self._touched
+        share, reckoned = self.perceived.breathing(foot.xy_A), self.correction.height(foot.xy_A)
+        touch = onset.touch_again(share * seen)
+        self.correction.revise(before - touch.depth, math.hypot(touch.sigma, share * self.breath.seen_uncertainty))
+        return self.correction.height(foot.xy_A) - reckoned
 
 
 def plane(X_WA: Array) -> Wall:

@@ -29,6 +29,8 @@ class WallWatch:
         """Whether what is measured now is worth nothing: the indenter has to lift off."""
         self.open = True
         """Whether samples may be taken at this moment of the breath."""
+        self.moved = False
+        """Whether the patient has moved."""
         self.ended = ""
         """Why the strokes have to end; empty while they need not."""
 
@@ -48,7 +50,8 @@ class WallWatch:
             self._losses, self._adrift_for = self._losses + 1, 0.0
         self.spoiled = lost or not calm
         self.open = not self._gated or abs(breath.displacement(t)) < GATE_M
-        if breath.moved:
+        self.moved = self.moved or breath.moved
+        if self.moved:
             self.ended = "the patient has moved"
         elif self._restless_for > CALM_PATIENCE_S:
             self.ended = f"the wall could not be followed for {CALM_PATIENCE_S:g} s"

@@ -90,8 +90,8 @@ class World:
         time [s], which perception forecasts as it is, every 0.1 s; without it nothing is said about a motion.
         """
         self.excursion = excursion
-        self.calm, self.moved = True, False
-        """What is said about the motion."""
+        self.calm, self.moved, self.shift_A = True, False, (0.0, 0.0)
+        """What is said about the motion; a look finds the patient where he is now."""
         self.settings, self.force = settings, force or hertz(2.4)
         self.exam = ExamSequence(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
@@ -155,7 +155,7 @@ class World:
         outcome = self.exam.step(Observation(self.t, reading, answer, motion, final, self.stop, self.soft, self.end, self.lost))
         self.end = ""
         if outcome.trigger:
-            self._answer_at = self.t + 300 * MS
+            self._answer_at, self.moved = self.t + 300 * MS, False
         status = self.exam.status
         self.rows.append((status.phase, status.steady, status.force_limited, status.depth_setpoint, self.depth, self.pressed))
         self.setpoints.append(outcome.setpoint)
@@ -169,7 +169,7 @@ class World:
         assert self.excursion is not None
         stamp = self.t - 100 * MS
         forecast = np.array([self.excursion((stamp + k * FORECAST_STEP) / SECOND) for k in range(11)])
-        return Motion(stamp, forecast, 3e-4, self.calm, self.moved)
+        return Motion(stamp, forecast, 3e-4, self.calm, self.moved, self.shift_A)
 
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
         """Steps until the exam has ended (or `until`), at most `seconds` of simulated time."""

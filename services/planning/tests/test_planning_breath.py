@@ -9,8 +9,9 @@ from planning_fakes import World, known
 from palpate_bus.messages import SurfaceMotion
 from palpate_models.scenario import Following
 from palpate_planning.breath import FORECAST_STEP, JOIN_S, Breath, Motion
+from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.periods import MS, SECOND
-from palpate_planning.status import Phase
+from palpate_planning.status import PerceptionFailure, Phase
 from palpate_planning.wall_watch import CALM_S, LOST_MAX, LOST_S, WallWatch
 
 DT = 0.01
@@ -117,19 +118,65 @@ def test_what_a_cough_spoils_is_repeated() -> None:
     assert world.exam.status.targets_skipped == 0
 
 
-def test_a_patient_who_moves_is_left_within_a_second() -> None:
+def moved_in_the_second_stroke(*answers: PerceivedAbdomen | PerceptionFailure) -> World:
+    """An examination in which the patient has moved, within a second of when that was said; later looks have these answers."""
     world = World(known(region_m=(0.025, 0.025)), excursion=breathing)
+    world.answers += answers
+    for _ in range(2):
+        world.run(lambda: world.exam.status.phase is Phase.SCAN)
+        world.run(lambda: world.exam.status.phase is not Phase.SCAN)
     world.run(lambda: world.exam.status.phase is Phase.SCAN)
     world.moved = True
     for _ in range(100):
         world.step()
     assert world.depth < -0.008
+    assert world.exam.status.patient_moved
+    return world
+
+
+def test_a_patient_who_moves_is_looked_at_again_and_the_rest_is_felt() -> None:
+    world = moved_in_the_second_stroke()
+    strokes = world.exam.status.stroke
+    assert world.exam.status.phase is Phase.LOOK
+    world.shift_A = (0.008, -0.003)
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    status = world.exam.status
+    assert status.stroke > strokes
+    assert not status.patient_moved
+    foot = world.exam._course.contact.foot
+    place = world.exam._sense.wall.perceived.xy(world.exam._course.contact.skin[0])
+    assert place == pytest.approx(foot.xy_A - (0.008, -0.003), abs=5e-4)
+    world.run()
+    assert status.phase is Phase.DONE
+    assert status.targets_skipped == 0
+
+
+def test_a_patient_who_moved_and_is_not_seen_again_is_assessed_as_far_as_he_was_felt() -> None:
+    world = moved_in_the_second_stroke(PerceptionFailure("a curtain"))
     world.run()
     status = world.exam.status
     assert status.phase is Phase.DONE
-    assert status.patient_moved
     assert 0 < status.targets_skipped < status.target_count
     assert "moved" in next(iter(world.exam.skipped.values()))
+
+
+def test_what_was_seen_is_told_for_the_past_alone() -> None:
+    breath = Breath()
+    breath.hear(motion(SECOND, 0.001, 0.0), SECOND + 100 * MS)
+    breath.hear(motion(SECOND + 100 * MS, 0.003, 0.0), SECOND + 200 * MS)
+    assert breath.seen(np.array([SECOND, SECOND + 50 * MS])) == pytest.approx([0.001, 0.002])
+    assert breath.seen(np.array([SECOND, SECOND + 150 * MS])) is None
+
+
+def test_a_forecast_is_the_less_sure_the_older_and_the_worse_those_before_were() -> None:
+    good, bad = Breath(), Breath()
+    for k in range(10):
+        for breath, step in ((good, 0.0), (bad, 5e-4)):
+            breath.hear(motion(k * 100 * MS, *[(-1) ** k * step] * 11), (k + 1) * 100 * MS)
+    t = SECOND + 50 * MS
+    assert good.uncertainty(t) == pytest.approx(3e-4)
+    assert bad.uncertainty(t) > 5e-4
+    assert bad.uncertainty(t + 50 * MS) > bad.uncertainty(t)
 
 
 def test_the_forecast_is_read_at_the_times_that_the_message_says() -> None:

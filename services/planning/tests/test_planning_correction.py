@@ -5,15 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_planning.surface_correction import (
-    FIELD_LENGTH_M,
-    FIELD_M,
-    FINE_LENGTH_M,
-    FINE_M,
-    OFFSET_M,
-    TILT_RAD,
-    SurfaceCorrection,
-)
+from palpate_planning.surface_correction import FIELD_LENGTH_M, FIELD_M, OFFSET_M, TILT_RAD, SurfaceCorrection
 
 PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
 BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])
@@ -27,7 +19,7 @@ def tilted(xy: np.ndarray) -> np.ndarray:
 def test_untouched_it_is_nothing_and_unsure() -> None:
     correction = SurfaceCorrection()
     assert correction.height(np.zeros(2)) == 0.0
-    assert correction.sigma(np.zeros(2)) == pytest.approx(np.sqrt(OFFSET_M**2 + FIELD_M**2 + FINE_M**2))
+    assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(OFFSET_M, FIELD_M))
 
 
 def test_offset_and_tilt_are_found_in_between() -> None:
@@ -53,7 +45,7 @@ def test_its_errors_are_as_large_as_it_says() -> None:
     everywhere = np.vstack((PLACES, BETWEEN))
     apart = np.sum((everywhere[:, None] - everywhere) ** 2, axis=-1)
     covariance = OFFSET_M**2 + TILT_RAD**2 * everywhere @ everywhere.T
-    covariance += FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)) + FINE_M**2 * np.exp(-apart / (2 * FINE_LENGTH_M**2))
+    covariance += FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2))
     scores = []
     for _ in range(50):
         truth = rng.multivariate_normal(np.zeros(len(everywhere)), covariance)
@@ -75,3 +67,25 @@ def test_touches_tell_how_rough_the_error_is(rough_m: float, most_m: float, roug
         correction.touch(place, float(height), 2.5e-4)
     assert roughness[0] <= correction.roughness <= roughness[1]
     assert correction.sigma(np.array((0.02, 0.02))) < most_m
+
+
+def test_the_latest_touch_can_be_revised() -> None:
+    revised, right = SurfaceCorrection(), SurfaceCorrection()
+    for correction in (revised, right):
+        correction.touch(PLACES[0], 0.004, 4e-4)
+    revised.touch(PLACES[1], 0.006, 9e-4)
+    revised.revise(0.005, 4e-4)
+    right.touch(PLACES[1], 0.005, 4e-4)
+    assert revised.height(PLACES[2]) == pytest.approx(right.height(PLACES[2]))
+    assert revised.sigma(PLACES[2]) == pytest.approx(right.sigma(PLACES[2]))
+
+
+def test_a_new_look_keeps_what_touches_told_of_offset_and_tilt() -> None:
+    correction = SurfaceCorrection()
+    for place in PLACES:
+        correction.touch(place, float(tilted(place)), 3e-4)
+    before = correction.sigma(PLACES[0])
+    correction.blur()
+    assert correction.sigma(PLACES[0]) > before
+    for place in BETWEEN:
+        assert correction.height(place) == pytest.approx(float(tilted(place)), abs=5e-4)

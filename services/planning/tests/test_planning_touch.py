@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_planning.touch import FELT_N, UNFITTED_M, find_touch
+from palpate_planning.touch import FELT_N, UNFITTED_M, Onset, find_touch
 
 
 def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:
@@ -38,3 +38,11 @@ def test_on_bone_the_skin_is_where_force_begins() -> None:
     touch = find_touch(rows)
     assert touch.depth == pytest.approx(0.0, abs=1e-9)
     assert touch.sigma == UNFITTED_M
+
+
+def test_a_wall_that_was_not_where_it_was_forecast_moves_the_touch() -> None:
+    onset = Onset()
+    for k, (depth, force) in enumerate(descent(0.003, 1.5, 1.3, 0.0, 0.0)):
+        onset.add(float(depth), float(force), k, 0.001)
+    assert onset.touch().depth == pytest.approx(0.003, abs=1e-5)
+    assert onset.touch_again(np.full(len(onset.times), 0.0005)).depth == pytest.approx(0.0025, abs=1e-5)
