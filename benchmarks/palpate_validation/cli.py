@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from palpate.case_display import CaseDisplay
 from palpate.command_line import output_file, output_folder, refuse
 from palpate_validation.check import PageSection
 from palpate_validation.report import failures, table, write, write_page
@@ -56,8 +57,10 @@ def validate(
     if unknown:
         refuse(f"--only {unknown[0]}: sections are {', '.join(SECTIONS)}")
     sections = []
-    for name in [name for name in SECTIONS if not only or name in only]:
-        with console.status(f"measuring: {name}"):
+    wanted = [name for name in SECTIONS if not only or name in only]
+    with CaseDisplay(console, False, "sections") as display:
+        for number, name in enumerate(wanted):
+            display.tell(number, len(wanted), f"measuring {name}")
             sections.append(run_section(name))
     try:
         write(sections, out)

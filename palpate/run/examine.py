@@ -28,7 +28,7 @@ from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers, write_scenario_files
 from palpate.run.secure import SecureBus
-from palpate.run.space import WatchedRoom, another_folder, check_room, megabytes_of, what_it_takes
+from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration, megabytes_of, what_it_takes
 from palpate_bus.implementations import ChoiceError, check_libraries
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError
@@ -99,7 +99,7 @@ def examine(scenario: Scenario, how: How) -> None:
     try:
         with results_folder(folder, overwrite=how.overwrite):
             check_room(folder, scenario.exam, how.record)
-            with RunDisplay(console, quiet) as display, given({"PALPATE_RECORD": how.record}):
+            with RunDisplay(console, quiet, expected_duration(scenario.exam)) as display, given({"PALPATE_RECORD": how.record}):
                 tell = WatchedRoom(folder, display.tell, say).tell
                 result = _run(scenario, folder.resolve(), tell, how, observers, absent, groups)
             conclude(console, folder, scenario, result, quiet, how.as_json)
@@ -199,7 +199,7 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     except (ScenarioError, BusConfigError) as error:
         refuse(error)
     roles = (*workers(chosen), *observers)
-    with RunDisplay(console, quiet) as display:
+    with RunDisplay(console, quiet, expected_duration(chosen.exam)) as display:
         timing = Timing(wallclock, 1.0 if realtime else None)
         result = conduct_run(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
     close_session(session)

@@ -20,12 +20,15 @@ PHASES = {
     for name in ("HOME", "LOOK", "PLAN", "APPROACH", "INDENT", "SCAN", "RETRACT", "RETURN", "ASSESS", "DONE", "ABORTED", "HELD")
 }
 """Phase names by value."""
+MINUTE_S = 60.0
 
 
 class RunDisplay:
     """A progress line on a terminal, and an operator's keys; plain lines at each phase otherwise; nothing when quiet."""
 
-    def __init__(self, console: Console, quiet: bool) -> None:
+    def __init__(self, console: Console, quiet: bool, expected_s: float | None = None) -> None:
+        """`expected_s`: about how long the examination takes, in simulated time [s]; from it the time left is told."""
+        self._expected_s = expected_s
         self._console = console
         self._quiet = quiet
         self._phase = -1
@@ -63,7 +66,7 @@ class RunDisplay:
             return
         facts = (
             f"t {progress.t / NS:6.1f} s   {progress.real_time_factor:4.2f} x real time   "
-            f"force {exam.normal_force:5.2f} N   depth {max(exam.depth, -0.0999) * 1e3:5.1f} mm"
+            f"force {exam.normal_force:5.2f} N   depth {max(exam.depth, -0.0999) * 1e3:5.1f} mm{self._left(progress)}"
         )
         done = exam.target_index / exam.target_count if exam.target_count else 0.0
         self._bar.update(self._task, completed=done, phase=PHASES[exam.phase], facts=facts)
@@ -73,6 +76,13 @@ class RunDisplay:
                 self._console.print(
                     f"[dim]{progress.t / NS:8.2f} s[/dim]  {PHASES[exam.phase]:<9} {escape(exam.message)}", highlight=False
                 )
+
+    def _left(self, progress: RunProgress) -> str:
+        """About how long the run takes still, by the clock; nothing where that is not known."""
+        if self._expected_s is None or progress.real_time_factor <= 0:
+            return ""
+        left = max(0.0, self._expected_s - progress.t / NS) / progress.real_time_factor
+        return f"   about {left / MINUTE_S:.0f} min left" if left > MINUTE_S else f"   about {left:.0f} s left"
 
     def _obey(self, progress: RunProgress) -> None:
         """Passes on what an operator's keys say, and shows what the supervisor makes of it."""
