@@ -60,10 +60,10 @@ class Way:
     segment: Segment
     per_m: float
     """Places a metre of the path."""
-    believed_W: Array
-    """Points of the perceived surface [m], shape (g, 3), in world."""
-    outward_W: Array
-    """Its outward unit normals, shape (g, 3)."""
+    believed_W: list[list[float]]
+    """Points of the perceived surface [m], g of three, in world."""
+    outward_W: list[list[float]]
+    """Its outward unit normals, g of three."""
     place: Array
     """Points of the true skin at rest [m], shape (g, 3), in that frame."""
     normal: Array
@@ -184,8 +184,8 @@ class QuickExamination:
         return Way(
             segment=Segment(path, contact=contact),
             per_m=count / path.length if path.length else 0.0,
-            believed_W=believed,
-            outward_W=outward,
+            believed_W=believed.tolist(),
+            outward_W=outward.tolist(),
             place=apply(self._X_AtA, place),
             normal=normal @ self._X_AtA[:3, :3].T,
             breathing=self._breathing(dense + self._loop.aside_m).tolist(),

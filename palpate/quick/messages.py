@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from palpate.quick.examination import QuickExamination, Row
+from palpate.quick.patient import Patient
 from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import NS, header
@@ -25,18 +26,16 @@ def collected(examination: QuickExamination, rows: list[Row]) -> Collected:
     X_WA = examination.patient.X_WA
     model = examination.patient.tissue.model
     sigma = examination.uncertainty_m
-    states = [_state(row, int(PHASE_OF[row.stage]), row.time, sigma) for row in rows]
+    phases = {stage: int(PHASE_OF[stage]) for stage in {row.stage for row in rows}}
+    states = [_state(row, phases[row.stage], row.time, sigma) for row in rows]
     states.append(_state(rows[-1], ExamState.PHASE_ASSESS, rows[-1].time + LEAVES_S, sigma))
-    places = apply(X_WA, np.array([row.way.place[row.at] for row in rows])).tolist()
-    stiffness = examination.patient.stiffness(np.array([row.way.place[row.at, :2] for row in rows])).tolist()
-    true = [_indentation(row, p, k) for row, p, k in zip(rows, places, stiffness, strict=True)]
     skin, normals = (a.astype(np.float32).ravel() for a in (model.vertices, model.normals))
     rest = SurfaceMesh(header(0, "abdomen"), skin, normals, model.triangles.astype(np.uint32).ravel(), _NO_SHARES)
     pose = pose_message(X_WA[:3, :3], X_WA[:3, 3])
     seen_vertices, seen_normals = (a.astype(np.float32).ravel() for a in examination.perceived)
     return Collected(
         exam_states=states,
-        indentation=true,
+        indentation=_indentations(examination.patient, rows),
         exam_time=round(rows[-1].time * NS),
         phantom=PhantomTruth(rest, model.stiffness, model.background, model.lesion, pose),
         surface=SurfaceMesh(
@@ -62,8 +61,8 @@ def _state(row: Row, phase: int, time: float, sigma: float) -> Any:
         depth_setpoint=row.setpoint,
         depth=row.depth,
         normal_force=row.force,
-        surface_point=Point(*row.way.believed_W[row.at].tolist()),
-        surface_normal=Vector3(*row.way.outward_W[row.at].tolist()),
+        surface_point=Point(*row.way.believed_W[row.at]),
+        surface_normal=Vector3(*row.way.outward_W[row.at]),
         end_tick=-1,
         depth_uncertainty=sigma,
         wall_displacement=row.followed,
@@ -72,18 +71,29 @@ def _state(row: Row, phase: int, time: float, sigma: float) -> Any:
     )
 
 
-def _indentation(row: Row, p_W: list[float], stiffness: float) -> Any:
-    """`truth/indentation`."""
-    F = row.true_force
-    normal = float(F @ row.way.normal[row.at])
-    size = float(np.sqrt(F @ F))
-    return IndentationTruth(
-        header=header(round(row.time * NS), "world"),
-        depth=row.true_depth,
-        normal_force=max(normal, 0.0),
-        tangential_force=float(np.sqrt(max(size * size - normal * normal, 0.0))),
-        peak_force=size,
-        contacts=0,
-        surface_point=Point(*p_W),
-        stiffness=stiffness,
+def _indentations(patient: Patient, rows: list[Row]) -> list[Any]:
+    """`truth/indentation` of every period."""
+    place = np.array([row.way.place[row.at] for row in rows])
+    outward = np.array([row.way.normal[row.at] for row in rows])
+    F = np.array([row.true_force for row in rows])
+    normal, size = (F * outward).sum(axis=1), np.linalg.norm(F, axis=1)
+    columns = (
+        apply(patient.X_WA, place),
+        np.maximum(normal, 0.0),
+        np.sqrt(np.maximum(size**2 - normal**2, 0.0)),
+        size,
+        patient.stiffness(place[:, :2]),
     )
+    return [
+        IndentationTruth(
+            header=header(round(row.time * NS), "world"),
+            depth=row.true_depth,
+            normal_force=along,
+            tangential_force=across,
+            peak_force=peak,
+            contacts=0,
+            surface_point=Point(*p_W),
+            stiffness=stiffness,
+        )
+        for row, p_W, along, across, peak, stiffness in zip(rows, *(column.tolist() for column in columns), strict=True)
+    ]

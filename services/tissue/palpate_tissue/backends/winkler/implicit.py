@@ -31,7 +31,7 @@ FAR_SWEEPS: Final = 20
 """The same in a step of the others, at most."""
 REACHED: Final = 1.5
 """Vertices within so many Pasternak lengths of the sphere are stepped."""
-FAR_S: Final = 0.1
+FAR_S: Final = 0.15
 """The others follow so often,"""
 SPRING_S: Final = 0.3
 """and at every step for so long after the sphere has left them: the wall springs back within the dashpot's 0.05 s."""
