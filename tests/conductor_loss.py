@@ -23,6 +23,7 @@ from palpate.environment import FIXED
 from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
+from palpate.run.self_test import RATES, measure
 from palpate_benchmarks.campaign import CONTACT_S, SETTINGS, forks
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
@@ -120,7 +121,8 @@ def _conduct(folder: Path, runtime: str) -> None:
     scenario = load_scenario("clean", SETTINGS)
     roles = (*WORKERS, "recorder")
     files = write_scenario_files(scenario, folder)
-    timing = Timing(wallclock=runtime == "wallclock")
+    wallclock = runtime == "wallclock"
+    timing = Timing(wallclock, rate=measure().rate or RATES[-1] if wallclock else 1.0)
     local = LocalProcesses(apart(roles), folder, files, timing, record="normal", forks=forks())
     session = open_session(local.bus["conductor"])
     for process in read_processes(compose_file(), roles).values():

@@ -98,6 +98,12 @@ class Settings(BaseSettings):
     runtime: Literal["lockstep", "wallclock"] = Field(
         default="lockstep", description="Whether services step in lockstep or by the wall clock."
     )
+    rate: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="By the wall clock: simulated seconds a second, alike for all; `palpate run` measures what it can keep.",
+    )
     scenario: Path | None = Field(default=None, description="The scenario file of a service, as `palpate prepare` writes it.")
     out: Path | None = Field(default=None, description="The run's results folder, for services that write files.")
     record: Literal["none", "normal", "full"] = Field(
@@ -238,7 +244,7 @@ def allowed(name: str) -> str:
         return "ROLE=MILLISECONDS, ..."
     if typing.get_origin(kinds[0]) is tuple:
         return "roles" if name == "absent" else "files" if Path in typing.get_args(kinds[0]) else "endpoints"
-    return "a path" if kinds[0] is Path else "text"
+    return {Path: "a path", float: "a number above 0, up to 1"}.get(kinds[0], "text")
 
 
 def page() -> str:

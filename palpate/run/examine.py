@@ -28,10 +28,11 @@ from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers, write_scenario_files
 from palpate.run.secure import SecureBus
+from palpate.run.self_test import RATES, measure
 from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration, megabytes_of, what_it_takes
 from palpate_bus.implementations import ChoiceError, check_libraries
 from palpate_bus.security.keys import KeysError
-from palpate_bus.settings import BusConfigError
+from palpate_bus.settings import BusConfigError, Settings
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.conduct import conduct as conduct_run
 from palpate_conductor.outcome import RunFailed
@@ -136,9 +137,28 @@ def _run(
 ) -> RunResult:
     if how.composed:
         return run_composed(scenario, folder, tell, observers)
-    timing = Timing(how.wallclock, 1.0 if how.realtime else None, handover_s=how.handover_s)
+    rate = _rate(scenario) if how.wallclock else 1.0
+    timing = Timing(how.wallclock, 1.0 if how.realtime else None, rate=rate, handover_s=how.handover_s)
     with SecureBus(how.keys) if how.secure else nullcontext() as bus:
         return run_distributed(scenario, folder, tell, observers, timing, bus, absent, groups)
+
+
+def _rate(scenario: Scenario) -> float:
+    """The rate of a run by the wall clock: PALPATE_RATE, or what a second's self-test says that this machine can keep.
+
+    Refuses the run where that is too little.
+    """
+    rate = Settings.read().rate
+    if rate is None:
+        kept = measure()
+        rate = kept.rate
+        if rate is None:
+            refuse(f"this machine cannot keep {RATES[-1]:g} of real time now: {kept.words}; run in lockstep")
+        if rate < 1.0:
+            say(f"this machine keeps {rate:g} of real time now: {kept.words}")
+    if rate < 1.0 and scenario.services.tissue == NONE:
+        refuse("services.tissue = 'none' is for hardware, whose clock nobody can slow down")
+    return rate
 
 
 def conclude(

@@ -168,6 +168,7 @@ class LocalProcesses:
         if key is None and settings.tags is not False:
             key = make_key(self._folder / "run.key")
         self._given["key"] = key
+        self._given["rate"] = timing.rate if timing.wallclock else None
         self._scenario_files = {
             role: file if view_of(role) == "scenario" else self._apart(file) for role, file in scenario_files.items()
         }

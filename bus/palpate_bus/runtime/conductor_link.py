@@ -52,14 +52,14 @@ class ConductorLink:
     """The way in: control messages and heartbeats, heard once a process."""
 
     def __init__(self, member: Member, grace_s: float = 0.0) -> None:
-        """`grace_s` [s] is how long the node goes on without a conductor that is lost."""
+        """`grace_s` [s], in the time of the run, is how long the node goes on without a conductor that is lost."""
         self._member = member
         self._control = member.internal_subscription("palpate/control", CONTROL_TYPE)
         self._beats = member.internal_subscription(HEARTBEAT, CONTROL_TYPE)
         self._decode = codec.decoder(CONTROL_TYPE)
         deadline = member.rules.internal[HEARTBEAT].deadline / NS
         self._deadline_s = deadline if Settings.read().runtime == "wallclock" else LOCKSTEP_SILENT_S
-        self._grace_s = grace_s
+        self._grace_s = grace_s / (Settings.read().rate or 1.0)
         self._patience_s = CONDUCTOR_AWAITED_S
         self._granted = self._beating = False
         self._silent_s = 0.0

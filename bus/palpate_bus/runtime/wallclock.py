@@ -4,6 +4,8 @@ A service still sees whole ticks: `t` counts periods since the common start, wit
 A late step is counted as an overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick
 by tick, unless it is later than `CATCH_UP` or drives real hardware. All others skip to the present tick, since an old command
 helps nobody and stamps must stay on the common clock. No service waits for another; expiry protects the readers of a late sample.
+
+On a machine that cannot keep up, the common clock may go slower than the wall's (PALPATE_RATE); never with hardware.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.priority import by_period, give_way
 from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.service import Service
+from palpate_bus.settings import Settings
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +77,7 @@ class WallClockNode(Node):
         self.skips = 0
         self._ages = {name: LatencyHistogram() for name in self._data}
         self._end: int | None = None
+        self._rate = Settings.read().rate or 1.0
         self._epoch = 0
         """The common start of the run on this process's monotonic clock [ns]."""
 
@@ -116,19 +120,17 @@ class WallClockNode(Node):
             self._end = int(message.tick)
 
     def _loop(self) -> None:
-        epoch = self._epoch
         period = self._stepper.role.period
         catch_up = CATCH_UP if self._stepper.role.critical and self._seat.service.catches_up else period
-        t = self._await_inputs(epoch)
+        t = self._await_inputs()
         while self._end is None or t <= self._end:
-            due = epoch + t
-            now = monotonic_ns()
-            if now < due:
-                sleep((due - now) / 1e9)
-            elif now - due > period:
+            late = self._passed() - t
+            if late < 0:
+                sleep(-late / self._rate / 1e9)
+            elif late > period:
                 self.overruns += 1
-                if now - due > catch_up:
-                    t += (now - due) // period * period
+                if late > catch_up:
+                    t += late // period * period
                     self.skips += 1
             self._receive(t)
             everything: list[Sent] = []
@@ -152,7 +154,12 @@ class WallClockNode(Node):
             lost.add(CONDUCTOR)
             self._seat.reports.miss_conductor(self._seat.tick, self._link.lost)
 
-    def _await_inputs(self, epoch: int) -> int:
+    def _passed(self) -> int:
+        """The time of the run [ns]: the wall's since the common start, or less of it."""
+        passed = monotonic_ns() - self._epoch
+        return passed if self._rate == 1.0 else int(passed * self._rate)
+
+    def _await_inputs(self) -> int:
         """Waits until every input that the first step needs has come once; returns the tick [ns] at which it may step.
 
         Not for events, which may never come, nor for what only a simulation sends, which hardware in this role never hears.
@@ -166,7 +173,7 @@ class WallClockNode(Node):
             if message is not None:
                 self._obey(message)
         period = self._stepper.role.period
-        return max(0, (monotonic_ns() - epoch) // period * period)
+        return max(0, self._passed() // period * period)
 
     def _receive(self, t: int) -> None:
         now = self._now()

@@ -77,7 +77,7 @@ class Conductor:
         self._freezes = FreezeWatch(self._patience)
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = RunOutcome()
-        self._contract = ContractWatch(session, rules, domain, timing.wallclock)
+        self._contract = ContractWatch(session, rules, domain, timing.wallclock and timing.rate == 1.0)
         collector.diagnose = self._diagnose
         self.grants = Grants(lambda tick, last: self._say(RunControl.GRANT, tick, last), timing)
         self._desk = OperatorDesk(session, domain, self.request, self.grants.pace)

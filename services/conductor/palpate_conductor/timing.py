@@ -18,6 +18,8 @@ class Timing:
     """Every service runs on its own timer, and nothing is granted but the common start and the end."""
     realtime: float | None = None
     """In lockstep, at most so many simulated seconds a wall second."""
+    rate: float = 1.0
+    """With `wallclock`: simulated seconds a second."""
     limit: int = SIM_LIMIT
     """Simulated time [ns] at which a run ends that nobody else ends."""
     handover_s: float = 0.0
