@@ -17,7 +17,7 @@ from palpate.command_line import refuse
 from palpate.report.archive import EvidenceError
 from palpate.report.page import write_page
 from palpate.report.recover import recovered
-from palpate.report.results import print_findings, write_results
+from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PRINT_TIMEOUT_S = 120
@@ -61,8 +61,10 @@ def report(
     try:
         with nullcontext() if quiet or as_json else console.status("writing the report"):
             if recover:
-                found = write_results(folder, *recovered(folder))
-                print_findings(Console(stderr=as_json), found)
+                scenario, result = recovered(folder)
+                shown = Console(stderr=as_json)
+                print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # at once: the truth takes longer
+                print_scores(shown, write_results(folder, scenario, result))
             page = write_page(folder)
             paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
     except (EvidenceError, PrintError, OSError) as error:

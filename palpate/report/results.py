@@ -172,10 +172,15 @@ def print_findings(console: Console, report: Report) -> None:
                 "over 99 %" if f.confidence > 0.99 else f"{100 * f.confidence:.0f} %",
             )
         console.print(table)
-    elif report.assessed and report.failure is None:
-        console.print("no finding")
+    elif report.assessed:
+        console.print("no finding" if report.failure is None else "no finding in what was scanned")
     else:
         console.print("not assessed")
+    print_scores(console, report)
+
+
+def print_scores(console: Console, report: Report) -> None:
+    """The scores against the truth in a line, where there are any."""
     if report.scores is not None:
         console.print(f"against the truth{clean_words(report)}: {in_words(report.scores)}", highlight=False, soft_wrap=True)
 
