@@ -244,7 +244,8 @@ def allowed(name: str) -> str:
         return "ROLE=MILLISECONDS, ..."
     if typing.get_origin(kinds[0]) is tuple:
         return "roles" if name == "absent" else "files" if Path in typing.get_args(kinds[0]) else "endpoints"
-    return {Path: "a path", float: "a number above 0, up to 1"}.get(kinds[0], "text")
+    words: dict[Any, str] = {Path: "a path", float: "a number above 0, up to 1"}
+    return words.get(kinds[0], "text")
 
 
 def page() -> str:
