@@ -35,10 +35,11 @@ def _patient(scenario: Scenario) -> list[tuple[str, str]]:
         rate = 60 * len(breaths) / breathing.repeats_s
         breath = f"{phantom.breathing.kind}, {rate:.1f} a minute, {1e3 * breaths[:, 4].mean():.1f} mm, at most "
         breath += f"{1e3 * breathing.largest_m:.1f} mm"
-    moves = f"{phantom.motion.kind} from {motion.at_s:.1f} s to {motion.until_s:.1f} s" if motion.moves else "none"
-    if motion.moves:
-        moves += f": {_offset(motion.pose(motion.until_s))}"
-    return [("breathing", breath), ("motion", moves)]
+    rows = [("breathing", breath)]
+    if not motion.moves:
+        return [*rows, ("motion", "none")]
+    rows.append(("motion", f"{phantom.motion.kind} from {motion.at_s:.1f} s to {motion.until_s:.1f} s"))
+    return [*rows, *_offset("moved", motion.pose(motion.until_s))]
 
 
 def _equipment(drawn: DrawnErrors) -> list[tuple[str, str]]:
@@ -50,8 +51,8 @@ def _equipment(drawn: DrawnErrors) -> list[tuple[str, str]]:
         ("force, gain", f"{_triple(gain)} %"),
         ("camera, offset", f"{1e3 * camera.offset_m:+.1f} mm, {1e3 * camera.warm_up_m:+.1f} mm more when warm"),
         ("camera, largest bias over the image", f"{1e3 * camera.given.field_m:.1f} mm, {len(camera.lost)} patches lost"),
-        ("camera, true in the calibrated frame", _offset(drawn.X_CCt)),
-        ("patient, true in the registered frame", _offset(drawn.X_AAt)),
+        *_offset("camera, true in the calibrated frame", drawn.X_CCt),
+        *_offset("patient, true in the registered frame", drawn.X_AAt),
         ("arm, largest joint offset", f"{1e3 * np.linalg.norm(arm.origin_m, axis=1).max():.2f} mm"),
         ("arm, largest joint zero", f"{1e3 * np.abs(arm.zero_rad).max():.2f} mrad"),
         ("arm, true over nominal friction", f"{arm.friction.min():.2f} to {arm.friction.max():.2f}"),
@@ -63,6 +64,7 @@ def _triple(values: Array) -> str:
     return ", ".join(f"{value:+.2f}" for value in values)
 
 
-def _offset(X: Array) -> str:
-    """A small pose: translation, and rotation vector."""
-    return f"{_triple(1e3 * X[:3, 3])} mm; {_triple(np.degrees(Rotation.from_matrix(X[:3, :3]).as_rotvec()))} degrees"
+def _offset(name: str, X: Array) -> list[tuple[str, str]]:
+    """A small pose in two rows: translation, and rotation vector."""
+    turned = np.degrees(Rotation.from_matrix(X[:3, :3]).as_rotvec())
+    return [(f"{name} [mm]", _triple(1e3 * X[:3, 3])), (f"{name} [degrees]", _triple(turned))]

@@ -24,14 +24,14 @@ def test_it_tells_what_was_drawn() -> None:
     scenario = Scenario(seed=7, phantom=phantom, errors=Errors(level="poor"))
     drawn = draw_errors(scenario.errors, 7)
     np.testing.assert_allclose(numbers(scenario, "force, bias"), drawn.force.bias[:3], atol=0.006)
-    true = numbers(scenario, "patient, true in the registered frame")
-    np.testing.assert_allclose(true[:3], 1e3 * drawn.X_AAt[:3, 3], atol=0.006)
+    true = numbers(scenario, "patient, true in the registered frame [mm]")
+    np.testing.assert_allclose(true, 1e3 * drawn.X_AAt[:3, 3], atol=0.006)
     np.testing.assert_allclose(numbers(scenario, "tool, true over nominal mass"), drawn.arm.tool_mass, atol=6e-4)
     assert numbers(scenario, "breathing")[-1] == round(1e3 * BreathingCurve(phantom.breathing, 7).largest_m, 1)
     moved = numbers(scenario, "motion")
     motion = BodyMotion(phantom.motion, 7)
-    np.testing.assert_allclose(moved[:2], (motion.at_s, motion.until_s), atol=0.06)
-    np.testing.assert_allclose(moved[2:5], 1e3 * motion.pose(1e3)[:3, 3], atol=0.006)
+    np.testing.assert_allclose(moved, (motion.at_s, motion.until_s), atol=0.06)
+    np.testing.assert_allclose(numbers(scenario, "moved [mm]"), 1e3 * motion.pose(1e3)[:3, 3], atol=0.006)
 
 
 def test_another_seed_has_another_truth_and_a_clean_world_has_none() -> None:
@@ -39,5 +39,6 @@ def test_another_seed_has_another_truth_and_a_clean_world_has_none() -> None:
     assert page(Scenario(seed=1, errors=errors)) != page(Scenario(seed=2, errors=errors))
     still = Phantom(breathing=Breathing(kind="none"))
     clean = Scenario(seed=1, phantom=still, errors=Errors(level="none"))
-    assert numbers(clean, "patient, true in the registered frame") == [0] * 6
+    for unit in ("mm", "degrees"):
+        assert numbers(clean, f"patient, true in the registered frame [{unit}]") == [0] * 3
     assert numbers(clean, "breathing") == numbers(clean, "motion") == []
