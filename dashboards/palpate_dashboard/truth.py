@@ -50,9 +50,9 @@ def _equipment(drawn: DrawnErrors) -> list[tuple[str, str]]:
         ("force, when warm", f"{_triple(force.warm_up[:3])} N"),
         ("force, gain", f"{_triple(gain)} %"),
         ("camera, offset", f"{1e3 * camera.offset_m:+.1f} mm, {1e3 * camera.warm_up_m:+.1f} mm more when warm"),
-        ("camera, largest bias over the image", f"{1e3 * camera.given.field_m:.1f} mm, {len(camera.lost)} patches lost"),
-        *_offset("camera, true in the calibrated frame", drawn.X_CCt),
-        *_offset("patient, true in the registered frame", drawn.X_AAt),
+        ("camera, largest bias", f"{1e3 * camera.given.field_m:.1f} mm, {len(camera.lost)} patches lost"),
+        *_offset("camera, off by", drawn.X_CCt),
+        *_offset("patient, off by", drawn.X_AAt),
         ("arm, largest joint offset", f"{1e3 * np.linalg.norm(arm.origin_m, axis=1).max():.2f} mm"),
         ("arm, largest joint zero", f"{1e3 * np.abs(arm.zero_rad).max():.2f} mrad"),
         ("arm, true over nominal friction", f"{arm.friction.min():.2f} to {arm.friction.max():.2f}"),
@@ -65,6 +65,6 @@ def _triple(values: Array) -> str:
 
 
 def _offset(name: str, X: Array) -> list[tuple[str, str]]:
-    """A small pose in two rows: translation, and rotation vector."""
+    """A small pose in two rows, translation and rotation vector: of the true frame in the nominal one."""
     turned = np.degrees(Rotation.from_matrix(X[:3, :3]).as_rotvec())
     return [(f"{name} [mm]", _triple(1e3 * X[:3, 3])), (f"{name} [degrees]", _triple(turned))]

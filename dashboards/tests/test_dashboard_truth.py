@@ -24,7 +24,7 @@ def test_it_tells_what_was_drawn() -> None:
     scenario = Scenario(seed=7, phantom=phantom, errors=Errors(level="poor"))
     drawn = draw_errors(scenario.errors, 7)
     np.testing.assert_allclose(numbers(scenario, "force, bias"), drawn.force.bias[:3], atol=0.006)
-    true = numbers(scenario, "patient, true in the registered frame [mm]")
+    true = numbers(scenario, "patient, off by [mm]")
     np.testing.assert_allclose(true, 1e3 * drawn.X_AAt[:3, 3], atol=0.006)
     np.testing.assert_allclose(numbers(scenario, "tool, true over nominal mass"), drawn.arm.tool_mass, atol=6e-4)
     assert numbers(scenario, "breathing")[-1] == round(1e3 * BreathingCurve(phantom.breathing, 7).largest_m, 1)
@@ -40,5 +40,5 @@ def test_another_seed_has_another_truth_and_a_clean_world_has_none() -> None:
     still = Phantom(breathing=Breathing(kind="none"))
     clean = Scenario(seed=1, phantom=still, errors=Errors(level="none"))
     for unit in ("mm", "degrees"):
-        assert numbers(clean, f"patient, true in the registered frame [{unit}]") == [0] * 3
+        assert numbers(clean, f"patient, off by [{unit}]") == [0] * 3
     assert numbers(clean, "breathing") == numbers(clean, "motion") == []
