@@ -6,12 +6,13 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import psutil
 import pytest
-from conductor_loss import Blow, Struck, strike_conductor
 
+from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, Blow, Struck, strike
 from palpate_bus.messages import ExamState, RobotStatus
 
 pytestmark = pytest.mark.slow
@@ -20,21 +21,32 @@ MORE_N = 2.0
 CLEAR_M = 0.005
 
 
-def kill(conductor: psutil.Process) -> None:
-    conductor.kill()
+ATTEMPTS = 3
 
 
-def freeze(conductor: psutil.Process) -> None:
-    conductor.suspend()
-    time.sleep(10.0)
-    conductor.resume()
+def kill(processes: Mapping[str, psutil.Process]) -> None:
+    processes[CONDUCTOR].kill()
 
 
-def kill_with_planning(conductor: psutil.Process) -> None:
-    services = conductor.children(recursive=True)  # forked: they differ in the log that they write alone
-    (planning,) = [child for child in services if any(Path(file.path).name == "planning.log" for file in child.open_files())]
-    for process in (planning, conductor):
-        process.kill()
+def freeze(processes: Mapping[str, psutil.Process]) -> None:
+    processes[CONDUCTOR].suspend()
+    time.sleep(FREEZE_S)
+    processes[CONDUCTOR].resume()
+
+
+def kill_with_planning(processes: Mapping[str, psutil.Process]) -> None:
+    for role in ("planning", CONDUCTOR):
+        processes[role].kill()
+
+
+def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
+    """On a busy machine a run by the wall clock may be stopped on its way to the patient; it is then begun anew."""
+    for attempt in range(ATTEMPTS):
+        struck = strike(folder / str(attempt), runtime, blow)
+        if struck is not None:
+            assert not struck.staying
+            return struck
+    raise AssertionError(f"never at depth in {ATTEMPTS} attempts: see {folder}")
 
 
 def assert_lifted(struck: Struck) -> None:
@@ -56,9 +68,8 @@ def test_by_the_wall_clock_the_arm_is_lifted_and_the_services_leave(blow: Blow, 
     struck = strike_conductor(tmp_path, "wallclock", blow)
     assert_lifted(struck)
     if blow is freeze:
-        (failure,) = [line for line in struck.said if line.startswith("failure: ")]
-        assert "conductor" in failure
-        assert "stood still for" in failure
+        assert "conductor" in struck.said["failure"]
+        assert "stood still for" in struck.said["failure"]
 
 
 def test_without_planning_too_the_driver_holds(tmp_path: Path) -> None:

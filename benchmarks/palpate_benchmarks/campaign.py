@@ -44,7 +44,11 @@ HANG_S: Final = 90.0
 """A case that takes longer after its fault has hung."""
 CONTACT_S: Final = 0.3
 """Simulated time at depth before the damage."""
-FORCE_LIMIT_N: Final = 25.0
+FORCE_LIMIT_N: Final = 15.0
+MORE_N: Final = 2.0
+"""How much the force may rise above its highest before a fault in contact ..."""
+CONTACT_N: Final = 1.0
+"""... where it was more than this."""
 PROCESS_KINDS: Final = ("kill", "freeze", "jump")
 MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
 KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS)
@@ -72,12 +76,15 @@ class FaultCase:
     where: str
     """Role for faults of a process, topic for those of a message."""
     wallclock: bool
+    at_s: float = CONTACT_S
+    """Simulated time at depth before the damage."""
 
     @property
     def name(self) -> str:
         """A file's name."""
         mode = "wallclock" if self.wallclock else "lockstep"
-        return f"{mode}-{self.kind}-{self.where.replace('/', '_')}"
+        moment = "" if self.at_s == CONTACT_S else f"-{self.at_s:g}"
+        return f"{mode}-{self.kind}-{self.where.replace('/', '_')}{moment}"
 
 
 @dataclass
@@ -104,14 +111,25 @@ class FaultFinding:
     """Whether what was noticed names the role or topic."""
     hung: bool = False
     wall_s: float = 0.0
+    at_s: float = CONTACT_S
+    """When it struck, in simulated time at depth."""
+    kept: bool = True
+    """Whether there are results of what had been scanned."""
+    left_behind: str = ""
+    """What the run left on the machine that the next command does not remove."""
 
     @property
     def good(self) -> bool:
-        """Done, no hang, no force above the limit; and if the run did not simply go on, its cause named."""
+        """Done, no hang, no force above the limits, results kept, nothing left behind; and its cause named unless it went on."""
+        most = FORCE_LIMIT_N
+        if self.peak_force_before_n > CONTACT_N:
+            most = min(most, self.peak_force_before_n + MORE_N)
         return (
             self.injected_s is not None
             and not self.hung
-            and (self.peak_force_n or 0.0) <= FORCE_LIMIT_N
+            and (self.peak_force_n or 0.0) <= most
+            and self.kept
+            and not self.left_behind
             and (self.ended in UNHARMED or self.named)
         )
 

@@ -17,13 +17,14 @@ from palpate.report.files import write_text
 from palpate.report.marked import docs_option, write_part
 from palpate_benchmarks.campaign import KINDS, FaultFinding, as_json, cases, forks, run_case
 from palpate_benchmarks.campaign_tables import csv_text, markdown, table
+from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
 
 WIDE = 200
 
 Listed = Annotated[list[str] | None, typer.Option("--only", help="Keep these roles and topics; may be repeated.")]
 
 
-def faults(
+def faults(  # noqa: PLR0913 - the options of a command
     mode: Annotated[list[str] | None, typer.Option(help="lockstep, wallclock; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"Out of {', '.join(KINDS)}; all by default.")] = None,
     only: Listed = None,
@@ -33,6 +34,8 @@ def faults(
     docs: Annotated[Path | None, docs_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
+    random: Annotated[int, typer.Option(metavar="N", min=0, help="Beside the list, N cases drawn by the seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
 ) -> None:
     """Kill, freeze, delay, drop, corrupt...: every service and topic in turn, in contact; print what came of each."""
     console = Console(stderr=True, width=max(WIDE, Console().width))
@@ -42,19 +45,22 @@ def faults(
             if value not in known:
                 refuse(f"{name} {value}: allowed are {', '.join(known)}")
     found = _load(out)
-    todo = list(cases(wanted_modes, wanted_kinds, only or ()))
+    todo = [*fixed(wanted_modes, wanted_kinds, only or ()), *cases(wanted_modes, wanted_kinds, only or ())]
+    todo += drawn(random, seed, wanted_modes)
     if not todo:
         refuse(f"nothing to do: {', '.join(only or ())} is no role or topic of these kinds")
     if not again:
-        done = {(f.kind, f.where, f.mode) for f in found}
-        todo = [case for case in todo if (case.kind, case.where, "wall clock" if case.wallclock else "lockstep") not in done]
+        done = {(f.kind, f.where, f.mode, f.at_s) for f in found}
+        modes = {True: "wall clock", False: "lockstep"}
+        todo = [case for case in todo if (case.kind, case.where, modes[case.wallclock], case.at_s) not in done]
     todo = todo[:limit]
     started_by = forks()
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.tell(0, len(todo), "")
         for number, case in enumerate(todo, 1):
-            finding = run_case(case, Path(folder), started_by)
-            found = [f for f in found if (f.kind, f.where, f.mode) != (finding.kind, finding.where, finding.mode)] + [finding]
+            finding = run_whole(case, Path(folder)) if is_whole(case) else run_case(case, Path(folder), started_by)
+            same = (finding.kind, finding.where, finding.mode, finding.at_s)
+            found = [f for f in found if (f.kind, f.where, f.mode, f.at_s) != same] + [finding]
             write_text(out, json.dumps(as_json(found), indent=1) + "\n")
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
             display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")

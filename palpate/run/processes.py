@@ -163,10 +163,11 @@ class LocalProcesses:
         self._out = out
         remove_leftovers()
         self._own = RunFolder()
-        self._folder = self._own.path
+        self.folder = self._own.path
+        """Of its sockets and its key, removed at its end."""
         key = settings.key
         if key is None and settings.tags is not False:
-            key = make_key(self._folder / "run.key")
+            key = make_key(self.folder / "run.key")
         self._given["key"] = key
         self._given["rate"] = timing.rate if timing.wallclock else None
         self._scenario_files = {
@@ -175,7 +176,7 @@ class LocalProcesses:
         router = secure.endpoint if secure else settings.router
         processes = {group[0]: group for group in (("conductor",), *groups)}
         quick = [name for name, roles in processes.items() if BARRIER.issuperset(roles)]
-        bus = mesh(tuple(processes), self._folder, lowlatency=quick)
+        bus = mesh(tuple(processes), self.folder, lowlatency=quick)
         self.bus = {role: replace(bus[name], router=router) for name, roles in processes.items() for role in roles}
         """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
         endpoints = {role: options.listen[0] for role, options in self.bus.items()}
@@ -202,7 +203,7 @@ class LocalProcesses:
 
     def _apart(self, file: Path) -> Path:
         """A copy of a scenario file, alone in a folder whose name says nothing: that of the results may tell of the patient."""
-        folder = self._folder / file.stem
+        folder = self.folder / file.stem
         folder.mkdir(exist_ok=True)
         return Path(shutil.copy(file, folder))
 
@@ -244,7 +245,7 @@ class LocalProcesses:
         for process in processes:
             own = dict(environments[process.role].items() - common.items())
             members[process.role] = GroupMember(process.shared_words(), own)
-        return group_command(self._folder / f"{processes[0].role}.json", members), common
+        return group_command(self.folder / f"{processes[0].role}.json", members), common
 
     def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> Child:
         if self._forks is not None:

@@ -1,0 +1,157 @@
+"""A whole run that is struck from outside, in contact: its conductor, its recorder, or several processes at once.
+
+    python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS
+
+is the conductor of such a run: it forks the services and a recorder, says where they are, and when the indenter has slid at depth
+for SECONDS of simulated time. `strike` starts it, does the damage, and gathers what came of it. What the arm did is read from
+what the recorder wrote, or where that was struck too, from what the conductor had heard.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import psutil
+
+from palpate.environment import FIXED
+from palpate.report.evidence import peak_force
+from palpate.run.placement import apart
+from palpate.run.processes import LocalProcesses, compose_file, read_processes
+from palpate.run.roles import WORKERS, write_scenario_files
+from palpate.run.self_test import RATES, measure
+from palpate_benchmarks.campaign import CONTACT_S, PATIENCE, SETTINGS, forks
+from palpate_bus.contract import contract
+from palpate_bus.messages import ExamState
+from palpate_bus.messages.codec import decode
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.recordings import open_recording
+from palpate_bus.wire.zenoh_config import close_session, open_session
+from palpate_conductor.conduct import conduct
+from palpate_conductor.result import RunProgress
+from palpate_conductor.timing import Timing
+from palpate_models.load import load_scenario
+
+Blow = Callable[[Mapping[str, psutil.Process]], None]
+"""Does the damage to some of the processes of a run, which it is given by role, the conductor among them."""
+CONDUCTOR: Final = "conductor"
+ROLES: Final = (*WORKERS, "recorder")
+AT_DEPTH: Final = "the indenter slides at depth"
+PROCESSES: Final = "processes: "
+RESULT: Final = "result: "
+FREEZE_S: Final = 10.0
+"""How long a frozen conductor stands still."""
+LEAVES_WITHIN_S: Final = 30.0
+"""Services that are still there after this time hang."""
+ENDS_WITHIN_S: Final = 120.0
+"""A conductor that has not ended after this time hangs."""
+
+
+@dataclass
+class Struck:
+    """What became of a run that was struck."""
+
+    folder: Path
+    own: Path
+    """The folder of its sockets."""
+    status: int | None
+    """The conductor's; None when it hung."""
+    said: dict[str, Any]
+    """What the conductor made of it: failure, trouble, and the forces that it heard; empty when it was killed."""
+    struck_s: float
+    """Simulated time of the blow."""
+    left_after_s: float
+    """From the blow until the last service had left."""
+    staying: list[str] = field(default_factory=list)
+    """Services that did not leave."""
+
+    def log(self, role: str) -> str:
+        """What a service wrote."""
+        return (self.folder / "logs" / f"{role}.log").read_text(encoding="utf-8")
+
+    @cached_property
+    def forces(self) -> list[tuple[int, float]]:
+        """The true normal force [N] at each simulated time [ns]."""
+        return [(stamp, message.normal_force) for stamp, message in self.recorded("truth/indentation")]
+
+    def recorded(self, topic: str) -> list[tuple[int, Any]]:
+        """Messages of a topic out of the recording: (stamp [ns], message)."""
+        row = contract().topics[topic]
+        return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
+
+
+def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S) -> Struck | None:
+    """Runs a short examination and does the damage when the indenter has slid at depth for `seconds` [s] of simulated time.
+
+    None when it never came to that: on a busy machine a run by the wall clock may be stopped on its way there.
+    """
+    words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(seconds)]
+    run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env={**os.environ, **FIXED})
+    assert run.stdout is not None
+    own, at, struck_s, said = Path(), 0.0, 0.0, {}
+    processes: dict[str, psutil.Process] = {}
+    for line in run.stdout:
+        if line.startswith(PROCESSES):
+            places = json.loads(line.removeprefix(PROCESSES))
+            own = Path(places.pop("folder"))
+            processes = {role: psutil.Process(pid) for role, pid in places.items()}
+            processes[CONDUCTOR] = psutil.Process(run.pid)
+        elif line.startswith(AT_DEPTH):
+            struck_s, at = float(line.rsplit(" ", 1)[1]), time.monotonic()
+            blow(processes)
+        elif line.startswith(RESULT):
+            said = json.loads(line.removeprefix(RESULT))
+    try:
+        status: int | None = run.wait(timeout=ENDS_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        run.kill()
+        status = None
+    services = {role: process for role, process in processes.items() if role != CONDUCTOR}
+    _, staying = psutil.wait_procs(services.values(), timeout=LEAVES_WITHIN_S)
+    left = time.monotonic() - at
+    hung = [role for role, process in services.items() if process in staying and process.status() != psutil.STATUS_STOPPED]
+    for process in staying:
+        process.kill()
+    return Struck(folder, own, status, said, struck_s, left, hung) if at else None
+
+
+def _conduct(folder: Path, runtime: str, seconds: float) -> None:
+    began: list[int] = []
+
+    def tell(progress: RunProgress) -> None:
+        exam = progress.collected.exam
+        if exam is not None and exam.phase == ExamState.PHASE_SCAN:
+            if not began:
+                began.append(progress.t)
+            elif began[-1] >= 0 and progress.t - began[0] > seconds * NS:
+                began.append(-1)
+                print(AT_DEPTH, progress.t / NS, flush=True)
+
+    scenario = load_scenario("clean", SETTINGS)
+    files = write_scenario_files(scenario, folder)
+    wallclock = runtime == "wallclock"
+    timing = Timing(wallclock, rate=measure().rate or RATES[-1] if wallclock else 1.0)
+    local = LocalProcesses(apart(ROLES), folder, files, timing, record="full", forks=forks())
+    session = open_session(local.bus[CONDUCTOR])
+    for process in read_processes(compose_file(), ROLES).values():
+        local.start(process)
+    pids = {role: child.pid for role, child in local.running.items()}
+    print(f"{PROCESSES}{json.dumps({**pids, 'folder': str(local.folder)})}", flush=True)
+    with local.as_conductor():
+        result = conduct(session, ROLES, tell, local.ended, timing, PATIENCE)
+    forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in result.collected.indentation]
+    print(f"{RESULT}{json.dumps({'failure': result.failure, 'lost': list(result.lost), 'forces': forces})}", flush=True)
+    close_session(session)
+    local.stop(patience_s=3.0)
+
+
+if __name__ == "__main__":
+    _conduct(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))

@@ -1,0 +1,145 @@
+"""Cases of the fault campaign that strike a whole run from outside (`struck`): its conductor, its recorder, several at once.
+
+Beside a fixed list there are drawn ones: a seed says which roles are struck, how, and how long after contact.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from random import Random
+from typing import Any, Final
+
+import psutil
+
+from palpate.report.archive import EvidenceError
+from palpate.report.recover import recovered
+from palpate.run.roles import WORKERS
+from palpate_benchmarks.campaign import FaultCase, FaultFinding
+from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Struck, strike
+from palpate_bus.messages import ExamState, RobotStatus
+from palpate_bus.recordings import RecordingError
+from palpate_bus.runs.run_folder import remove_leftovers
+
+TOGETHER: Final = "+"
+FIXED: Final = (
+    CONDUCTOR,
+    "recorder",
+    "planning+conductor",
+    "control+conductor",
+    "supervisor+conductor",
+    "recorder+conductor",
+    "control+recorder",
+    "planning+supervisor",
+)
+KINDS: Final = ("kill", "freeze")
+LONGEST_S: Final = 0.6
+"""Drawn cases strike within so much simulated time of contact: a line is no longer."""
+_SAID: Final = re.compile(r".*(the conductor is gone|nothing heard of the conductor).*")
+
+
+def is_whole(case: FaultCase) -> bool:
+    """Whether a case strikes a run from outside."""
+    return case.kind in KINDS and not set(WORKERS).issuperset({case.where})
+
+
+def fixed(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
+    """The fixed list; `only` keeps those that strike one of these roles."""
+    for mode in modes:
+        for kind in (kind for kind in KINDS if kind in kinds):
+            for where in FIXED:
+                if not only or set(where.split(TOGETHER)) & set(only):
+                    yield FaultCase(kind, where, mode == "wallclock")
+
+
+def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
+    """`count` cases out of a seed: one to three roles, killed or frozen, at a moment in contact."""
+    draw = Random(seed)
+    for _ in range(count):
+        roles = draw.sample([*ROLES, CONDUCTOR], draw.choice((1, 2, 2, 3)))
+        at_s = round(draw.uniform(0.05, LONGEST_S), 3)
+        yield FaultCase(draw.choice(KINDS), TOGETHER.join(sorted(roles)), draw.choice(modes) == "wallclock", at_s)
+
+
+def run_whole(case: FaultCase, folder: Path) -> FaultFinding:
+    """Runs one case; its logs stay in a folder of its own under `folder`."""
+    finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep", at_s=case.at_s)
+    begin = time.monotonic()
+    roles = case.where.split(TOGETHER)
+
+    def blow(processes: Mapping[str, psutil.Process]) -> None:
+        number = signal.SIGKILL if case.kind == "kill" else signal.SIGSTOP
+        for role in roles:
+            processes[role].send_signal(number)
+        if case.kind == "freeze" and CONDUCTOR in roles:  # others are ended by their conductor
+            time.sleep(FREEZE_S)
+            for role in roles:
+                if processes[role].is_running():
+                    processes[role].send_signal(signal.SIGCONT)
+
+    struck = strike((folder / case.name).resolve(), "wallclock" if case.wallclock else "lockstep", blow, case.at_s)
+    finding.wall_s = round(time.monotonic() - begin, 1)
+    if struck is None:
+        finding.ended = "the fault was never done: the run did not come to depth"
+        return finding
+    _judge(finding, struck, roles)
+    return finding
+
+
+def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
+    finding.injected_s = struck.struck_s
+    finding.hung = struck.status is None or bool(struck.staying)
+    failure, kept = struck.said.get("failure"), True
+    if not struck.said:
+        try:
+            failure, kept = _recovered(struck.folder)
+        except EvidenceError as error:
+            failure, kept = str(error), False
+    finding.kept = kept
+    finding.sign = _first_word(struck) if CONDUCTOR in roles else str(failure or ", ".join(struck.said.get("lost", ())))
+    finding.ended = str(failure or "went on without what was struck")
+    words = f"{finding.sign} {finding.ended}"
+    finding.named = any(re.search(rf"(?<![\w/]){role}(?!\w)", words) for role in roles)
+    _measure(finding, struck)
+    remove_leftovers()
+    finding.left_behind = str(struck.own) if struck.own.exists() else ""
+
+
+def _recovered(folder: Path) -> tuple[str, bool]:
+    """How a run without a conductor ended, and whether there is anything of what it had measured."""
+    _, result = recovered(folder)
+    return str(result.failure), bool(result.collected.exam_states)
+
+
+def _first_word(struck: Struck) -> str:
+    """What a service said of the conductor."""
+    for path in sorted((struck.folder / "logs").glob("*.log")):
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            if found := _SAID.fullmatch(line):
+                return f"{path.stem}: {found[1]}"
+    return ""
+
+
+def _measure(finding: FaultFinding, struck: Struck) -> None:
+    """Forces and the arm's reaction, as far as anybody wrote or heard them."""
+    forces = [(stamp, force) for stamp, force in struck.said.get("forces", ())]
+    statuses: list[tuple[int, Any]] = []
+    states: list[tuple[int, Any]] = []
+    try:
+        forces = forces or struck.forces
+        statuses, states = struck.recorded("robot/status"), struck.recorded("exam/state")
+    except (RecordingError, OSError):
+        pass  # the recorder was struck: its file has no end
+    split = struck.struck_s * 1e9
+    finding.peak_force_before_n = round(max((force for stamp, force in forces if stamp < split), default=0.0), 2)
+    after = [force for stamp, force in forces if stamp >= split]
+    finding.peak_force_n = round(max(after), 2) if after else None
+    if any(status.mode == RobotStatus.MODE_SAFE_HOLD for _, status in statuses):
+        finding.reaction = "safe hold"
+    elif states and states[-1][1].phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_RETURN, ExamState.PHASE_RETRACT):
+        finding.reaction = "lifted off"
+    else:
+        finding.reaction = "run ended"

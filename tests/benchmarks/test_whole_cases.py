@@ -1,0 +1,69 @@
+"""Which cases strike a whole run, and how they are judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from palpate_benchmarks.campaign import FaultCase, FaultFinding, cases
+from palpate_benchmarks.struck import CONDUCTOR, ROLES, Struck
+from palpate_benchmarks.whole_cases import FIXED, _judge, drawn, fixed, is_whole
+
+
+def test_the_conductor_and_the_recorder_are_struck_in_both_modes() -> None:
+    listed = list(fixed(["lockstep", "wallclock"], ["kill", "freeze", "drop"], []))
+    assert len(listed) == 2 * 2 * len(FIXED) == len({case.name for case in listed})
+    assert {CONDUCTOR, "recorder"} <= {case.where for case in listed}
+    assert all(is_whole(case) for case in listed)
+    assert not any(is_whole(case) for case in cases(["lockstep"], ["kill", "freeze", "drop"], []))
+    assert {case.where for case in fixed(["lockstep"], ["kill"], ["recorder"])} == {
+        "recorder",
+        "recorder+conductor",
+        "control+recorder",
+    }
+
+
+def test_drawn_cases_follow_their_seed() -> None:
+    first, again, other = (list(drawn(40, seed, ["lockstep"])) for seed in (1000, 1000, 1001))
+    assert first == again != other
+    assert {len(case.where.split("+")) for case in first} == {1, 2, 3}
+    assert {role for case in first for role in case.where.split("+")} <= {*ROLES, CONDUCTOR}
+    assert len({case.name for case in first}) == 40
+
+
+def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> None:
+    good = FaultFinding("kill", "x", "lockstep", 8.0, peak_force_before_n=5.0, peak_force_n=6.9, ended="x lost", named=True)
+    assert good.good
+    assert replace(good, peak_force_before_n=0.0, peak_force_n=14.0).good, "before contact the force has yet to rise"
+    for bad in (
+        replace(good, peak_force_n=7.1),
+        replace(good, peak_force_before_n=14.0, peak_force_n=15.5),
+        replace(good, kept=False),
+        replace(good, left_behind="/somewhere"),
+        replace(good, named=False),
+        replace(good, hung=True),
+    ):
+        assert not bad.good
+
+
+@pytest.mark.parametrize("named", ["control lost at tick 8.000 s: killed by signal 9", "something went wrong"])
+def test_what_the_conductor_says_is_judged(named: str, tmp_path: Path) -> None:
+    said = {"failure": named, "lost": ["control"], "forces": [[int(7e9), 5.0], [int(8.1e9), 5.5]]}
+    struck = Struck(tmp_path, tmp_path / "gone", 0, said, 8.0, 1.0)
+    finding = FaultFinding("kill", "control+recorder", "lockstep")
+    _judge(finding, struck, ["control", "recorder"])
+    assert finding.good == ("control" in named)
+    assert (finding.peak_force_before_n, finding.peak_force_n, finding.ended) == (5.0, 5.5, named)
+
+
+def test_without_conductor_and_recording_nothing_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "planning.log").write_text("2026 planning WARNING the conductor is gone\n", encoding="utf-8")
+    finding = FaultFinding("kill", CONDUCTOR, "lockstep")
+    _judge(finding, Struck(tmp_path, tmp_path / "gone", -9, {}, 8.0, 1.0), [CONDUCTOR])
+    assert finding.sign == "planning: the conductor is gone"
+    assert finding.named
+    assert not finding.kept
+    assert not FaultCase("kill", CONDUCTOR, False).wallclock
