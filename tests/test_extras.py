@@ -30,6 +30,7 @@ EXTRA_OF = {
     "palpate.live.dashboard": "all",  # the command line on what the dashboard draws
     "palpate.fuzz": "fuzz",
     "palpate.search": "library",
+    "palpate.search.environment": "learn-env",
     "palpate.study": "study",
     "palpate_bus": BARE,
     "palpate_bus.recordings": "recordings",

@@ -15,7 +15,10 @@ import numpy as np
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
 
-_NODES = 25
+_BINS = 64
+_BIN = 0.25
+"""Hypotheses whose mean observation differs by less than this part of the standard deviation count as one Gaussian."""
+_NODES = 41
 _REACH = 4.0
 """The grid reaches so many standard deviations beyond the mixture."""
 _RARE = 2e-5
@@ -33,33 +36,46 @@ def information(unexplained: Array, contrast: Array, contrast_variance: Array, p
     """
     places, hypotheses = unexplained.shape
     out = np.zeros(places)
-    mean, sd, weight = np.empty(hypotheses + 1), np.empty(hypotheses + 1), np.empty(hypotheses + 1)
+    weight, first, second = np.empty(_BINS + 1), np.empty(_BINS + 1), np.empty(_BINS + 1)
     for i in range(places):
-        count = 1
-        mean[0], sd[0], rest = 0.0, np.sqrt(variance[i]), 1.0
-        low, high = -_REACH * sd[0], _REACH * sd[0]
+        sd, low, high = np.sqrt(variance[i]), 0.0, 0.0
         for h in range(hypotheses):
-            shift = contrast[h] * unexplained[i, h]
-            if probability[h] > _RARE and abs(shift) > _SAME * sd[0]:
-                mean[count] = shift
-                sd[count] = np.sqrt(variance[i] + contrast_variance[h] * unexplained[i, h] ** 2)
-                weight[count] = probability[h]
-                rest -= probability[h]
-                low, high = min(low, shift - _REACH * sd[count]), max(high, shift + _REACH * sd[count])
-                count += 1
-        if count == 1:
+            if probability[h] > _RARE:
+                shift = contrast[h] * unexplained[i, h]
+                low, high = min(low, shift), max(high, shift)
+        if high - low < _SAME * sd:
             continue
-        weight[0] = max(rest, 0.0)
-        given = 0.0
-        for k in range(count):
-            given += weight[k] * (0.5 * np.log(2 * np.pi * np.e) + np.log(sd[k]))
+        width = max(_BIN * sd, (high - low) / (_BINS - 1) + 1e-12)
+        weight[:], first[:], second[:] = 0.0, 0.0, 0.0
+        given, rest = 0.0, 1.0
+        for h in range(hypotheses):
+            p = probability[h]
+            shift = contrast[h] * unexplained[i, h]
+            if p > _RARE and abs(shift) > _SAME * sd:
+                spread = variance[i] + contrast_variance[h] * unexplained[i, h] ** 2
+                k = int((shift - low) / width)
+                weight[k] += p
+                first[k] += p * shift
+                second[k] += p * (shift**2 + spread)
+                given += 0.5 * p * np.log(spread)
+                rest -= p
+        weight[_BINS], first[_BINS], second[_BINS] = max(rest, 0.0), 0.0, max(rest, 0.0) * variance[i]
+        given += max(rest, 0.0) * np.log(sd)
+        count = 0
+        for k in range(_BINS + 1):  # from sums to weight, mean and standard deviation, the empty bins left out
+            if weight[k] > 0.0:
+                mean = first[k] / weight[k]
+                spread = np.sqrt(max(second[k] / weight[k] - mean**2, 1e-12))
+                weight[count], first[count], second[count] = weight[k], mean, spread
+                low, high = min(low, mean - _REACH * spread), max(high, mean + _REACH * spread)
+                count += 1
         step = (high - low) / (_NODES - 1)
         entropy = 0.0
         for node in range(_NODES):
             y, density = low + node * step, 0.0
             for k in range(count):
-                density += weight[k] / (np.sqrt(2 * np.pi) * sd[k]) * np.exp(-0.5 * ((y - mean[k]) / sd[k]) ** 2)
+                density += weight[k] / (np.sqrt(2 * np.pi) * second[k]) * np.exp(-0.5 * ((y - first[k]) / second[k]) ** 2)
             if density > 1e-300:
                 entropy -= density * np.log(density) * step
-        out[i] = max(entropy - given, 0.0)
+        out[i] = max(entropy - given - 0.5 * np.log(2 * np.pi * np.e), 0.0)
     return out

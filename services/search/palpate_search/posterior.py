@@ -45,9 +45,9 @@ LUMP_PROBABILITY: Final = 0.5
 """That there is one, before anything is felt."""
 CONTRAST: Final = (float(np.log(2.0)), 0.35)
 """Prior mean and standard deviation of a lump's log-contrast."""
-ROUGH: Final = (0.5, 1.0, 2.0)
+ROUGH: Final = (0.6, 1.5)
 """Natural variation, of its usual amplitude."""
-WRONG: Final = (0.5, 1.0, 2.0)
+WRONG: Final = (0.6, 1.5)
 """Errors of depth, of what the examination states."""
 USUAL_N: Final = 5.0
 """About this force the level is sought."""
@@ -58,8 +58,15 @@ NEAR_M: Final = 0.020
 class Posterior:
     """The probability of each hypothesis, and the field, given the presses so far."""
 
-    def __init__(self, task: Task, accepted: Sequence[Bump] = ()) -> None:
-        """`accepted`: lumps that count as found; others are sought beside them."""
+    def __init__(
+        self,
+        task: Task,
+        accepted: Sequence[Bump] = (),
+        models: Sequence[tuple[float, float]] = tuple(product(ROUGH, WRONG)),
+    ) -> None:
+        """`accepted`: lumps that count as found; others are sought beside them. `models`: natural variation and errors of depth
+        of each, of their usual amplitudes.
+        """
         self.task = task
         self.accepted = tuple(accepted)
         self.presses: list[Press] = []
@@ -72,7 +79,7 @@ class Posterior:
         """Each bump at each place, shape (p, h)."""
         free = self._free().astype(float)
         self._log_prior = np.log(np.append(LUMP_PROBABILITY * free / max(free.sum(), 1.0), 1 - LUMP_PROBABILITY) + 1e-300)
-        self._models = list(product(ROUGH, WRONG))
+        self._models = tuple(models)
         self._parts = np.array([[(NATURAL_SD * rough) ** 2] * (len(LENGTHS_M) + 1) + [BONE_SD**2] for rough, _ in self._models])
         count, most = len(self._models), 16
         self._factor = np.zeros((count, most, most))
@@ -190,7 +197,7 @@ class Posterior:
 
     def accept(self, bump: Bump) -> Posterior:
         """The posterior of what else there is, given that this lump is there."""
-        other = Posterior(self.task, (*self.accepted, bump))
+        other = Posterior(self.task, (*self.accepted, bump), self._models)
         for felt in self.presses:
             other.add(felt)
         return other

@@ -14,8 +14,10 @@ PLACES_M = 0.010
 """Distance of the places that are weighed."""
 BORDER_M = 0.010
 """Presses keep so far from the edge of the region, in which the arm's reach and the skin are known."""
+SHALLOWER = 0.6
+"""The shallowest press that is worth it, and ..."""
 DEEPER = 1.4
-"""The deepest press, of the usual one."""
+"""... the deepest, of the usual one."""
 TRAVEL_MPS = 0.12
 """Mean speed of a hop from one place to the next."""
 PRESS_S = 3.2
@@ -75,6 +77,11 @@ class Task:
     """At the beginning."""
     seed: int = 0
     """Of what a policy draws."""
+
+    @property
+    def shallowest(self) -> float:
+        """Least depth of a press [m]."""
+        return SHALLOWER * self.depth
 
     @classmethod
     def of(cls, known: ExamInput) -> Task:

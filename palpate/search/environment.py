@@ -1,0 +1,132 @@
+"""`Palpate/Search-v0`: a Gymnasium environment in which an agent says where to press next.
+
+    >>> import gymnasium
+    >>> import palpate.search.environment  # registers it
+    >>> env = gymnasium.make("Palpate/Search-v0", presses=30)
+    >>> observation, _ = env.reset(seed=1)
+    >>> observation["history"].shape
+    (30, 5)
+
+An episode is one patient and `presses` presses. The reward of a press is the information that it gave, what the entropy of the
+posterior over "no lump, or one at this place" lost [nat], less TIME_COST for each second that it took. At the end comes the
+logarithm of the probability of what is true: no lump, or one near where it is; at least WORST.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, Final, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from palpate.search.hand import PatientHand, SurrogateHand
+from palpate.search.population import Case, case
+from palpate_models.frames import Array
+from palpate_search.posterior import Posterior
+from palpate_search.presses import seconds
+
+ID: Final = "Palpate/Search-v0"
+TIME_COST: Final = 0.01
+WORST: Final = -5.0
+NEAR_M: Final = 0.020
+"""A lump within this distance of where it is counts as there."""
+ONE_MODEL: Final = ((1.0, 1.0),)
+"""Reward is counted with usual roughness and errors: a fifth of the time."""
+Observation = dict[str, NDArray[np.float32]]
+_cases = lru_cache(maxsize=512)(case)
+
+
+class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """One patient after the other. Equal seeds and actions give equal rewards."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(
+        self, hand: Literal["surrogate", "patient"] = "surrogate", presses: int = 40, patients: int = 64, *, maps: bool = False
+    ) -> None:
+        """`hand`: who presses; `presses` an episode; `patients`: so many of the tuning seeds; `maps`: observe the posterior, too.
+
+        An action is place and depth, each from -1 to 1 over what is allowed. The observation has `history`, a row for each press,
+        zeros for those to come: x, y and depth as of an action, the logarithm of the force over 5 N, and 1; and `left`, the share
+        of presses that is left. With maps it has `maps`, shape (3, nx, ny) over the places: probability of a lump there, mean and
+        standard deviation of the field.
+        """
+        if hand not in ("surrogate", "patient"):
+            raise ValueError(f"hand = {hand!r}: want surrogate or patient")
+        if not 1 <= presses <= 100 or not 1 <= patients <= 1000:
+            raise ValueError(f"presses = {presses}, patients = {patients}: want 1 to 100, 1 to 1000")
+        self._kind, self._presses, self._patients, self._maps = hand, presses, patients, maps
+        self._begin(_cases(0))
+        self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+        parts: dict[str, spaces.Space[Any]] = {
+            "history": spaces.Box(-10.0, 10.0, (presses, 5), np.float32),
+            "left": spaces.Box(0.0, 1.0, (1,), np.float32),
+        }
+        if maps:
+            parts["maps"] = spaces.Box(-20.0, 20.0, (3, *self._shape), np.float32)
+        self.observation_space: spaces.Space[Any] = spaces.Dict(parts)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Another patient, drawn from the environment's seed; `options={"patient": 7}` asks for one."""
+        super().reset(seed=seed)
+        patient = (options or {}).get("patient", int(self.np_random.integers(self._patients)))
+        self._begin(_cases(patient))
+        return self._observed(), {"patient": patient}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One press."""
+        task = self._hand.task
+        share = 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0)
+        xy = task.low + share[:2] * (task.high - task.low)
+        depth = task.shallowest + share[2] * (task.deepest - task.shallowest)
+        before, here = self._entropy(), self._posterior.here
+        felt = self._hand.press(xy, float(depth))
+        self._posterior.add(felt)
+        reward = before - self._entropy() - TIME_COST * float(seconds(here, xy))
+        self._history[self._count] = (*(2 * share - 1), np.log(felt.force / 5.0), 1.0)
+        self._count += 1
+        over = self._count == self._presses
+        if over:
+            reward += max(float(np.log(max(self._truth(), 1e-12))), WORST)
+        told = {"lump": self._posterior.lump, "truth": self._truth()} if over else {}
+        return self._observed(), float(reward), over, False, told
+
+    def _begin(self, patient: Case) -> None:
+        hands = SurrogateHand(patient.scenario, felt=patient.felt) if self._kind == "surrogate" else PatientHand(patient.scenario)
+        self._case, self._hand, self._count = patient, hands, 0
+        self._posterior = Posterior(hands.task, models=ONE_MODEL)
+        self._history = np.zeros((self._presses, 5), dtype=np.float32)
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        places = self._hand.task.places
+        rows = len(np.unique(places[:, 0]))
+        return rows, len(places) // rows
+
+    def _entropy(self) -> float:
+        """Of the posterior over no lump, or one at each place [nat]."""
+        p = np.append(self._posterior.by_place, self._posterior.none)
+        return float(-(p * np.log(np.maximum(p, 1e-300))).sum())
+
+    def _truth(self) -> float:
+        """The probability of what is true."""
+        centre: Array | None = self._case.centre
+        if centre is None:
+            return self._posterior.none
+        near = np.linalg.norm(self._hand.task.places - centre, axis=1) <= NEAR_M
+        return float(self._posterior.by_place[near].sum())
+
+    def _observed(self) -> Observation:
+        left = np.array([1 - self._count / self._presses], dtype=np.float32)
+        seen: Observation = {"history": self._history.clip(-10, 10), "left": left}
+        if self._maps:
+            mean, variance = self._posterior.field()
+            layers = np.stack((self._posterior.by_place, mean, np.sqrt(variance)))
+            seen["maps"] = layers.reshape(3, *self._shape).clip(-20, 20).astype(np.float32)
+        return seen
+
+
+gymnasium.register(ID, "palpate.search.environment:SearchEnv")

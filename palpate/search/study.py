@@ -1,0 +1,64 @@
+"""The study of searches: the same patients by every policy. `python -m palpate.search.study` makes the trials.
+
+Each trial goes on for the whole budget, and what was known is kept after each press. All policies have one judge, the posterior:
+a lump is said to be near the most probable place when its probability exceeds a threshold, which is chosen for each policy on
+healthy tuning patients (`curves`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+import pandas as pd
+import typer
+from rich.progress import track
+
+from palpate.search.hand import PatientHand, SurrogateHand
+from palpate.search.population import case
+from palpate.search.trial import search
+from palpate_search.choice import policies, policy
+
+HANDS: Final = {"surrogate": SurrogateHand, "patient": PatientHand}
+
+
+def run(seeds: Sequence[int], hand: str, names: Sequence[str], out: Path) -> None:
+    """Makes the trials that are not there yet: a file for each patient, a row for each press."""
+    out.mkdir(parents=True, exist_ok=True)
+    for seed in track(seeds, "searching"):
+        file = out / f"{hand}-{seed}.csv"
+        known = pd.read_csv(file) if file.exists() else pd.DataFrame(columns=["policy"])
+        missing = [name for name in names if name not in set(known.policy)]
+        if not missing:
+            continue
+        patient = case(seed)
+        rows = [known] if len(known) else []
+        for name in missing:
+            hands = SurrogateHand(patient.scenario, felt=patient.felt) if hand == "surrogate" else PatientHand(patient.scenario)
+            trial = search(hands, policy(name))
+            apart = np.full(len(trial.near), np.nan)
+            if patient.centre is not None:
+                apart = np.linalg.norm(trial.place - patient.centre, axis=1)
+            columns = {"press": np.arange(1, len(apart) + 1), "seconds": trial.seconds, "near": trial.near, "apart_m": apart}
+            rows.append(pd.DataFrame({"seed": seed, "policy": name, **columns, "think_s": trial.think_s}))
+        pd.concat(rows).to_csv(file, index=False, float_format="%.5g")
+
+
+def main(
+    first_seed: Annotated[int, typer.Option(min=0, help="Of the patients; below 1000 they tune thresholds.")] = 1000,
+    number: Annotated[int, typer.Option("-n", min=1, help="Patients; every second one has a lump.")] = 100,
+    every: Annotated[int, typer.Option(min=1, help="Only every so many-th seed; 2 for healthy patients alone.")] = 1,
+    hand: Annotated[str, typer.Option(help=f"Who presses: {', '.join(HANDS)}.")] = "surrogate",
+    names: Annotated[list[str] | None, typer.Option("--policy", help="Only these policies.")] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where the trials are.")] = Path("out/search-study"),
+) -> None:
+    """Search the patients of some seeds by every policy. `python -m palpate.search.curves` compares what was done."""
+    if hand not in HANDS:
+        raise typer.BadParameter(f"--hand {hand}: want one of {', '.join(HANDS)}")
+    run(range(first_seed, first_seed + number * every, every), hand, names or policies(), out)
+
+
+if __name__ == "__main__":
+    typer.run(main)
