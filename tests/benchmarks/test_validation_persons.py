@@ -7,7 +7,7 @@ import pytest
 
 from palpate_validation import buried, persons, population
 from palpate_validation.check import PageSection
-from palpate_validation.population import Sample
+from palpate_validation.population import PopulationSample
 
 
 def assert_bounds(section: PageSection) -> None:
@@ -22,8 +22,8 @@ def test_persons_have_the_statistics_of_the_measured_people() -> None:
 
 def test_people_all_alike_or_too_stiff_would_be_found_out() -> None:
     people = population.measured()
-    alike = Sample(people.person, np.tile(np.median(people.force, axis=0), (len(people.force), 1)))
-    stiff = Sample(people.person, 1.3 * people.force)
+    alike = PopulationSample(people.person, np.tile(np.median(people.force, axis=0), (len(people.force), 1)))
+    stiff = PopulationSample(people.person, 1.3 * people.force)
     for wrong in (alike, stiff):
         assert any(check.passed is False for check in population.section(wrong).checks)
 
