@@ -134,11 +134,6 @@ def known_loops() -> tuple[LoopErrors, ...]:
     return tuple(TypeAdapter(list[LoopErrors]).validate_python(yaml.safe_load(text)["loops"]))
 
 
-def any_assumed() -> bool:
-    """Whether a loop stands for more examinations than were carried out."""
-    return any(row.examinations < LEAST_EXAMINATIONS for row in known_loops())
-
-
 def setting_of(scenario: Scenario) -> dict[str, str | None]:
     """The level of each section of a scenario's errors that its loop depends on, None where it is none; and the breathing."""
     sections: dict[str, str | None] = {}

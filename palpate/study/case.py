@@ -52,6 +52,8 @@ class Attempt(BaseModel):
     """What of that the assessment took."""
     core_s: float = 0.0
     host: str = ""
+    loop_examinations: int | None = None
+    """From how many whole examinations the errors of a quick case are; null of a whole one."""
 
 
 def examine(case: Case) -> Attempt:
@@ -63,7 +65,8 @@ def examine(case: Case) -> Attempt:
                 f"{path} is not the file that the study was made with: its SHA-256 begins with {file_hash(path)[:16]}"
             )
     scenario = Scenario.model_validate(case.scenario)
-    report, assess_s = _quick(scenario) if case.tier == "quick" else _whole(scenario, case)
+    quick = case.tier == "quick"
+    report, assess_s = _quick(scenario) if quick else _whole(scenario, case)
     return Attempt(
         case_id=case.case_id,
         report=report,
@@ -74,6 +77,7 @@ def examine(case: Case) -> Attempt:
         assess_time_s=assess_s,
         core_s=_core_s() - used,
         host=socket.gethostname(),
+        loop_examinations=_behind_loop(scenario) if quick else None,
     )
 
 
@@ -96,6 +100,12 @@ def _quick(scenario: Scenario) -> tuple[Report, float]:
 
     quick = run_quick(scenario)
     return quick.report, quick.assess_s
+
+
+def _behind_loop(scenario: Scenario) -> int:
+    from palpate.quick.errors import loop_errors  # noqa: PLC0415 - whole examinations need nothing of it
+
+    return loop_errors(scenario).examinations
 
 
 def _core_s() -> float:

@@ -12,6 +12,7 @@ from typing import Final
 from palpate.run.roles import WORKERS
 
 PACKAGES: Final = (
+    "palpate.quick",
     "palpate.run",
     "palpate.truth",
     "palpate.report",

@@ -190,6 +190,10 @@ def _conclude(folder: Path, manifest: Manifest) -> None:
         raise typer.Exit(EXIT_FAILED)
 
 
+def _time(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 600 else f"{seconds:.0f} s"
+
+
 def _in_words(found: RunRecord) -> str:
     words = [f"{found.study}, split {found.split}: {found.done} of {found.cases} cases done, {found.not_completed} not completed"]
     words += [f"digest {found.digest}" if found.digest else f"no digest: {found.no_digest}"]
@@ -202,4 +206,5 @@ def _in_words(found: RunRecord) -> str:
             f"{3600 * done / seconds:.0f} cases an hour, {found.core_s / found.cases:.0f} s of a core a case, "
             f"at most {found.peak_memory_bytes / 1e9:.1f} GB a case"
         )
+        words.append(f"so 10,000 such cases on 1,000 cores like these take {_time(10 * found.core_s / found.cases)} (calculated)")
     return "\n".join(words)

@@ -39,6 +39,8 @@ class Outcome(BaseModel):
     """Time of the processor that it took."""
     host: str
     """The machine."""
+    loop_examinations: int | None = None
+    """From how many whole examinations the errors of a quick case are; null of a whole one."""
 
     @property
     def completed(self) -> bool:

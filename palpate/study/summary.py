@@ -9,7 +9,7 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from palpate.quick.errors import any_assumed
+from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.report.files import write_text
 from palpate.study import human_line
 from palpate.study.page import render
@@ -126,7 +126,7 @@ class StudySummary(_Row):
     methods: dict[str, MethodRow]
     comparisons: tuple[Comparison, ...]
     assumed: bool
-    """Whether cases are of the quick tier on a loop that is assumed, not measured: then no figure may be quoted."""
+    """Whether the errors of quick cases are of too few whole examinations: then no figure may be quoted."""
     level: float
     """Of the intervals."""
     bootstrap_folds: int
@@ -176,7 +176,7 @@ def analysed_tables(tables: Tables) -> Analysed:
         reference=reference.name,
         methods={analysis.name: _method(analysis) for analysis in analyses},
         comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
-        assumed=any_assumed() and any((variant.cases["tier"] == "quick").any() for variant in tables.variants),
+        assumed=any((variant.cases["loop_examinations"] < LEAST_EXAMINATIONS).any() for variant in tables.variants),
         level=LEVEL,
         bootstrap_folds=tables.folds,
         human=human_line.as_json(),

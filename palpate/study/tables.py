@@ -51,11 +51,13 @@ CASES: Final = pa.schema(
         "assess_time_s": pa.float64(),
         "peak_memory_bytes": pa.int64(),
         "core_s": pa.float64(),
+        "loop_examinations": pa.int64(),
     }
 )
 """A row a case. Counts are null and figures NaN where a case has no report. `score`: greatest confidence of any finding or
 candidate, 0 without one. `exam_time_s` is simulated time; `sim_time_s` real time of the simulation, in whole examinations with
-the assessment, `assess_time_s` that of the assessment, `wall_time_s` all of it with the truth, `core_s` the processor's."""
+the assessment, `assess_time_s` that of the assessment, `wall_time_s` all of it with the truth, `core_s` the processor's.
+`loop_examinations`: from how many whole examinations the errors of a quick case are; null of a whole one."""
 FINDINGS: Final = pa.schema(
     {
         "case_id": pa.string(),
@@ -115,6 +117,7 @@ def _case(study: str, outcome: Outcome, hits: Sequence[Row]) -> Row:
     row |= case.model_dump(include={"case_id", "population", "method", "split", "number", "seed", "tier", "errors"})
     row |= {"study": study, "status": outcome.status, "attempts": outcome.attempts, "why": outcome.why}
     row |= {"completed": outcome.completed, "peak_memory_bytes": outcome.peak_memory_bytes, "core_s": outcome.core_s}
+    row |= {"loop_examinations": outcome.loop_examinations}
     row |= {"wall_time_s": outcome.wall_time_s, "assess_time_s": _number(outcome.assess_time_s)}
     if report is None:
         return row

@@ -44,7 +44,7 @@ def case(number: int, population: str, **fields: Any) -> dict[str, Any]:
         "tier": "whole", "errors": "typical", "status": "done", "attempts": 1, "why": "", "run_hash": "0", "completed": True,
         "palpable": 0, "not_palpable": 0, "matched": 0, "missed": 0, "false_findings": 0, "score": 0.0, "coverage_area": 0.9,
         "coverage_lumps": 0.9, "coverage_ratio": np.nan, "depth_rms_m": 3e-4, "peak_force_n": 9.0, "exam_time_s": 200.0,
-        "sim_time_s": 220.0, "wall_time_s": 80.0, "assess_time_s": 4.0,
+        "sim_time_s": 220.0, "wall_time_s": 80.0, "assess_time_s": 4.0, "loop_examinations": np.nan,
     }  # fmt: skip
     return row | fields
 

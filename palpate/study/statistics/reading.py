@@ -16,7 +16,8 @@ from palpate.study.statistics.estimate import FOLDS, Bootstrap
 
 COLUMNS: Final = {
     "cases": """case_id study population method split number tier errors status completed palpable not_palpable false_findings
-        score coverage_area coverage_lumps coverage_ratio depth_rms_m peak_force_n exam_time_s""",
+        score coverage_area coverage_lumps coverage_ratio depth_rms_m peak_force_n exam_time_s
+        loop_examinations""",
     "findings": """case_id reported area_m2 ratio ratio_lower ratio_upper confidence lump place_error_m area_true_m2
         ratio_true""",
     "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence",
