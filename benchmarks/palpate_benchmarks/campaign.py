@@ -54,6 +54,7 @@ MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
 KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS)
 WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
 COMPLETE: Final = "complete"
+WENT_WITHOUT: Final = "went on without what was struck"
 UNHARMED: Final = (COMPLETE, WENT_ON)
 """Ends that need no cause."""
 LASTING: Final = frozenset({"nan", "stamp"})
@@ -122,7 +123,10 @@ class FaultFinding:
     def good(self) -> bool:
         """Done, no hang, no force above the limits, results kept, nothing left behind; and its cause named unless it went on."""
         most = FORCE_LIMIT_N
-        if self.peak_force_before_n > CONTACT_N:
+        if self.peak_force_before_n > CONTACT_N and self.ended not in (
+            *UNHARMED,
+            WENT_WITHOUT,
+        ):  # else later forces are the scan's
             most = min(most, self.peak_force_before_n + MORE_N)
         return (
             self.injected_s is not None

@@ -18,7 +18,7 @@ import psutil
 from palpate.report.archive import EvidenceError
 from palpate.report.recover import recovered
 from palpate.run.roles import WORKERS
-from palpate_benchmarks.campaign import FaultCase, FaultFinding
+from palpate_benchmarks.campaign import WENT_WITHOUT, FaultCase, FaultFinding
 from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Struck, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.recordings import RecordingError
@@ -100,7 +100,7 @@ def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
             failure, kept = str(error), False
     finding.kept = kept
     finding.sign = _first_word(struck) if CONDUCTOR in roles else str(failure or ", ".join(struck.said.get("lost", ())))
-    finding.ended = str(failure or "went on without what was struck")
+    finding.ended = str(failure or WENT_WITHOUT)
     words = f"{finding.sign} {finding.ended}"
     finding.named = any(re.search(rf"(?<![\w/]){role}(?!\w)", words) for role in roles)
     _measure(finding, struck)

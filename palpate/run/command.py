@@ -45,6 +45,10 @@ def run(  # noqa: PLR0913 - the options of a command
     keys: Annotated[
         Path | None, typer.Option(help="With --secure: folder of `palpate keys init`; else keys of this run.")
     ] = None,
+    repeat: Annotated[
+        int,
+        typer.Option(metavar="N", min=1, help="So many examinations, each with a folder and a seed of its own; see soak.json."),
+    ] = 1,
     settings: Settings = None,
     services: ServiceChoices = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
@@ -75,7 +79,7 @@ def run(  # noqa: PLR0913 - the options of a command
 
       palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
     """
-    from palpate.run.examine import How, examine  # noqa: PLC0415 - see above
+    from palpate.run.examine import How, examine, examine_again  # noqa: PLC0415 - see above
     from palpate.run.inputs import usable  # noqa: PLC0415
 
     how = How(
@@ -95,7 +99,11 @@ def run(  # noqa: PLR0913 - the options of a command
         quiet=quiet,
         as_json=as_json,
     )
-    examine(usable(scenario, settings, seed, services), how)
+    chosen = usable(scenario, settings, seed, services)
+    if repeat > 1:
+        examine_again(chosen, how, repeat)
+    else:
+        examine(chosen, how)
 
 
 def prepare(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from palpate.run.placement import Groups, PlacementError, placement
 from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
+from palpate.run.repeat import repeat
 from palpate.run.roles import NONE, OBSERVERS, choice, workers, write_scenario_files
 from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
@@ -108,6 +109,23 @@ def examine(scenario: Scenario, how: How) -> None:
         refuse(error)
     except RunFailed as error:
         fail(error)
+
+
+def examine_again(scenario: Scenario, how: How, count: int) -> None:
+    """Runs so many examinations one after another, with seeds from the scenario's on; ends the command when one has failed."""
+    folder = how.out or usual_folder(scenario.name)
+
+    def once(number: int, own: Path) -> bool:
+        try:
+            examine(scenario.model_copy(update={"seed": scenario.seed + number - 1}), replace(how, out=own))
+        except typer.Exit as left:
+            if left.exit_code != EXIT_FAILED:
+                raise  # what cannot start once cannot start again
+            return False
+        return True
+
+    if failed := repeat(count, folder, once):
+        fail(f"{failed} of {count} examinations did not come to a good end")
 
 
 def _refuse_contradictions(scenario: Scenario, how: How) -> None:
