@@ -75,8 +75,9 @@ class Collector(Service):
                 c.status_changes.append(status)
         c.supervisor = inbox.latest("supervisor/state")
         c.phantom = inbox.latest("truth/phantom")
-        c.surface = inbox.latest("perception/surface")
-        c.targets = inbox.latest("perception/targets")
+        if not c.samples:  # later looks are at a patient who has moved: what is felt is told where the first look saw it
+            c.surface = inbox.latest("perception/surface")
+            c.targets = inbox.latest("perception/targets")
         c.stiffness_map = inbox.latest("assessment/map")
         c.findings = inbox.latest("assessment/findings")
         out: dict[str, Any] = {"clock": Clock(time_message(t))}
