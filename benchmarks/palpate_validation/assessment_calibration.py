@@ -64,7 +64,7 @@ def phantom(seed: int) -> Phantom:
 def scan_errors(seed: int) -> ScanErrors:
     """From a third of the typical errors to one and a half times as much."""
     scale = float(np.exp(generator(seed, "scan-errors").uniform(np.log(0.33), np.log(1.5))))
-    return ScanErrors(stroke_m=7e-4 * scale, field_m=5e-4 * scale, breathing_m=7e-4 * scale, tare_n=0.05 * scale)
+    return ScanErrors(stroke_m=3e-4 * scale, field_m=8e-4 * scale, breathing_m=5e-4 * scale, tare_n=0.05 * scale)
 
 
 def case(seed: int, calibration: Calibration) -> WeighedPatient:
@@ -125,6 +125,11 @@ def told(cases: list[WeighedPatient], calibration: Calibration, false_findings: 
         if here.any():
             mean, part = probability[here].mean(), real[here].mean()
             print(f"probability {low} to {high}: {here.sum()} candidates, {mean:.2f} told, {part:.2f} true")
+    soft = np.concatenate([c.features[:, FEATURES.index("softer")] > 0 for c in cases])
+    for name, kind in (("stiff", ~soft), ("soft", soft)):
+        reported = kind & (every >= threshold)
+        lumps, there = (reported & real).sum(), (kind & real).sum()
+        print(f"{name}: {reported.sum()} reported, {lumps} of them lumps; {there} candidates were lumps")
     held = np.array([c.held for c in cases])
     print(f"band holds: mean {held.mean():.3f}, median {np.median(held):.3f}, tenth {np.quantile(held, 0.1):.3f}")
 

@@ -6,6 +6,7 @@ It takes a fraction of a second a person, so that thousands can be had, for the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
@@ -13,6 +14,9 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.sampling import ForceSample
 from palpate_models.seeds import generator
+
+FIELD_LENGTH_M: Final = 0.025
+"""As whole examinations have it: what touches leave of the error of the perceived surface."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +26,7 @@ class ScanErrors:
     stroke_m: float = 0.0
     """Zero of a stroke's depth."""
     field_m: float = 0.0
-    """Perceived surface, smooth over 50 mm."""
+    """Perceived surface, smooth over FIELD_LENGTH_M."""
     breathing_m: float = 0.0
     """What is left of breathing, over 1 s and with its period."""
     tare_n: float = 0.0
@@ -40,14 +44,14 @@ def felt_samples(
     rng = generator(seed, "felt-scan")
     lines = np.linspace(-region / 2, region / 2, round(region / spacing) + 1)
     along = np.arange(-region / 2 + 0.0025, region / 2, 0.005)
-    n, conversion, period = rng.normal(1.35, 0.1), rng.normal(0.0, 0.02), rng.uniform(3.0, 6.0)
+    n, conversion, period = rng.normal(1.4, 0.1), rng.normal(-0.008, 0.015), rng.uniform(3.0, 6.0)
     duration = region / 0.03
     times = np.concatenate([i * (duration + 4.0) + np.linspace(0, duration, len(along)) for i in range(len(lines))])
     clock = np.arange(0.0, times[-1] + 0.1, 0.05)
     wander = gaussian_filter1d(rng.standard_normal(len(clock)), 1.0 / np.sqrt(2) / 0.05)
     wander = wander / wander.std() + np.sqrt(2) * np.sin(2 * np.pi * clock / period + rng.uniform(0, 6))
     breathing = errors.breathing_m * np.interp(times, clock, wander) / np.sqrt(2)
-    field = gaussian_filter(rng.standard_normal((75, 75)), 0.05 / np.sqrt(2) / PITCH_M)
+    field = gaussian_filter(rng.standard_normal((75, 75)), FIELD_LENGTH_M / np.sqrt(2) / PITCH_M)
     field *= errors.field_m / max(float(field.std()), 1e-12)
     xy = np.concatenate(
         [np.column_stack((along[:: 1 if i % 2 == 0 else -1], np.full(len(along), y))) for i, y in enumerate(lines)]
@@ -61,7 +65,7 @@ def felt_samples(
     force += errors.tare_n * rng.standard_normal(len(lines))[stroke] + errors.noise_n * rng.standard_normal(len(xy))
     limited = force > 14.0
     speed = np.where(stroke % 2 == 0, 0.03, -0.03)
-    unsure = float(np.sqrt(errors.stroke_m**2 + errors.breathing_m**2 + errors.field_m**2))
+    unsure = float(np.hypot(errors.stroke_m, errors.field_m) * np.exp(0.3 * rng.standard_normal()))
     return [
         ForceSample(
             time=float(times[i]),

@@ -117,6 +117,7 @@ class DashboardService(Service):
         """True pose of the patient before any motion, shape (4, 4)."""
         self._pressed_n = 0.0
         self._found: list[str] = []
+        self._unassessed: list[str] = []
         self._robot = "no status yet"
         self._paced = paced
         self._pace: float | None = None
@@ -300,7 +301,9 @@ class DashboardService(Service):
 
     def _stiffness(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.vertices)
-        scanned = np.asarray(message.scanned, dtype=bool) & (np.asarray(message.unassessed) == StiffnessMap.ASSESSED)
+        reached, codes = np.asarray(message.scanned, dtype=bool), np.asarray(message.unassessed)
+        scanned = reached & (codes == StiffnessMap.ASSESSED)
+        self._unassessed = words.unassessed(codes[reached])
         apparent = np.asarray(message.apparent, dtype=np.float64)
         if not scanned.any():
             return
@@ -319,7 +322,12 @@ class DashboardService(Service):
             self._map.findings(t, centroids, labels)
             self._scene.findings(t, apply(self._X_WA, centroids), labels)
         if message.final:
-            self._plots.say(t, "log/findings", "; ".join(lines) or "no stiff area found", "WARN" if lines else "INFO")
+            self._plots.say(
+                t,
+                "log/findings",
+                "; ".join(self._unassessed + (lines or ["no area found"])),
+                "WARN" if lines or self._unassessed else "INFO",
+            )
 
     def _diagnostics(self, t: int, message: Message) -> None:
         rows = [words.Health.of(status) for status in message.status]

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
-from palpate_bus.messages import ExamState
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_bus.messages import ExamState, StiffnessMap
 from palpate_bus.messages.codec import Message
 
 LEVELS = ("ok", "warning", "ERROR", "stale")
@@ -104,6 +108,18 @@ def services(rows: Sequence[Health], blame: Iterable[tuple[str, float]] = ()) ->
         rate, missing = row.values.get("bus_rate_hz", ""), row.values.get("missing", "")
         lines.append(f"| {row.name} | {row.word} | {row.message} | {rate} | {missing if missing != '0' else ''} |")
     return "\n".join(lines)
+
+
+UNASSESSED: Final = {
+    StiffnessMap.CONTRADICTED: "the samples contradict each other",
+    StiffnessMap.YIELDED: "the force limit was met before the depth",
+}
+
+
+def unassessed(codes: NDArray[np.uint8]) -> list[str]:
+    """What of the places that were reached is not assessed, and why: a line for each reason that there is."""
+    shares = {reason: float(np.mean(codes == code)) if len(codes) else 0.0 for code, reason in UNASSESSED.items()}
+    return [f"not assessed: {100 * share:.0f} %, {reason}" for reason, share in shares.items() if share > 0]
 
 
 def finding(quadrant: str, ratio: float, lower: float, upper: float, area_m2: float, confidence: float) -> str:

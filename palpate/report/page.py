@@ -20,7 +20,7 @@ from palpate.report import page_figures, page_surface
 from palpate.report.archive import FILE as EVIDENCE
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
 from palpate.report.evidence import body_of, felt_truth
-from palpate.report.results import clean_words
+from palpate.report.results import clean_words, unassessed
 from palpate.report.rows import FindingRow, Report
 from palpate.report.scoring import Truth
 from palpate_models.frames import Array, apply, inverse
@@ -116,12 +116,6 @@ def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
     return felt_truth(scenario, body_of(evidence.phantom), evidence.pressed, evidence.touched)
 
 
-REASONS = {
-    "contradicted": "where the samples disagree by more than stiffness and the known errors explain",
-    "yielded": "where the force limit was met before the depth, as over bone",
-}
-
-
 def confidence(value: float) -> str:
     """A probability in words: no finding is certain."""
     return "over 99 %" if value > 0.99 else f"{_PERCENT * value:.0f} %"
@@ -134,14 +128,8 @@ def verdict(report: Report) -> str:
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
     if not report.findings:
-        return f"{_unassessed(report)}No lump was found{_unreached(report)}."
-    return _unassessed(report) + " ".join(_in_words(finding) for finding in report.findings)
-
-
-def _unassessed(report: Report) -> str:
-    """What is not known, which comes first."""
-    parts = report.unassessed_m2.items()
-    return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in parts)
+        return f"{unassessed(report)}No lump was found{_unreached(report)}."
+    return unassessed(report) + " ".join(_in_words(finding) for finding in report.findings)
 
 
 def _unreached(report: Report) -> str:

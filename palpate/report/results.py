@@ -105,6 +105,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         findings=[finding_row(f) for f in ([] if final is None else final.findings)],
         candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
         unassessed_m2={} if c.stiffness_map is None else unassessed_of(c.stiffness_map),
+        background_N=None if c.stiffness_map is None else float(c.stiffness_map.background),
         truth=None if known.body is None else _truth(known.felt),
         scores=scores,
         blame=result.blame,
@@ -158,8 +159,38 @@ def write_samples(path: Path, samples: Samples, run: str = "") -> None:
             writer.writerow((*(f"{value:.6g}" for value in row), int(limited), run))
 
 
+REASONS = {
+    "contradicted": "where the samples disagree by more than stiffness and the known errors explain",
+    "yielded": "where the force limit was met before the depth, as over bone",
+}
+
+
+USUAL_N = (1.2, 4.8)
+"""Level of a person's apparent stiffness: the measured median of 2.4 N, and twice 0.35 in the logarithm, which is 0.12 between
+those people, who are alike [V], 0.2 between places of one [V], and something for all others [A]."""
+
+
+def unassessed(report: Report) -> str:
+    """What is not known, which comes first."""
+    parts = report.unassessed_m2.items()
+    return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in parts) + _level(report)
+
+
+def _level(report: Report) -> str:
+    """A region that is unusual all over, in which nothing can stand out."""
+    level, (low, high) = report.background_N, USUAL_N
+    if level is None or low <= level <= high:
+        return ""
+    return (
+        f"The whole region is unusually {'firm' if level > high else 'soft'}: {level:.1f} N, where {low:g} to {high:g} N are "
+        "usual. A lump or a guarded muscle that fills it cannot be told from the person's own stiffness: examine a wider region. "
+    )
+
+
 def print_findings(console: Console, report: Report) -> None:
-    """The findings as a table, and their scores in a line."""
+    """What is not assessed, the findings as a table, and their scores in a line."""
+    if words := unassessed(report):
+        console.print(words.rstrip(), highlight=False, soft_wrap=True)
     if report.findings:
         table = Table("finding", "where (x, y)", "area", "apparent stiffness", "90 % band", "confidence", box=None)
         for f in report.findings:

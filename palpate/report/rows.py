@@ -114,6 +114,8 @@ class Report(_Row):
     unassessed_m2: dict[str, float] = {}
     """Area that the arm scanned and of which nothing is said, by reason: `contradicted`, the samples disagree by more than
     stiffness and the known errors explain; `yielded`, the force limit was met before the depth."""
+    background_N: float | None = None
+    """Apparent stiffness of the region where there is no finding."""
     truth: TruthRow | None
     scores: Scores | None
     """Null when the run ended before there was anything to score, or nothing is known of what could be felt."""

@@ -96,6 +96,17 @@ def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> No
     assert verdict(none).startswith(f"Not assessed: {none.samples} samples are too few for a map")
 
 
+def test_what_is_not_assessed_comes_first_and_a_region_that_is_stiff_all_over_is_told() -> None:
+    nothing = assemble(load_scenario("clean"), result(collected(), failure=None), Known(None, None, None))
+    report = nothing.model_copy(
+        update={"findings": [], "skipped_targets": 0, "unassessed_m2": {"contradicted": 0.0012}, "background_N": 2.4}
+    )
+    assert verdict(report).startswith("Not assessed: 12 cm², where the samples disagree")
+    assert verdict(report).endswith("No lump was found.")
+    firm = verdict(report.model_copy(update={"unassessed_m2": {}, "background_N": 7.0}))
+    assert firm.startswith("The whole region is unusually firm: 7.0 N, where 1.2 to 4.8 N are usual.")
+
+
 def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:
     c = collected(measured_error=0.0002)
     archive.write_evidence(tmp_path / archive.FILE, c)
