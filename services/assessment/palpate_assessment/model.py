@@ -42,9 +42,9 @@ BREATHING_S = 1.0
 """How long what following leaves of breathing stays alike."""
 LEAST_DEPTH_ERROR_M = 0.0001
 """Prior median of the depth's errors for strokes that claim to have none."""
-SURFACE_M, SURFACE_SHARE = 0.025, 1.0
-"""Length of the error that strokes share smoothly, as touches some 70 mm apart leave it, and its part of the depth's uncertainty:
-a scan cannot tell it from stiffness."""
+SURFACE_M, SURFACE_SHARE = 0.020, 1.0
+"""Length of the error that strokes share, what an offset and a tilt leave of the camera's, and its part of the depth's
+uncertainty: a scan cannot tell it from stiffness."""
 SLIDE_SD = 0.015
 """How much a slide may feel of a place otherwise than a press does, beside what it does everywhere, in the logarithm."""
 UNLIKE = 0.1
