@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted, pieces
-from palpate_assessment.detection import matched
+from palpate_assessment.detection import agreed, matched
 from palpate_assessment.model import LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
 
@@ -20,7 +22,7 @@ def observed(stroke_m: float = 0.0, sd: float = 0.15, seed: int = 0) -> Observat
     return o
 
 
-@pytest.mark.parametrize("stroke_m", [0.0002, 0.0015])
+@pytest.mark.parametrize("stroke_m", [0.0005, 0.0015])
 def test_errors_of_the_strokes_are_found_from_the_data(stroke_m: float) -> None:
     found = amplitudes(observed(stroke_m), learned(), ())
     assert np.exp(found[len(LENGTHS_M) + 2]) == pytest.approx(stroke_m, rel=0.6)
@@ -48,6 +50,24 @@ def test_the_matched_filter_reads_a_bump_without_bias() -> None:
     (log_contrast,), (t,) = matched(Regression(o, learned(), (), usual_amplitudes(o)), [bump])
     assert log_contrast == pytest.approx(0.4, abs=0.05)
     assert t > 3
+
+
+def test_what_one_stroke_alone_says_is_not_believed() -> None:
+    """A hiccup of a second lifts the force along three centimetres of one stroke, a lump that of all strokes over it."""
+    bump = Bump(0.0, 0.005, 0.015)
+    hiccup = [
+        replace(s, force=1.3 * s.force) if s.stroke == 6 and abs(s.position[0]) < 0.015 else s for s in lines(level, noise=0.005)
+    ]
+    lumpy = lines(lambda xy: LEVEL + lump(xy, (0.0, 0.005), 0.015, 1.3), noise=0.005)
+    strengths = []
+    for samples in (hiccup, lumpy):
+        o = observe(samples, learned())
+        assert o is not None
+        regression = Regression(o, learned(), (), usual_amplitudes(o))
+        (t,) = matched(regression, [bump])[1]
+        strengths.append((float(t), agreed(regression, bump, float(t))))
+    assert strengths[0][1] < 0.5 * strengths[0][0]
+    assert strengths[1][1] == pytest.approx(strengths[1][0], rel=0.15)
 
 
 def test_a_lump_in_the_model_takes_its_contrast() -> None:
