@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
@@ -51,7 +52,8 @@ def patient(length: float, seed: int) -> FeltPatient:
     noise = gaussian_filter(rng.standard_normal((len(axis) + 2 * border,) * 2), width, mode="wrap")
     unit = 2 * np.sqrt(np.pi) * width  # of white noise under a Gaussian of this width, the standard deviation's inverse
     background = LEVEL_N * np.exp(NATURAL_SD * unit * noise[border:-border, border:-border])
-    lump = Bump(*rng.uniform(-0.07, 0.07, 2), rng.uniform(*RADII_M))(places).reshape(background.shape)
+    x, y = rng.uniform(-0.07, 0.07, 2).tolist()
+    lump = Bump(x, y, float(rng.uniform(*RADII_M)))(places).reshape(background.shape)
     contrast = np.exp(rng.uniform(*np.log(CONTRASTS))) if seed % 2 else 1.0
     return FeltPatient(background * contrast**lump, background)
 
@@ -78,7 +80,7 @@ def ours(o: Observations) -> float:
     return float(calibration.logit(np.array([c.features for c in candidates])).max()) if candidates else -20.0
 
 
-def auc(scores: Array, diseased: Array) -> tuple[float, float]:
+def auc(scores: Array, diseased: NDArray[np.bool_]) -> tuple[float, float]:
     """Area under the ROC curve, and its standard error (Hanley and McNeil)."""
     sick, well = scores[diseased], scores[~diseased]
     area = float(mannwhitneyu(sick, well).statistic) / (len(sick) * len(well))
