@@ -71,3 +71,12 @@ def test_each_container_has_the_scenario_file_of_its_role_and_no_other() -> None
             view = view_of(role)
             assert COMPOSE[role]["environment"]["PALPATE_SCENARIO"] == f"{folders[view]}/{view}.yaml"
             assert [volume.split(":")[-1 if view == "scenario" else -2] for volume in COMPOSE[role]["volumes"]] == [folders[view]]
+
+
+def test_no_container_takes_a_machine_for_itself() -> None:
+    for role, service in COMPOSE.items():
+        assert service["mem_limit"].endswith("g"), role
+        assert service["pids_limit"] <= 256
+        assert service["cpus"] <= 1.0
+        assert service["logging"]["options"] == {"max-size": "10m", "max-file": "3"}
+        assert service["cap_drop"] == ["ALL"]
