@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
 
-import click
 import pytest
 import typer
 from rich.console import Console
@@ -17,6 +15,7 @@ from typer.testing import CliRunner
 
 from palpate import commands
 from palpate.commands import COMMANDS, app_for
+from palpate.reference import walked
 from palpate.run import examine
 from palpate_bus.implementations import ChoiceError
 from palpate_models.load import load_scenario
@@ -101,19 +100,12 @@ def test_help_and_unknown_words_know_them_all() -> None:
     assert names("run") == {"run"}
 
 
-def walked(command: click.Command, path: str) -> Iterator[tuple[str, click.Command]]:
-    """A command and those within it, by their words."""
-    if isinstance(command, click.Group):
-        for name, inner in command.commands.items():
-            yield from walked(inner, f"{path} {name}".strip())
-    else:
-        yield path, command
-
-
 @pytest.mark.parametrize("word", sorted(COMMANDS))
 def test_options_are_alike_everywhere(word: str) -> None:
-    for path, command in walked(typer.main.get_command(app_for(word)), ""):
-        options = {name: option for option in command.params if isinstance(option, click.Option) for name in option.opts}
+    found = list(walked(typer.main.get_command(app_for(word))))
+    assert all(path.partition(" ")[0] == word for path, _ in found)
+    for path, command in found:
+        options = {name: option for option in command.params if option.param_type_name == "option" for name in option.opts}
         assert command.help, path
         assert "--doc" not in options, path
         if "--out" in options:

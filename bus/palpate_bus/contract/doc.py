@@ -146,6 +146,7 @@ def _facts(topic: Topic) -> list[tuple[str, str]]:
     rows += [("in the run hash", "yes" if topic.hashed else "no")]
     rows += [("may be sent by", "anyone: a ROS 2 node too")] if topic.open else []
     rows += [("tagged", "where the run has a key")] if topic.tagged else []
+    rows += [("--record normal keeps", f"one message in {topic.record_ms} ms")] if topic.record_ms else []
     rows += [("stale after", f"{topic.max_age_ms} ms")] if topic.max_age_ms else []
     rows += [("expires after", f"{topic.expiry_ms} ms: the receiver then acts safely")] if topic.expiry_ms else []
     return rows

@@ -1,0 +1,52 @@
+"""A tissue of your own: a bed of springs, one under each point of the skin, which know nothing of each other."""
+
+import numpy as np
+
+from palpate_bus.contract import contract
+from palpate_bus.messages.stamps import NS
+from palpate_models.breathing import BreathingCurve
+from palpate_models.load import true_pose
+from palpate_models.phantom import build_phantom
+from palpate_tissue.backend import TissueBackend
+from palpate_tissue.service import TissueService
+
+
+class Springs(TissueBackend):
+    """A point that is displaced by u along its normal pushes back with k A u: its modulus k, its area A."""
+
+    def step(self, t_s, p_A, v_A, radius, w_A=None):
+        """Force on the sphere at p_A [N], and its torque about the centre [N m], in the abdomen frame."""
+        lifted = self.excursion(t_s) * self.model.breathing  # outward, by the breath
+        from_centre = self.model.vertices + lifted[:, None] * self.model.normals - p_A
+        along = np.einsum("ij,ij->i", from_centre, self.model.normals)
+        inside = radius**2 - np.einsum("ij,ij->i", from_centre, from_centre)
+        pressed = np.where(inside > 0, along + np.sqrt(along**2 + np.maximum(inside, 0)), 0.0)
+        self._inward, self._contacts = pressed - lifted, np.flatnonzero(inside > 0)
+        self.touching = bool(len(self._contacts))
+        push = (self.model.stiffness * self.model.areas * pressed)[:, None] * self.model.normals
+        return push.sum(axis=0), np.cross(from_centre, push).sum(axis=0)
+
+    def idle(self, t_s):
+        """No sphere anywhere: it only breathes."""
+        self._inward, self._contacts, self.touching = -self.excursion(t_s) * self.model.breathing, np.empty(0, np.intp), False
+
+    def settle(self):
+        """Springs have no memory."""
+        self.idle(0.0)
+
+    contacts = property(lambda self: self._contacts)
+    inward = property(lambda self: self._inward)
+
+    @property
+    def deepest(self):
+        """Of the points in contact, the one that is displaced most, and by how much [m]."""
+        vertex = int(self._contacts[np.argmax(self._inward[self._contacts])])
+        return vertex, float(self._inward[vertex])
+
+
+def create(scenario):
+    """The service of the role `tissue`."""
+    model = build_phantom(scenario.phantom, scenario.seed)
+    springs = Springs(model, BreathingCurve(scenario.phantom.breathing, scenario.seed), contract().roles["tissue"].period / NS)
+    springs.settle()
+    return TissueService(springs, model, true_pose(scenario), {})
