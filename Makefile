@@ -16,7 +16,7 @@ TWO_WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
 run: $(VENV)/.examines  ## the default examination, as processes on this machine
 	$(BIN)/palpate run $(ARGS)
 
-test: install  ## everything but the slow, Docker, browser and page tests; whole examinations (tests/test_gate.py) too
+test: install  ## everything but the slow, Docker, browser and page tests; whole examinations (tests/test_gate*.py) too
 	$(BIN)/python -m pytest -q -m "not slow and not docker and not browser and not pages" $(TWO_WORKERS)
 
 test-slow: install  ## long cases: seeds, scenarios, faults

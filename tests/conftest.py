@@ -15,7 +15,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from examination import GATE, Finished, palpate_run
 
-LONG_FILES = ("test_gate.py", "test_runtimes.py", "test_patient_seen.py", "test_examination.py", "test_fmu_cli.py")
+LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_cli.py")
 """Files whose tests take long: they begin early, so that no worker is left with them at the end."""
 LISTENER = Path(__file__).parent / "contract" / "foreign_listener.py"
 
@@ -51,7 +51,8 @@ def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--record", "none", settings=GATE)
 
 
-EXAMINATION_FILES = ("test_gate.py", "test_examination.py", "test_contract_ros_tools.py", "test_library.py")
+GATE_FILES = ("test_gate.py", "test_gate_alone.py")
+EXAMINATION_FILES = ("test_gate.py", "test_examination.py", "test_contract_ros_tools.py")
 """Files that look at the same examinations: one worker has them all, so that each examination is carried out once."""
 LONG_S = 1200
 """Time for a test with whole examinations [s], on a machine that others load too."""
@@ -79,9 +80,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """A line for each examination of test_gate.py, with its figures, for the summary of `.ci/run`."""
+    """A line for each examination of the gate, with its figures, for the summary of `.ci/run`."""
     for outcome in ("passed", "failed", "error"):
         for report in terminalreporter.stats.get(outcome, ()):
-            _, _, name = report.nodeid.partition("test_gate.py::test_")
-            if name and (report.when == "call" or outcome == "error"):
+            file, _, name = report.nodeid.partition("::test_")
+            if Path(file).name in GATE_FILES and (report.when == "call" or outcome == "error"):
                 terminalreporter.write_line(f"gate: {name.replace('_', ' ')}: {outcome}  {report.capstdout.strip()}".rstrip())

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from examination import Finished, palpate_run
 
+import palpate
+
 
 def test_it_completes(distributed: Finished) -> None:
     assert distributed.status == 0, distributed.output
@@ -80,3 +82,16 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones(tmp_path: Path) -> 
     finished = palpate_run("no_such", tmp_path)
     assert finished.status == 2
     assert "clean" in finished.output
+
+
+def test_the_library_reads_the_folder(composed: Finished) -> None:
+    read = palpate.Examination(composed.folder)
+    assert read.failure is None
+    assert read.recording is None
+    assert len(read.samples) == composed.report["samples"]
+    assert read.findings.quadrant.tolist() == [row["quadrant"] for row in composed.report["findings"]]
+    assert read.map is not None
+    assert len(read.map.frame) == len(read.map.apparent) == len(read.map.uncertainty)
+    assert (read.map.uncertainty > 0).all()
+    assert read.states.force.max() <= composed.report["max_force_N"] + 0.5
+    assert "<img" in read._repr_html_()

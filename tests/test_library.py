@@ -213,19 +213,6 @@ def test_the_assessment_is_the_one_that_the_scenario_names() -> None:
 # --- examinations --------------------------------------------------------------------------------------------------------
 
 
-def test_an_examination_is_read_from_its_folder(composed: Finished) -> None:
-    read = palpate.Examination(composed.folder)
-    assert read.failure is None
-    assert read.recording is None
-    assert len(read.samples) == composed.report["samples"]
-    assert read.findings.quadrant.tolist() == [row["quadrant"] for row in composed.report["findings"]]
-    assert read.map is not None
-    assert len(read.map.frame) == len(read.map.apparent) == len(read.map.uncertainty)
-    assert (read.map.uncertainty > 0).all()
-    assert read.states.force.max() <= composed.report["max_force_N"] + 0.5
-    assert "<img" in read._repr_html_()
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_an_examination_is_that_of_the_command_line(composed: Finished, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A service's process is killed while the indenter is in contact. That of control's is in test_gate.py."""
+"""A service's process is killed while the indenter is in contact. That of control's is in test_gate_alone.py."""
 
 from __future__ import annotations
 

@@ -48,14 +48,11 @@ def test_the_lump_is_found_where_it_is(clean: QuickCase) -> None:
 
 
 def test_any_order_and_any_process_gives_the_same() -> None:
-    seeds = (1, 2, 3)
-    forwards = {seed: hash_of(seed) for seed in seeds}
-    backwards = {seed: hash_of(seed) for seed in reversed(seeds)}
+    one, three, one_again = hash_of(1), hash_of(3), hash_of(1)
     words = [sys.executable, "-c", ALONE, *SMALL]
     alone = subprocess.run(words, capture_output=True, text=True, check=True, timeout=250).stdout.strip()
-    assert len(set(forwards.values())) == 3
-    assert forwards == backwards
-    assert alone == forwards[3]
+    assert one == one_again != three
+    assert alone == three
 
 
 def test_depth_is_wrong_by_what_was_drawn() -> None:

@@ -1,0 +1,23 @@
+"""The rest of what decides whether a change is good (test_gate.py): a healthy patient, and a service killed in contact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from examination import SHORT, palpate_run
+from killing import assert_held_and_no_harder, kill_in_contact
+
+
+def test_healthy_has_no_finding(tmp_path: Path) -> None:
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=(*SHORT, "phantom.lesions=[]"))
+    assert finished.status == 0, finished.output
+    assert finished.report["samples"] > 30
+    assert finished.report["findings"] == []
+    assert finished.report["scores"]["false_findings"] == 0
+
+
+def test_a_killed_service_ends_the_run_by_name_and_the_force_does_not_rise(tmp_path: Path) -> None:
+    killed = kill_in_contact("control", tmp_path)
+    print(f"named {killed.named_after_s:.1f} s after it was killed")
+    assert killed.named_after_s < 20.0, killed.lines  # two seconds, on a machine that has the time: test_losses.py
+    assert_held_and_no_harder(killed)
