@@ -51,7 +51,8 @@ CONTACT_N: Final = 1.0
 """... where it was more than this."""
 PROCESS_KINDS: Final = ("kill", "freeze", "jump")
 MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
-KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS)
+KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, "partition")
+"""All but the last are done to a part (`run_case`), some of them to whole runs, too (`whole_cases`)."""
 WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
 COMPLETE: Final = "complete"
 WENT_WITHOUT: Final = "went on without what was struck"
@@ -123,10 +124,8 @@ class FaultFinding:
     def good(self) -> bool:
         """Done, no hang, no force above the limits, results kept, nothing left behind; and its cause named unless it went on."""
         most = FORCE_LIMIT_N
-        if self.peak_force_before_n > CONTACT_N and self.ended not in (
-            *UNHARMED,
-            WENT_WITHOUT,
-        ):  # else later forces are the scan's
+        goes_on = self.ended in (*UNHARMED, WENT_WITHOUT)  # then later forces are the scan's
+        if self.peak_force_before_n > CONTACT_N and not goes_on:
             most = min(most, self.peak_force_before_n + MORE_N)
         return (
             self.injected_s is not None
@@ -142,7 +141,7 @@ def cases(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> It
     """All faults of these modes and kinds; `only` keeps roles and topics."""
     topics = [t for t in contract().topics.values() if t.producer in WORKERS and not t.latched and _flows(t)]
     for mode in modes:
-        for kind in kinds:
+        for kind in (kind for kind in kinds if kind in (*PROCESS_KINDS, *MESSAGE_KINDS)):
             for where in WORKERS if kind in PROCESS_KINDS else [topic.name for topic in topics]:
                 if not only or where in only:
                     yield FaultCase(kind, where, mode == "wallclock")

@@ -1,6 +1,6 @@
 """A whole run that is struck from outside, in contact: its conductor, its recorder, or several processes at once.
 
-    python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS
+    python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS [secure]
 
 is the conductor of such a run: it forks the services and a recorder, says where they are, and when the indenter has slid at depth
 for SECONDS of simulated time. `strike` starts it, does the damage, and gathers what came of it. What the arm did is read from
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,7 @@ from palpate.report.evidence import peak_force
 from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
+from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
 from palpate_benchmarks.campaign import CONTACT_S, PATIENCE, SETTINGS, forks
 from palpate_bus.contract import contract
@@ -88,12 +90,15 @@ class Struck:
         return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
 
 
-def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S) -> Struck | None:
+def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S, namespace: str = "") -> Struck | None:
     """Runs a short examination and does the damage when the indenter has slid at depth for `seconds` [s] of simulated time.
 
+    In a network `namespace` all processes are clients of a secure router there, so that what is done to its loopback hits them.
     None when it never came to that: on a busy machine a run by the wall clock may be stopped on its way there.
     """
     words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(seconds)]
+    if namespace:
+        words = ["ip", "netns", "exec", namespace, *words, "secure"]
     run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env={**os.environ, **FIXED})
     assert run.stdout is not None
     own, at, struck_s, said = Path(), 0.0, 0.0, {}
@@ -123,7 +128,7 @@ def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S) -
     return Struck(folder, own, status, said, struck_s, left, hung) if at else None
 
 
-def _conduct(folder: Path, runtime: str, seconds: float) -> None:
+def _conduct(folder: Path, runtime: str, seconds: float, secure: SecureBus | None) -> None:
     began: list[int] = []
 
     def tell(progress: RunProgress) -> None:
@@ -139,7 +144,7 @@ def _conduct(folder: Path, runtime: str, seconds: float) -> None:
     files = write_scenario_files(scenario, folder)
     wallclock = runtime == "wallclock"
     timing = Timing(wallclock, rate=measure().rate or RATES[-1] if wallclock else 1.0)
-    local = LocalProcesses(apart(ROLES), folder, files, timing, record="full", forks=forks())
+    local = LocalProcesses(apart(ROLES), folder, files, timing, record="full", secure=secure, forks=forks())
     session = open_session(local.bus[CONDUCTOR])
     for process in read_processes(compose_file(), ROLES).values():
         local.start(process)
@@ -154,4 +159,5 @@ def _conduct(folder: Path, runtime: str, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    _conduct(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))
+    with SecureBus() if "secure" in sys.argv else nullcontext() as bus:
+        _conduct(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]), bus)

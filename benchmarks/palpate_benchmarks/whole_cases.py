@@ -5,8 +5,10 @@ Beside a fixed list there are drawn ones: a seed says which roles are struck, ho
 
 from __future__ import annotations
 
+import os
 import re
 import signal
+import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +20,7 @@ import psutil
 from palpate.report.archive import EvidenceError
 from palpate.report.recover import recovered
 from palpate.run.roles import WORKERS
-from palpate_benchmarks.campaign import WENT_WITHOUT, FaultCase, FaultFinding
+from palpate_benchmarks.campaign import COMPLETE, WENT_WITHOUT, FaultCase, FaultFinding
 from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Struck, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.recordings import RecordingError
@@ -36,6 +38,9 @@ FIXED: Final = (
     "planning+supervisor",
 )
 KINDS: Final = ("kill", "freeze")
+PARTITION: Final = "partition"
+PARTITIONS_S: Final = (1, 5, 30)
+NETWORK: Final = "network"
 LONGEST_S: Final = 0.6
 """Drawn cases strike within so much simulated time of contact: a line is no longer."""
 _SAID: Final = re.compile(r".*(the conductor is gone|nothing heard of the conductor).*")
@@ -43,7 +48,7 @@ _SAID: Final = re.compile(r".*(the conductor is gone|nothing heard of the conduc
 
 def is_whole(case: FaultCase) -> bool:
     """Whether a case strikes a run from outside."""
-    return case.kind in KINDS and not set(WORKERS).issuperset({case.where})
+    return case.kind == PARTITION or (case.kind in KINDS and case.where not in WORKERS)
 
 
 def fixed(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
@@ -53,6 +58,8 @@ def fixed(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> It
             for where in FIXED:
                 if not only or set(where.split(TOGETHER)) & set(only):
                     yield FaultCase(kind, where, mode == "wallclock")
+        if PARTITION in kinds and (not only or NETWORK in only):
+            yield from (FaultCase(PARTITION, f"{NETWORK}, {seconds} s", mode == "wallclock") for seconds in PARTITIONS_S)
 
 
 def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
@@ -80,13 +87,42 @@ def run_whole(case: FaultCase, folder: Path) -> FaultFinding:
                 if processes[role].is_running():
                     processes[role].send_signal(signal.SIGCONT)
 
-    struck = strike((folder / case.name).resolve(), "wallclock" if case.wallclock else "lockstep", blow, case.at_s)
+    if case.kind == PARTITION:
+        seconds = float(case.where.split()[1])
+        struck = _parted(case, folder, seconds)
+        roles = ["transport"]
+    else:
+        struck = strike((folder / case.name).resolve(), _runtime(case), blow, case.at_s)
     finding.wall_s = round(time.monotonic() - begin, 1)
     if struck is None:
         finding.ended = "the fault was never done: the run did not come to depth"
         return finding
     _judge(finding, struck, roles)
     return finding
+
+
+def _runtime(case: FaultCase) -> str:
+    return "wallclock" if case.wallclock else "lockstep"
+
+
+def _parted(case: FaultCase, folder: Path, seconds: float) -> Struck | None:
+    """A run in a network namespace of its own, whose network is gone for some time. Needs root, as `ip netns` does."""
+    name = f"palpate-{os.getpid()}"
+
+    def loopback(state: str) -> None:
+        subprocess.run(["ip", "-n", name, "link", "set", "lo", state], check=True)
+
+    def blow(_: Mapping[str, psutil.Process]) -> None:
+        loopback("down")
+        time.sleep(seconds)
+        loopback("up")
+
+    subprocess.run(["ip", "netns", "add", name], check=True)
+    try:
+        loopback("up")
+        return strike((folder / case.name).resolve(), _runtime(case), blow, case.at_s, name)
+    finally:
+        subprocess.run(["ip", "netns", "del", name], check=True)
 
 
 def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
@@ -100,7 +136,7 @@ def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
             failure, kept = str(error), False
     finding.kept = kept
     finding.sign = _first_word(struck) if CONDUCTOR in roles else str(failure or ", ".join(struck.said.get("lost", ())))
-    finding.ended = str(failure or WENT_WITHOUT)
+    finding.ended = str(failure or (COMPLETE if finding.kind == PARTITION else WENT_WITHOUT))
     words = f"{finding.sign} {finding.ended}"
     finding.named = any(re.search(rf"(?<![\w/]){role}(?!\w)", words) for role in roles)
     _measure(finding, struck)

@@ -25,6 +25,13 @@ def test_the_conductor_and_the_recorder_are_struck_in_both_modes() -> None:
     }
 
 
+def test_the_network_is_parted_in_both_modes() -> None:
+    parted = list(fixed(["lockstep", "wallclock"], ["partition"], []))
+    assert [case.where for case in parted] == 2 * ["network, 1 s", "network, 5 s", "network, 30 s"]
+    assert all(is_whole(case) for case in parted)
+    assert not list(cases(["lockstep"], ["partition"], []))
+
+
 def test_drawn_cases_follow_their_seed() -> None:
     first, again, other = (list(drawn(40, seed, ["lockstep"])) for seed in (1000, 1000, 1001))
     assert first == again != other

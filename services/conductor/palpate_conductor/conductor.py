@@ -36,6 +36,8 @@ AFTER_LOSS = NS
 POLL_S = 0.02
 """How often it looks [s]: at who died, at reports, and at what there is to grant."""
 OBSERVERS_FINISH_S = 60.0
+SILENT_S = 2.0
+"""When all services are silent for so long, it is their way to the conductor that is at fault."""
 
 
 class Conductor:
@@ -266,6 +268,8 @@ class Conductor:
         judged = [role for role in self._workers if role not in self.outcome.lost and role not in self._places.empty]
         stalled = self.watchdog.longest_stall(judged) if self._wallclock else self.watchdog.stalled_for()
         if stalled > self._patience.hard:
+            if (silent := self.watchdog.silent_for()) > SILENT_S:
+                raise RunFailed(f"transport lost: nothing was heard of any service for {silent:.0f} s; no service is at fault")
             role, sentence = self.watchdog.culprit(judged)
             raise RunFailed(f"{role} blocks the run for {stalled:.0f} s: {sentence}")
         if stalled > self._patience.soft and not self._complained:

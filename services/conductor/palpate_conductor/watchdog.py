@@ -40,6 +40,10 @@ class RunWatchdog:
             progress.tick = tick
             progress.moved = now
 
+    def silent_for(self) -> float:
+        """Seconds since any service was heard of, whatever it said: they report while they wait, too."""
+        return monotonic() - max(progress.reported for progress in self.progress.values())
+
     def stalled_for(self) -> float:
         """Seconds since any service finished a tick."""
         return monotonic() - max(progress.moved for progress in self.progress.values())

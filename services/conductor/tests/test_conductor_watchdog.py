@@ -60,3 +60,12 @@ def test_when_all_wait_for_a_grant_none_of_them_blocks() -> None:
     for role in ROLES:
         w.report(role, 1_000_000, "grant")
     assert w.culprit(ROLES)[0] == "conductor"
+
+
+def test_when_none_is_heard_it_is_the_transport() -> None:
+    w = watchdog()
+    for progress in w.progress.values():
+        progress.reported -= 100.0
+    assert w.silent_for() > 99.0
+    w.report("robot", 1_000_000, "")
+    assert w.silent_for() < 50.0
