@@ -24,6 +24,8 @@ from palpate_models.phantom import MeshError
 from palpate_models.scenario import Scenario
 
 EXIT_BAD_INPUT = 2
+DENSE = 2000
+"""Continuous states that a dense Jacobian can do: at this number it has 32 MB."""
 NAMES_CHECKED = 1000
 """More variables than this are not held to the naming convention: FMPy takes milliseconds a name."""
 MESHES = (".obj", ".stl", ".ply")
@@ -84,6 +86,17 @@ def build(
         console.print(f"{out}: FMI {fmi}.0, {out.stat().st_size / 1e6:.1f} MB, for {places}", highlight=False, soft_wrap=True)
 
 
+def _states(count: int) -> str:
+    """How many continuous states model exchange has, and what that asks of a solver."""
+    words = f"continuous states: {count}"
+    if count <= DENSE:
+        return words
+    return (
+        f"{words}: a solver with a dense Jacobian, such as FMPy's CVode, holds {8e-6 * count**2:.0f} MB and factors them; "
+        "take steps of 1 ms (solver='Euler'), a sparse Jacobian, or a coarser mesh (--set phantom.edge_m=0.02)"
+    )
+
+
 @app.command()
 def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     """Show an FMU's interface, variables and platforms."""
@@ -100,6 +113,7 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
     console.print(f"[bold]{description.modelName}[/] FMI {description.fmiVersion}, {', '.join(kinds)}", highlight=False)
     console.print(f"{description.description or ''}\nplatforms: {', '.join(places) or 'none (sources only)'}", highlight=False)
+    console.print(_states(int(description.numberOfContinuousStates or 0)), highlight=False, soft_wrap=True)
     table = Table("variable", "shape", "type", "causality", "unit", "range", "description", box=None)
     for v in read_variables(description).values():
         bounds = "" if v.low is None and v.high is None else f"{v.low or ''} .. {v.high or ''}"

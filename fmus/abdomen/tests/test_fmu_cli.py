@@ -26,7 +26,17 @@ def test_build_info_and_simulate(tmp_path: Path) -> None:
     shown = runner.invoke(app, ["info", str(path)])
     assert shown.exit_code == 0
     kinds = "FMI 3.0, coSimulation, modelExchange"
-    for word in ("abdomen", kinds, native(), "indenter_position", "m/s", "-10.0 .. 10.0", "valid"):
+    for word in (
+        "abdomen",
+        kinds,
+        native(),
+        "indenter_position",
+        "m/s",
+        "-10.0 .. 10.0",
+        "valid",
+        "continuous states",
+        "FMPy's CVode",
+    ):
         assert word in shown.output
     plot = tmp_path / "a.png"
     probed = runner.invoke(app, ["simulate", str(path), "-o", str(plot), "--depth", "0.008", "--at", "0.02", "-0.03"])
