@@ -23,7 +23,8 @@ from nbconvert.writers import FilesWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = Path("docs/notebooks")
-PICTURES = {".png", ".gif", ".svg", ".mp4"}
+PICTURES = {".png", ".gif", ".svg", ".mp4", ".csv", ".css"}
+"""And what else a page uses or links to."""
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")
 
 

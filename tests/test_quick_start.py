@@ -26,6 +26,7 @@ from palpate_models.phantom import build_phantom
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")
 EXAMPLES = ROOT / "docs" / "examples"
+OVER_THE_LUMP = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.055, -0.055]")
 SMALL = ("exam.region_m=[0.06, 0.06]", "camera.frames=6")
 
 
@@ -99,12 +100,9 @@ def test_ones_own_patient_and_mesh_are_examined(tmp_path: Path) -> None:
     mesh = tmp_path / "my_abdomen.stl"
     subprocess.run([sys.executable, str(EXAMPLES / "make_abdomen.py"), str(mesh)], check=True, timeout=120)
     ran = palpate_run(
-        "healthy",
-        tmp_path / "mesh",
-        "--composed",
-        "--record",
-        "none",
-        settings=("phantom.kind=mesh", f"phantom.mesh={mesh}", *SMALL),
+        *("clean", tmp_path / "mesh", "--composed", "--record", "none"),
+        settings=("phantom.kind=mesh", f"phantom.mesh={mesh}", "camera.frames=6", *OVER_THE_LUMP),
     )
     assert ran.status == 0, ran.output
-    assert ran.report["findings"] == []
+    assert [finding["quadrant"] for finding in ran.report["findings"]] == ["RLQ"]
+    assert ran.report["scores"]["matched"] == 1
