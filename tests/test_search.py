@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from examination import GATE, palpate_run
 
 import palpate
 from palpate.search.hand import PatientHand, SurrogateHand
@@ -46,3 +49,18 @@ def test_a_hand_refuses_what_is_out_of_reach() -> None:
         hand.press(np.array((0.3, 0.0)), 0.01)
     with pytest.raises(ValueError, match=r"depth = 0.1 m: want more than 0 and at most"):
         hand.press(np.zeros(2), 0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_arm_presses_where_the_search_asks(tmp_path: Path) -> None:
+    budget = ("exam.pattern=search", "exam.budget.presses=16")
+    options = ("--composed", "--record", "none")
+    finished = palpate_run("clean", tmp_path, *options, settings=(GATE[0], GATE[1], GATE[3], *budget))
+    assert finished.status == 0, finished.output
+    report = finished.report
+    assert report["samples"] <= 16
+    assert "exam/request" in report["digests"]
+    scores = report["scores"]
+    assert (scores["matched"], scores["false_findings"]) == (1, 0)
+    assert scores["place_error_m"] < 0.012

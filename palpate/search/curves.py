@@ -1,0 +1,152 @@
+"""What the study of searches says: `python -m palpate.search.curves out/search-study` prints the table and draws the curves.
+
+The threshold of each policy is the SPECIFICITY quantile, over healthy tuning patients, of the greatest probability within the
+budget. A lump is found at the press after which it is first said to be near a place within NEAR_M of where it is; one that is
+first said to be elsewhere, or never, counts as the whole budget. Intervals: Wilson's for shares, percentiles of 2,000 bootstrap
+samples of patients for all else.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+import pandas as pd
+import typer
+from matplotlib.figure import Figure
+
+from palpate_models.frames import Array
+
+TUNING: Final = 1000
+"""Seeds below this are tuning patients."""
+SPECIFICITY: Final = 0.95
+NEAR_M: Final = 0.020
+Z95: Final = 1.96
+OURS: Final = "informed"
+_BOOTSTRAPS: Final = 2000
+
+
+def wilson(k: int, n: int) -> tuple[float, float]:
+    """The 95 % interval of a share, k of n (Wilson 1927)."""
+    if not n:
+        return 0.0, 1.0
+    p, z = k / n, Z95
+    middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return float((middle - half) / (1 + z * z / n)), float((middle + half) / (1 + z * z / n))
+
+
+def thresholds(trials: pd.DataFrame) -> pd.Series:
+    """The threshold of each policy."""
+    healthy = trials[(trials.seed < TUNING) & trials.apart_m.isna()]
+    greatest = healthy.groupby(["policy", "seed"]).near.max()
+    return greatest.groupby("policy").quantile(SPECIFICITY, interpolation="higher")
+
+
+def outcomes(trials: pd.DataFrame, limits: pd.Series) -> pd.DataFrame:
+    """A row for each policy and test patient: presses and seconds to the first word, whether it was right, how far off it was."""
+    rows = []
+    for (name, seed), trial in trials[trials.seed >= TUNING].groupby(["policy", "seed"]):
+        said = np.flatnonzero(trial.near.to_numpy() > limits[name])
+        lump, budget = bool(trial.apart_m.notna().any()), len(trial)
+        k = int(said[0]) if len(said) else budget - 1
+        apart = float(trial.apart_m.iloc[k])
+        right = lump and bool(len(said)) and apart <= NEAR_M
+        presses = k + 1 if right else budget
+        took = float(trial.seconds.iloc[k if right else budget - 1])
+        rows.append((name, seed, lump, bool(len(said)), right, presses, took, apart, float(trial.think_s.iloc[0])))
+    return pd.DataFrame(rows, columns=["policy", "seed", "lump", "said", "right", "presses", "seconds", "apart_m", "think_s"])
+
+
+def _interval(values: Array, statistic: float, rng: np.random.Generator) -> tuple[float, float, float]:
+    """A quantile of values, and its 95 % interval."""
+    drawn = values[rng.integers(0, len(values), (_BOOTSTRAPS, len(values)))]
+    low, high = np.quantile(np.quantile(drawn, statistic, axis=1), (0.025, 0.975))
+    return float(np.quantile(values, statistic)), float(low), float(high)
+
+
+def table(found: pd.DataFrame, limits: pd.Series) -> str:
+    """The comparison, as Markdown."""
+    rng = np.random.Generator(np.random.PCG64(0))
+    lines = [
+        "| policy | threshold | lumps found | healthy without a finding | presses, median | presses, 90 % | seconds, median "
+        "| place [mm] | presses against ours |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    ours = found[(found.policy == OURS) & found.lump].set_index("seed").presses
+    order = found[found.lump].groupby("policy").presses.mean().sort_values().index
+    for name in order:
+        mine = found[found.policy == name]
+        ill, well = mine[mine.lump], mine[~mine.lump]
+        k, n = int(ill.right.sum()), len(ill)
+        quiet, healthy = int((~well.said).sum()), len(well)
+        cells = [f"`{name}`", f"{limits[name]:.3f}", _share(k, n), _share(quiet, healthy)]
+        values = ill.presses.to_numpy(dtype=float)
+        cells += [_words(_interval(values, q, rng), "{:.0f}") for q in (0.5, 0.9)]
+        cells.append(_words(_interval(ill.seconds.to_numpy(), 0.5, rng), "{:.0f}"))
+        cells.append(f"{1e3 * ill[ill.right].apart_m.median():.1f}")
+        both = ill.set_index("seed").presses
+        pairs = np.log(both / ours.reindex(both.index)).dropna().to_numpy()
+        means = np.exp(pairs[rng.integers(0, len(pairs), (_BOOTSTRAPS, len(pairs)))].mean(axis=1))
+        ratio = (float(np.exp(pairs.mean())), *map(float, np.quantile(means, (0.025, 0.975))))
+        cells.append("" if name == OURS else _words(ratio, "{:.2f}"))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _share(k: int, n: int) -> str:
+    low, high = wilson(k, n)
+    return f"{k} of {n}: {100 * k / max(n, 1):.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _words(values: tuple[float, float, float], form: str) -> str:
+    middle, low, high = (form.format(value) for value in values)
+    return f"{middle} ({low} to {high})"
+
+
+def drawn(found: pd.DataFrame, trials: pd.DataFrame) -> Figure:
+    """Sensitivity against presses and against seconds, and the distance of the most probable place from the lump."""
+    figure = Figure(figsize=(12, 4), dpi=110, layout="constrained")
+    by_press, by_second, place = figure.subplots(1, 3)
+    budget = int(found.presses.max())
+    for name, mine in found[found.lump].groupby("policy"):
+        style = {"lw": 2.4, "color": "black", "zorder": 5} if name == OURS else {"lw": 1.1}
+        right, n = mine[mine.right], len(mine)
+        presses = np.arange(1, budget + 1)
+        shares = np.array([(right.presses <= k).sum() for k in presses])
+        (line,) = by_press.plot(presses, shares / n, label=str(name), **style)
+        if name == OURS:
+            bands = np.array([wilson(int(k), n) for k in shares])
+            by_press.fill_between(presses, bands[:, 0], bands[:, 1], color=line.get_color(), alpha=0.15)
+        grid = np.linspace(0, float(found.seconds.max()), 200)
+        by_second.plot(grid, [(right.seconds <= t).mean() * len(right) / n if len(right) else 0.0 for t in grid], **style)
+        apart = trials[(trials.policy == name) & trials.seed.isin(mine.seed)].groupby("press").apart_m.median()
+        place.plot(apart.index, 1e3 * apart, **style)
+    by_press.set(xlabel="presses", ylabel=f"lumps found at specificity {SPECIFICITY:.2f}", ylim=(0, 1), title="sensitivity")
+    by_second.set(xlabel="seconds", ylim=(0, 1), title="sensitivity")
+    place.set(xlabel="presses", ylabel="most probable place from the lump, median [mm]", title="localisation", ylim=(0, None))
+    by_press.legend(fontsize=7, loc="upper left")
+    return figure
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="Folder of trials.")] = Path("out/search-study"),
+    hand: Annotated[str, typer.Option(help="Trials of which hand.")] = "surrogate",
+    picture: Annotated[Path | None, typer.Option(help="Where to draw the curves.")] = None,
+) -> None:
+    """Compare the policies of the trials in a folder."""
+    files = sorted(folder.glob(f"{hand}-*.csv"))
+    if not files:
+        raise typer.BadParameter(f"{folder}: there are no trials of the hand {hand}")
+    trials = pd.concat([pd.read_csv(file) for file in files], ignore_index=True)
+    limits = thresholds(trials)
+    found = outcomes(trials, limits)
+    tuned = trials[trials.seed < TUNING].seed.nunique()
+    print(f"{found.seed.nunique()} patients, {found[found.lump].seed.nunique()} with a lump; {tuned} healthy tuning patients\n")
+    print(table(found, limits))
+    if picture is not None:
+        drawn(found, trials).savefig(picture)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,73 @@
+"""A film of a search: `python -m palpate.search.film` searches a patient and draws where it pressed and what it knew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Final
+
+import matplotlib.pyplot as plt
+import numpy as np
+import typer
+from matplotlib.animation import PillowWriter
+
+from palpate.interface.scenarios import scenario
+from palpate.search.hand import PatientHand
+from palpate.search.trial import search
+from palpate_models.frames import Array
+from palpate_search.choice import policy
+from palpate_search.posterior import Posterior
+from palpate_search.presses import Budget
+
+FRAMES_PER_S: Final = 3
+_LAST: Final = 6
+"""So often the last frame is shown."""
+
+
+def main(
+    name: Annotated[str, typer.Argument(metavar="scenario", help="Who is searched.")] = "lump",
+    seed: Annotated[int, typer.Option(min=0)] = 1003,
+    presses: Annotated[int, typer.Option(min=1, max=100)] = 25,
+    chosen: Annotated[str, typer.Option("--policy", help="A policy's name or file.")] = "informed",
+    out: Annotated[Path, typer.Option("-o", "--out", help="The GIF.")] = Path("search.gif"),
+) -> None:
+    """Search a patient and write a film of it."""
+    hand = PatientHand(scenario(name, seed=seed))
+    posterior, maps = Posterior(hand.task), list[Array]()
+    next_press = policy(chosen)
+
+    def watched(known: Posterior, left: Budget) -> tuple[Array, float]:
+        maps.append(known.by_place)
+        return next_press(known, left)
+
+    trial = search(hand, watched, presses, posterior)
+    maps.append(posterior.by_place)
+    plt.switch_backend("agg")
+    figure, (where, sure) = plt.subplots(1, 2, figsize=(8.4, 4.0), dpi=75, layout="constrained", width_ratios=(1.15, 1))
+    writer = PillowWriter(fps=FRAMES_PER_S)
+    x, y = (np.unique(axis) for axis in hand.task.places.T)
+    with writer.saving(figure, str(out), dpi=75):
+        for k in _frames(len(trial.near)):
+            where.clear()
+            sure.clear()
+            where.pcolormesh(1e3 * x, 1e3 * y, np.sqrt(maps[k + 1]).reshape(len(x), len(y)).T, cmap="viridis", vmin=0, vmax=0.7)
+            where.plot(*(1e3 * trial.xy[: k + 1].T), "o", ms=4, color="white", mec="black", mew=0.5)
+            where.plot(*(1e3 * trial.xy[k]), "o", ms=10, mfc="none", mec="red", mew=1.6)
+            where.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]")
+            where.set_title(f"press {k + 1}: where a lump may be")
+            sure.plot(np.arange(1, k + 2), trial.lump[: k + 1], color="black", label="there is a lump")
+            sure.plot(np.arange(1, k + 2), trial.near[: k + 1], color="red", label="it is at the brightest place")
+            sure.set(xlim=(0, len(trial.near)), ylim=(0, 1), xlabel="presses", ylabel="probability")
+            sure.set_title(f"{trial.seconds[k]:.0f} s")
+            sure.legend(loc="lower right", fontsize=8)
+            writer.grab_frame()
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {len(trial.near)} presses, {trial.seconds[-1]:.0f} s")
+
+
+def _frames(count: int) -> Iterator[int]:
+    yield from range(count)
+    yield from [count - 1] * _LAST
+
+
+if __name__ == "__main__":
+    typer.run(main)
