@@ -47,14 +47,14 @@ def outcomes(trials: pd.DataFrame, limits: pd.Series) -> pd.DataFrame:
     """A row for each policy and test patient: presses and seconds to the first word, whether it was right, how far off it was."""
     rows = []
     for (name, seed), trial in trials[trials.seed >= TUNING].groupby(["policy", "seed"]):
-        said = np.flatnonzero(trial.near.to_numpy() > limits[name])
+        said = np.flatnonzero(trial.near.to_numpy() > float(limits.loc[str(name)]))
         lump, budget = bool(trial.apart_m.notna().any()), len(trial)
         k = int(said[0]) if len(said) else budget - 1
         apart = float(trial.apart_m.iloc[k])
         right = lump and bool(len(said)) and apart <= NEAR_M
         presses = k + 1 if right else budget
         took = float(trial.seconds.iloc[k if right else budget - 1])
-        rows.append((name, seed, lump, bool(len(said)), right, presses, took, apart, float(trial.think_s.iloc[0])))
+        rows.append((str(name), seed, lump, bool(len(said)), right, presses, took, apart, float(trial.think_s.iloc[0])))
     return pd.DataFrame(rows, columns=["policy", "seed", "lump", "said", "right", "presses", "seconds", "apart_m", "think_s"])
 
 
@@ -80,7 +80,7 @@ def table(found: pd.DataFrame, limits: pd.Series) -> str:
         ill, well = mine[mine.lump], mine[~mine.lump]
         k, n = int(ill.right.sum()), len(ill)
         quiet, healthy = int((~well.said).sum()), len(well)
-        cells = [f"`{name}`", f"{limits[name]:.3f}", _share(k, n), _share(quiet, healthy)]
+        cells = [f"`{name}`", f"{limits[str(name)]:.3f}", _share(k, n), _share(quiet, healthy)]
         values = ill.presses.to_numpy(dtype=float)
         cells += [_words(_interval(values, q, rng), "{:.0f}") for q in (0.5, 0.9)]
         cells.append(_words(_interval(ill.seconds.to_numpy(), 0.5, rng), "{:.0f}"))
@@ -88,7 +88,8 @@ def table(found: pd.DataFrame, limits: pd.Series) -> str:
         both = ill.set_index("seed").presses
         pairs = np.log(both / ours.reindex(both.index)).dropna().to_numpy()
         means = np.exp(pairs[rng.integers(0, len(pairs), (_BOOTSTRAPS, len(pairs)))].mean(axis=1))
-        ratio = (float(np.exp(pairs.mean())), *map(float, np.quantile(means, (0.025, 0.975))))
+        low, high = np.quantile(means, (0.025, 0.975))
+        ratio = float(np.exp(pairs.mean())), float(low), float(high)
         cells.append("" if name == OURS else _words(ratio, "{:.2f}"))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
