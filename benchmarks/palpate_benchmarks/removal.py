@@ -40,6 +40,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "driver's limits": ("palpate_robot.driver",),
     "arm's kinematics": ("palpate_robot.backends.dart.kinematics",),
     "tissue's step": ("palpate_tissue.backends.winkler.kernel", "palpate_tissue.friction"),
+    "rest point's triangles": ("palpate_tissue.surface",),
     "path and its splines": ("palpate_planning.path", "palpate_planning.poses", "palpate_planning.compiled_splines"),
     "perceived surface": ("palpate_planning.surface", "palpate_planning.compiled_splines"),
     "nearest vertex": ("palpate_models.nearest",),
