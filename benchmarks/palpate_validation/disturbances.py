@@ -1,6 +1,6 @@
 """What one disturbance at a time makes of the assessment: healthy patients, scanned without physics in time.
 
-    python -m palpate_validation.disturbances --patients 20 --first-seed 1000
+    OPENBLAS_NUM_THREADS=1 python -m palpate_validation.disturbances --patients 30 --first-seed 1000
 
 Patients and scans are those of `felt_scans`. Where nothing else is said errors are the typical ones of a scan, and what a row
 adds to its samples is not told to the assessment. Prints a Markdown table: how many of the healthy have a finding, with Wilson's
@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.stats import binomtest
 
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient, felt_patient
-from palpate.study.statistics.estimate import wilson
 from palpate_assessment.assess import assess
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.sampling import ForceSample
@@ -30,8 +30,8 @@ TYPICAL: Final = ScanErrors(stroke_m=7e-4, field_m=5e-4, breathing_m=7e-4, tare_
 """As the assessment's calibration has them."""
 CLEAN: Final = ScanErrors()
 DEFAULT: Final = Phantom()
-REGION_M: Final = 0.14
-"""Side of the region that is scanned: half the area of an examination's, at a tenth of its cost."""
+REGION_M: Final = 0.2
+"""Side of the square that is scanned, as in an examination."""
 REACH_M: Final = 0.010
 """Within which a sample speaks for a place."""
 FALSE_FINDINGS: Final = 0.02
@@ -90,16 +90,16 @@ ROWS: Final = (
 )
 
 
-def examined(row: Row, seed: int) -> tuple[int, float]:
-    """Findings in the patient of a seed, and the part of the examined area on which the band holds."""
+def examined(row: Row, seed: int, region: float = REGION_M) -> tuple[int, float]:
+    """Findings in the patient of a seed, and the part of a square of side `region` [m] on which the band holds."""
     patient = felt_patient(row.phantom, seed)
     if row.rectus:
         patient = _with_rectus(patient)
-    samples = felt_samples(patient, row.errors, seed, region=REGION_M)
+    samples = felt_samples(patient, row.errors, seed, region=region)
     if row.change is not None:
         sign = 1.0 if seed % 2 else -1.0
         samples = [row.change(sample, sign) for sample in samples]
-    axis = np.arange(-REGION_M / 2, REGION_M / 2 + 1e-9, 0.005)
+    axis = np.arange(-region / 2, region / 2 + 1e-9, 0.005)
     flat = np.zeros((len(axis), len(axis)))
     found = assess(samples, MapGrid(axis, axis, flat, np.full(flat.size, 0.005**2)), REACH_M, FALSE_FINDINGS)
     assert found is not None
@@ -117,25 +117,26 @@ def _with_rectus(patient: FeltPatient) -> FeltPatient:
     return FeltPatient(patient.force * band, patient.healthy * band)
 
 
-def line(row: Row, seeds: range) -> str:
+def line(row: Row, seeds: range, region: float = REGION_M) -> str:
     """A row of the table."""
-    results = [examined(row, seed) for seed in seeds]
-    ill = wilson(sum(findings > 0 for findings, _ in results), len(results), "patients")
+    results = [examined(row, seed, region) for seed in seeds]
+    ill = sum(findings > 0 for findings, _ in results)
     held = 100 * np.array([part for _, part in results])
-    low, high = (100 * (end or 0.0) for end in (ill.low, ill.high))
-    rate = f"{sum(findings > 0 for findings, _ in results)} of {ill.n} ({low:.0f}–{high:.0f} %)"
+    interval = binomtest(ill, len(results)).proportion_ci(method="wilson")
+    rate = f"{ill} of {len(results)} ({100 * interval.low:.0f}–{100 * interval.high:.0f} %)"
     return f"| {row.name} | {rate} | {held.mean():.0f} | {np.quantile(held, 0.1):.0f} |"
 
 
 def main() -> None:
     """Prints the table, row by row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--patients", type=int, default=20)
+    parser.add_argument("--patients", type=int, default=30)
     parser.add_argument("--first-seed", type=int, default=1000)
+    parser.add_argument("--region", type=float, default=REGION_M, help="side of the square that is scanned [m]")
     args = parser.parse_args()
     print("| healthy patients | with a finding | band holds [%] | tenth [%] |\n|---|---|---|---|")
     for row in ROWS:
-        print(line(row, range(args.first_seed, args.first_seed + args.patients)), flush=True)
+        print(line(row, range(args.first_seed, args.first_seed + args.patients), args.region), flush=True)
 
 
 if __name__ == "__main__":
