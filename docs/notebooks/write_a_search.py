@@ -104,8 +104,28 @@ plt.show()
 final.findings
 
 # %% [markdown]
+# ## As a policy
+#
+# A search that is a function of a posterior and the budget that is left is a policy: the same function presses a patient here,
+# and with `palpate run --set exam.pattern=search --set search.policy=FILE` it drives the arm. Ours weighs how much each press
+# would tell a second. This patient breathes, and the equipment errs.
+
+# %%
+from palpate.search.hand import PatientHand  # noqa: E402
+from palpate.search.trial import search  # noqa: E402
+from palpate_search.choice import policy  # noqa: E402
+
+trial = search(PatientHand(palpate.scenario("lump", seed=7)), policy("informed"), presses=20)
+plt.plot(trial.seconds, trial.lump, label="there is a lump")
+plt.plot(trial.seconds, trial.near, label="it is near the most probable place")
+plt.xlabel("time [s]")
+plt.ylabel("probability")
+plt.legend()
+plt.show()
+
+# %% [markdown]
 # ## Yours
 #
 # Where to press next is a function of the map. Try another: the place where the apparent stiffness is greatest, a press and its
 # uncertainty together, or a line of a `slide` where a line tells more a second. Compare on patients that breathe:
-# `palpate.Patient("lump", seed=7)`. And say when to stop.
+# `palpate.Patient("lump", seed=7)`. And say when to stop. [Search](../search.md) compares nine policies.
