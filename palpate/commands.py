@@ -10,7 +10,7 @@ from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -75,10 +75,13 @@ COMMANDS = {word: where for group in GROUPS.values() for word, where in group.it
 
 def main() -> None:
     """Runs the command of `sys.argv`."""
+    word = sys.argv[1] if len(sys.argv) > 1 else ""
     try:
-        app_for(sys.argv[1] if len(sys.argv) > 1 else "")(prog_name="palpate")
+        app_for(word)(prog_name="palpate")
     except BrokenPipeError:
         sys.exit(1)
+    except ModuleNotFoundError as error:  # of a library that the command imports late
+        _lacking(word, error)
 
 
 def app_for(word: str) -> typer.Typer:
@@ -124,9 +127,7 @@ def _add(app: typer.Typer, word: str) -> None:
     try:
         command = getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
-        extra = EXTRAS.get(word, "run")
-        print(f"palpate: the command {word} needs the module {error.name}; pip install 'palpate[{extra}]'", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _lacking(word, error)
     except ValueError as error:  # a contract of one's own that cannot be used
         print(f"palpate: {error}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
@@ -134,6 +135,15 @@ def _add(app: typer.Typer, word: str) -> None:
         app.add_typer(command, name=word)
     else:
         app.command(word)(command)
+
+
+def _lacking(word: str, error: ModuleNotFoundError) -> NoReturn:
+    """Ends for a library that is not installed; raises the error again where it is one of our own modules that is not there."""
+    if (error.name or "palpate").startswith("palpate"):
+        raise error
+    extra = EXTRAS.get(word, "run")
+    print(f"palpate: the command {word} needs the module {error.name}; pip install 'palpate[{extra}]'", file=sys.stderr)
+    sys.exit(EXIT_BAD_INPUT)
 
 
 def _summary(where: str) -> str:

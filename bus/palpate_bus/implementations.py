@@ -19,6 +19,8 @@ from typing import Any
 
 from palpate_bus.service import Service
 
+OWN = "palpate_own_"
+"""How the module of a user's own file is called, before the role."""
 Create = Callable[[Any], Service]
 """Makes a service from a scenario."""
 
@@ -171,7 +173,7 @@ def _own(role: str, path: Path) -> Create:
     """`create` of a user's own file, which may import what is beside it."""
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
-    name = f"palpate_own_{role}"
+    name = f"{OWN}{role}"
     spec = spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None

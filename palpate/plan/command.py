@@ -47,9 +47,9 @@ def plan(
     except (NoPathError, PatternError, OSError) as error:
         refuse(error)
     console = Console()
-    targets, lines = len(planned.scan.targets), len(planned.scan.lines)
+    targets, lines, strokes = len(planned.scan.targets), len(planned.scan.lines), len(planned.strokes)
     said = [
-        f"{targets} targets in {lines} line{'s' if lines > 1 else ''}, felt in {len(planned.strokes)} strokes",
+        f"{targets} targets in {lines} line{'s' if lines > 1 else ''}, felt in {strokes} stroke{'s' if strokes > 1 else ''}",
         f"{planned.length_m:.2f} m in contact, {len(planned.touches)} touches before",
         f"about {planned.duration_s:.0f} s of simulated time",
     ]

@@ -14,6 +14,8 @@ from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
 from palpate_bus import implementations
 from palpate_bus.implementations import ChoiceError, check, check_libraries, create, create_for, names
+from palpate_bus.runtime.failure import described
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario, Services
 
@@ -77,6 +79,18 @@ def test_what_goes_wrong_in_a_file_is_told_with_its_line(tmp_path: Path, text: s
     file.write_text(text)
     with pytest.raises(ChoiceError, match=said):
         load_services(chosen(f"assessment={file}"), ("assessment",))
+
+
+def test_an_exception_in_a_step_is_told_with_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from palpate_bus.service import Service\nclass Mine(Service):\n    role = 'assessment'\n"
+        "    def step(self, t, inbox):\n        return self.nothing\ndef create(scenario):\n    return Mine()\n"
+    )
+    service = create("assessment", str(file), load_scenario("healthy"))
+    with pytest.raises(AttributeError) as raised:
+        service.step(0, HandInbox())
+    assert described(raised.value, ()).startswith(f"{file}, line 5: AttributeError: 'Mine' object has no attribute 'nothing'")
 
 
 @pytest.mark.parametrize("words", [["run"], ["run", "--composed"]])

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from traceback import walk_tb
+from typing import Any
 
 from palpate_bus.contract.conformance import Checker
+from palpate_bus.implementations import OWN
 from palpate_bus.messages.codec import CodecError, Message
 from palpate_bus.runtime.lockstep import InputBuffer, Received
 
 
 def described(error: BaseException, buffers: Iterable[InputBuffer]) -> str:
-    """An error as text, followed by each input that breaks its row of the contract and the role that sends it."""
-    words = [f"{type(error).__name__}: {error}"]
+    """An error as text, followed by each input that breaks its row of the contract and the role that sends it.
+
+    Where a user's own file took part, its last line that did stands before the error.
+    """
+    words = [f"{_own_line(error)}{type(error).__name__}: {error}"]
     with suppress(Exception):  # whatever is wrong with an input must not hide the error
         words += invalid_inputs(buffers)
     return "; ".join(words)
+
+
+def _own_line(error: BaseException) -> str:
+    lines = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__) if _is_own(frame.f_globals)]
+    return f"{lines[-1][0]}, line {lines[-1][1]}: " if lines else ""
+
+
+def _is_own(names: Mapping[str, Any]) -> bool:
+    return str(names.get("__name__", "")).startswith(OWN)
 
 
 def invalid_inputs(buffers: Iterable[InputBuffer]) -> list[str]:
