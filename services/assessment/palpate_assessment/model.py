@@ -42,9 +42,11 @@ BREATHING_S = 1.0
 """How long what following leaves of breathing stays alike."""
 LEAST_DEPTH_ERROR_M = 0.0001
 """Prior median of the depth's errors for strokes that claim to have none."""
-SURFACE_M, SURFACE_SHARE = 0.020, 1.0
+SURFACE_M, SURFACE_SHARE = 0.020, 0.8
 """Length of the error that strokes share, what an offset and a tilt leave of the camera's, and its part of the depth's
-uncertainty: a scan cannot tell it from stiffness."""
+uncertainty: a scan cannot tell it from stiffness, ..."""
+WIDE_M, WIDE_SHARE = 0.15, 0.7
+"""... nor what touches leave of offset and tilt."""
 SLIDE_SD = 0.015
 """How much a slide may feel of a place otherwise than a press does, beside what it does everywhere, in the logarithm."""
 UNLIKE = 0.1
@@ -117,7 +119,8 @@ def errors(o: Observations) -> list[Array]:
 def fixed(o: Observations, calibration: Calibration) -> Array:
     """Covariance of what a scan cannot tell about itself: level, exponent, surface, sensor; shape (m, m)."""
     lever = np.outer(o.per_metre, o.per_metre)
-    surface = SURFACE_SHARE**2 * np.outer(o.depth_uncertainty, o.depth_uncertainty) * lever * _smooth(o.xy, o.xy, SURFACE_M)
+    surface = SURFACE_SHARE**2 * _smooth(o.xy, o.xy, SURFACE_M) + WIDE_SHARE**2 * _smooth(o.xy, o.xy, WIDE_M)
+    surface *= np.outer(o.depth_uncertainty, o.depth_uncertainty) * lever
     covariance = LEVEL_SD**2 + calibration.exponent_sd**2 * np.outer(o.log_depth, o.log_depth) + surface
     covariance += TARE_N**2 * np.outer(o.per_newton, o.per_newton) * o.same_stroke
     covariance[np.diag_indices(len(o.y))] += o.noise**2
