@@ -22,7 +22,7 @@ from scipy import stats
 
 from palpate.quick.case import run_quick
 from palpate.quick.errors import loop_errors
-from palpate.quick.study import drawn_of, trace_of
+from palpate.quick.study import drawn_of, runs_in, trace_of
 from palpate.report.archive import read_evidence
 from palpate.report.evidence import map_of
 from palpate.report.results import truth_of_run
@@ -119,7 +119,8 @@ def compare(quick: Sequence[Tier], whole: Sequence[Tier]) -> list[Compared]:
         both = both[np.isfinite(both).all(axis=1)]
         difference = both[:, 0] - both[:, 1]
         mean, count = float(difference.mean()) if len(both) else np.nan, len(both)
-        half = float(stats.t.ppf(0.5 + LEVEL / 2, count - 1) * stats.sem(difference)) if count > 1 else np.inf
+        varies = count > 1 and bool(difference.std() > 0)  # cases that differ by the same say nothing of others
+        half = float(stats.t.ppf(0.5 + LEVEL / 2, count - 1) * stats.sem(difference)) if varies else np.inf
         low, high = mean - half, mean + half
         equivalent = bool(-margin < low and high < margin)
         q, w = (float(both[:, k].mean()) if count else np.nan for k in (0, 1))
@@ -151,13 +152,13 @@ def _or_nan(value: float | None) -> float:
 
 
 def main(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of completed whole examinations.")],
+    runs: Annotated[list[Path], typer.Argument(help="Folders of completed whole examinations, or of many of them.")],
     drawn: Annotated[bool, typer.Option("--drawn", help="Draw all of the loop's errors, as studies do.")] = False,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for quick.json and quick.png.")] = Path("out/quick"),
 ) -> None:
     """Compare the quick tier with whole examinations of the same patients."""
     quick, whole, cases = [], [], []
-    for folder in runs:
+    for folder in runs_in(runs):
         scenario, q, w, seconds = pair(folder, not drawn)
         quick.append(q)
         whole.append(w)

@@ -1,7 +1,8 @@
 """What whole examinations get wrong, fitted: `python -m palpate.quick.study RUN...` writes loop.yaml from the folders of runs.
 
-`python -m palpate.quick.study --examine 20 --level typical --breathing quiet -o DIR` makes such runs first: persons, every second
-one with a lump, seeds 0 to 999. Rows of loop.yaml whose setting is not among the runs stay as they are.
+`python -m palpate.quick.study --examine 12 --set 'exam.region_m=[0.1, 0.1]' -o DIR` makes such runs first: persons, every second
+one with a lump, seeds from 0 on, with typical errors and quiet breathing. What is there already is not made again. Rows of
+loop.yaml whose setting is not among the runs stay as they are.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from scipy.optimize import curve_fit
 
 from palpate.quick.errors import Drawn, LoopErrors, Normal, known_loops, setting_of
 from palpate.quick.patient import PERIOD_S
+from palpate.report import archive
 from palpate.report.archive import read_evidence
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_bus.messages import ExamState
@@ -70,6 +72,15 @@ class Trace:
     """How far breathing lifted the skin there above its mean [m], shape (n,)."""
     regulation: Array
     """Measured depth less set-point [m], shape (n,)."""
+
+
+def runs_in(folders: Sequence[Path]) -> list[Path]:
+    """Folders of runs among these, and of completed runs within those that are none, each once."""
+    found: list[Path] = []
+    for folder in folders:
+        inside = sorted(path.parent for path in folder.glob(f"*/{archive.FILE}"))
+        found += [folder] if (folder / archive.FILE).is_file() or not inside else inside
+    return list(dict.fromkeys(path.resolve() for path in found))
 
 
 def trace_of(folder: Path) -> Trace:
@@ -217,7 +228,7 @@ def examine(number: int, level: str, breathing: str, out: Path, settings: Sequen
 
     def one(seed: int) -> Path:
         folder = out / f"{level}-{breathing}-{seed}"
-        if not (folder / "evidence.npz").is_file():
+        if not (folder / archive.FILE).is_file():
             lumps = "phantom.draw.lumps=[1, 1]" if seed % 2 else "phantom.draw.lumps=[0, 0]"
             words = [f"errors={level}", f"phantom.breathing.kind={breathing}", lumps, *settings]
             options = [word for setting in words for word in ("--set", setting)]
@@ -230,7 +241,7 @@ def examine(number: int, level: str, breathing: str, out: Path, settings: Sequen
 
 
 def main(
-    runs: Annotated[list[Path] | None, typer.Argument(help="Folders of completed runs.")] = None,
+    runs: Annotated[list[Path] | None, typer.Argument(help="Folders of completed runs, or of many of them.")] = None,
     examinations: Annotated[int, typer.Option("--examine", min=0, help="Make so many whole examinations first.")] = 0,
     level: Annotated[str, typer.Option(help="With --examine: errors, none, typical or poor.")] = "typical",
     breathing: Annotated[str, typer.Option(help="With --examine: none, quiet, deep or held.")] = "quiet",
@@ -239,7 +250,7 @@ def main(
     out: Annotated[Path, typer.Option("-o", "--out", help="With --examine: where the runs go.")] = Path("out/loop"),
 ) -> None:
     """Fit what whole examinations get wrong, and write it to palpate/quick/loop.yaml."""
-    folders = [*(runs or ()), *examine(examinations, level, breathing, out, settings or (), workers)]
+    folders = runs_in([*(runs or ()), *examine(examinations, level, breathing, out, settings or (), workers)])
     groups: dict[tuple[Any, ...], list[Trace]] = defaultdict(list)
     for folder in folders:
         trace = trace_of(folder)

@@ -56,7 +56,8 @@ CASES: Final = pa.schema(
 )
 """A row a case. Counts are null and figures NaN where a case has no report. `score`: greatest confidence of any finding or
 candidate, 0 without one. `exam_time_s` is simulated time; `sim_time_s` real time of the simulation, in whole examinations with
-the assessment, `assess_time_s` that of the assessment, `wall_time_s` all of it with the truth, `core_s` the processor's.
+the assessment, `assess_time_s` that of the assessment (in quick cases the processor's), `wall_time_s` all of it with the truth,
+`core_s` the processor's.
 `loop_examinations`: from how many whole examinations the errors of a quick case are; null of a whole one."""
 FINDINGS: Final = pa.schema(
     {
