@@ -17,8 +17,9 @@ DICE = 0.80
 """With the area in which the lump is felt, which is wider than the lump."""
 COVERAGE = 0.85
 HIGHEST_FORCE_N = 11.3
-DEPTH_RMS_M = 0.4e-3
-"""Depth is counted from where the skin is touched, not from what a camera without error sees."""
+DEPTH_RMS_M = 0.25e-3
+"""Depth is counted from where the skin is touched, not from what a camera without error sees: 0.18 mm, of which 0.15 are a touch
+that is felt late between the points of the skin's mesh."""
 
 
 def assert_within_bounds(finished: Finished) -> None:
