@@ -45,7 +45,7 @@ PLOT_PERIOD: Final = 50 * MS
 TEXT_PERIOD: Final = 500 * MS
 IMAGE_PERIOD: Final = 500 * MS
 MAP_PERIOD: Final = 1000 * MS
-SELDOM: Final = 1000 * MS
+SELDOM: Final = 2000 * MS
 """Meshes and images of a recording that is not full."""
 POSE_PERIOD: Final = 100 * MS
 """The arm of such a recording."""

@@ -27,7 +27,7 @@ def chosen(*options: str) -> Scenario:
 
 
 def test_every_role_has_a_choice_and_its_default_is_installed() -> None:
-    assert set(Services.model_fields) == {*WORKERS, *OBSERVERS}
+    assert set(Services.model_fields) == {*WORKERS, *OBSERVERS, "search"}
     scenario = chosen()
     for role in Services.model_fields:
         assert choice(scenario, role) in names(role)

@@ -218,14 +218,14 @@ def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_mos
     service = RecorderService(tmp_path / FOLDER, full=False)
     for k in range(101):
         service.record(TOPICS["joint_states"], joint_states(k * MS), k * MS, k + 1)
-        service.record(TOPICS["planning/setpoint"], b"", k * MS, k + 1)
+        service.record(TOPICS["robot/status"], b"", k * MS, k + 1)
     facts = service.finish()
     assert facts["topics"]["/joint_states"] == 100 // every + 1
-    assert facts["topics"]["/planning/setpoint"] == 101
+    assert facts["topics"]["/robot/status"] == 101
     assert facts["missing"] == {}
     recording = open_recording(tmp_path / FOLDER)
     assert recording.thinned.keys() == {name for name, topic in TOPICS.items() if topic.record_ms}
-    recording.check(contract(), ["planning/setpoint"])
+    recording.check(contract(), ["robot/status"])
     recording.check(contract(), ["joint_states"], whole=False)
     with pytest.raises(RecordingError, match=r"of topic joint_states one message in \d+ ms was kept.*--record full"):
         recording.check(contract(), ["joint_states"])
