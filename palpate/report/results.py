@@ -207,6 +207,10 @@ def print_findings(console: Console, report: Report) -> None:
         console.print("no finding" if report.failure is None else "no finding in what was scanned")
     else:
         console.print("not assessed")
+    if searched := report.services.get("search", {}).get("facts"):
+        console.print(
+            f"search: {searched['presses']} presses in {searched['seconds']:.0f} s; {searched['ended']}", highlight=False
+        )
     print_scores(console, report)
 
 

@@ -43,6 +43,8 @@ class SearchService(Service):
         """Of the latest request."""
         self._felt: list[Press] = []
         """Samples since that."""
+        self._spent_s = 0.0
+        """From the first request to the latest."""
         self._ended = ""
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -60,22 +62,24 @@ class SearchService(Service):
         while self._posterior.at[1] >= FOUND:
             self._posterior = self._posterior.accept(self._posterior.best)
         self._number += 1
-        return {"exam/request": self._request(t, (t - self._begin) / NS)}
+        self._spent_s = (t - self._begin) / NS
+        return {"exam/request": self._request(t)}
 
     def finish(self) -> Mapping[str, Any]:
         """How much was asked for, what was found, and why it ended."""
         return {
             "requests": self._number,
             "presses": len(self._posterior.presses),
+            "seconds": round(self._spent_s, 2),
             "found_m": [[round(bump.x, 4), round(bump.y, 4)] for bump in self._posterior.accepted],
             "missed": round(self._posterior.lump, 4),
             "ended": self._ended or "with the examination",
         }
 
-    def _request(self, t: int, spent_s: float) -> Message:
+    def _request(self, t: int) -> Message:
         posterior = self._posterior
-        self._ended = self._over(spent_s)
-        place, depth = (np.zeros(2), 0.0) if self._ended else self._policy(posterior, posterior.left(spent_s))
+        self._ended = self._over()
+        place, depth = (np.zeros(2), 0.0) if self._ended else self._policy(posterior, posterior.left(self._spent_s))
         return SearchRequest(
             header(t, FRAME),
             self._number,
@@ -86,11 +90,11 @@ class SearchService(Service):
             self._ended,
         )
 
-    def _over(self, spent_s: float) -> str:
+    def _over(self) -> str:
         """Why the search is over; empty while it is not."""
-        posterior, left = self._posterior, self._posterior.left(spent_s)
+        posterior, left = self._posterior, self._posterior.left(self._spent_s)
         if posterior.lump < self._missed and len(posterior.presses) >= FEWEST:
-            return f"a lump that was not found has a probability of {posterior.lump:.3f}"
+            return f"a lump that was not found has a probability of {100 * posterior.lump:.1f} %"
         if self._number > self._posterior.task.budget.presses:
             return f"{posterior.task.budget.presses} presses are made"
         if left.seconds <= 0:

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites.search import REQUEST, Play, suite
+from palpate.check.suites.search import PRESS_S, REQUEST, Play, suite
 from palpate_bus.messages import ExamState, SearchRequest
 from palpate_models.scenario import Budget, Exam, Scenario, Search
 from palpate_search.service import FEWEST, create
@@ -54,3 +54,13 @@ def test_it_asks_for_nothing_while_nobody_palpates(phase: int) -> None:
     play.phase = phase
     rig.run(0.3, {"exam/state": play.state})
     assert not rig.log[REQUEST]
+
+
+def test_the_report_says_what_it_took() -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=Budget(presses=5)))
+    service = create(scenario)
+    suite(ServiceRig(service, RigSettings(scenario)), ConformanceReport("search"))
+    facts = service.finish()
+    assert facts["presses"] == 5
+    assert 4 * PRESS_S <= facts["seconds"] <= 6 * PRESS_S + 0.5
+    assert facts["ended"] == "5 presses are made"
