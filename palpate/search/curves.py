@@ -65,13 +65,14 @@ def _interval(values: Array, statistic: float, rng: np.random.Generator) -> tupl
     return float(np.quantile(values, statistic)), float(low), float(high)
 
 
-def table(found: pd.DataFrame, limits: pd.Series) -> str:
+def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
     """The comparison, as Markdown."""
+    there = trials[(trials.seed >= TUNING) & trials.apart_m.notna()]
     rng = np.random.Generator(np.random.PCG64(0))
     lines = [
-        "| policy | threshold | lumps found | healthy without a finding | presses, median | presses, 90 % | seconds, median "
-        "| place [mm] | presses against ours |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| policy | most probable place right after 10 presses | after 30 | threshold | found | healthy without a finding "
+        "| presses, median | presses, 90 % | seconds, median | presses against ours |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     ours = found[(found.policy == OURS) & found.lump].set_index("seed").presses
     order = found[found.lump].groupby("policy").presses.mean().sort_values().index
@@ -80,11 +81,14 @@ def table(found: pd.DataFrame, limits: pd.Series) -> str:
         ill, well = mine[mine.lump], mine[~mine.lump]
         k, n = int(ill.right.sum()), len(ill)
         quiet, healthy = int((~well.said).sum()), len(well)
-        cells = [f"`{name}`", f"{limits[str(name)]:.3f}", _share(k, n), _share(quiet, healthy)]
+        cells = [f"`{name}`"]
+        for press in (10, 30):
+            apart = there[(there.policy == name) & (there.press == press)].apart_m
+            cells.append(_share(int((apart <= NEAR_M).sum()), len(apart)))
+        cells += [f"{limits[str(name)]:.2f}", _share(k, n), _share(quiet, healthy)]
         values = ill.presses.to_numpy(dtype=float)
         cells += [_words(_interval(values, q, rng), "{:.0f}") for q in (0.5, 0.9)]
         cells.append(_words(_interval(ill.seconds.to_numpy(), 0.5, rng), "{:.0f}"))
-        cells.append(f"{1e3 * ill[ill.right].apart_m.median():.1f}")
         both = ill.set_index("seed").presses
         pairs = np.log(both / ours.reindex(both.index)).dropna().to_numpy()
         means = np.exp(pairs[rng.integers(0, len(pairs), (_BOOTSTRAPS, len(pairs)))].mean(axis=1))
@@ -144,7 +148,7 @@ def main(
     found = outcomes(trials, limits)
     tuned = trials[trials.seed < TUNING].seed.nunique()
     print(f"{found.seed.nunique()} patients, {found[found.lump].seed.nunique()} with a lump; {tuned} healthy tuning patients\n")
-    print(table(found, limits))
+    print(table(found, limits, trials))
     if picture is not None:
         drawn(found, trials).savefig(picture)
 
