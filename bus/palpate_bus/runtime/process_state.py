@@ -59,6 +59,7 @@ class Activity:
 
     def __init__(self, pid: int) -> None:
         """Raises psutil.Error when there is no such process."""
+        self.pid = pid
         self._process = psutil.Process(pid)
         self._used = self._usage()
         self._went_on = monotonic()

@@ -291,7 +291,10 @@ class Conductor:
         if self._member.gone() and self._member.transport_lost():
             reached = max(progress.tick for progress in self.watchdog.progress.values())
             raise RunFailed(f"transport lost at tick {max(reached, 0) / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault")
-        return {**dict.fromkeys(self._member.gone(), "its connection is gone"), **ended}
+        return {
+            **{role: self._freezes.gone(role) for role in self._member.gone() - self.outcome.lost.keys() - ended.keys()},
+            **ended,
+        }
 
     def _miss(self, role: str, how: str) -> None:
         """Keeps the place of a role that is gone, or marks it lost."""
@@ -311,15 +314,16 @@ class Conductor:
                 self._missed(role, message.tick, detail.get("lost", ""))
         if self._heartbeat.stood_still_s and CONDUCTOR not in self.outcome.lost:
             role = next(iter(self._workers))
-            self._missed(role, self.watchdog.progress[role].tick, self.outcome.failure or "gone")
+            self._missed("", self.watchdog.progress[role].tick, "the services left without it")
 
     def _missed(self, role: str, tick: int, words: str) -> None:
-        """A service has not heard this conductor for the deadline: the examination ends, whatever becomes of it now."""
+        """A service, if known which, has not heard this conductor for the deadline: the examination ends, whatever comes now."""
         if CONDUCTOR in self.outcome.lost:
             return
         self.outcome.lost[CONDUCTOR] = max(tick, 0)
         stood = f"; it stood still for {self._heartbeat.stood_still_s:.1f} s" if self._heartbeat.stood_still_s else ""
-        sentence = f"conductor lost at tick {max(tick, 0) / NS:.3f} s: {role} says: {words}{stood}"
+        said = f"{role} says: {words}" if role else words
+        sentence = f"conductor lost at tick {max(tick, 0) / NS:.3f} s: {said}{stood}"
         self._tell(sentence)
         self.outcome.failure = sentence
 

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any, Final
 
 import psutil
 
-from palpate_bus.runtime.process_state import Activity, home
+from palpate_bus.runtime.process_state import Activity, home, runs
 from palpate_conductor.outcome import Patience
 
 LOOK_S: Final = 0.25
+EXIT_S: Final = 0.05
+"""A process that ends closes its connections before it is gone itself."""
 
 
 class FreezeWatch:
@@ -32,6 +34,16 @@ class FreezeWatch:
         if role not in self._activity and detail.get("home") == home() != "":
             with suppress(psutil.Error):
                 self._activity[role] = Activity(int(detail["pid"]))
+
+    def gone(self, role: str) -> str:
+        """How a service whose connection is gone went, as far as its process tells."""
+        activity = self._activity.get(role)
+        if activity is None or not runs(activity.pid):
+            return "its connection is gone"
+        sleep(EXIT_S)
+        if not runs(activity.pid):
+            return "its connection is gone"
+        return f"its connection is gone, but its process {activity.pid} runs: the way to it is broken, or the machine too busy"
 
     def frozen(self) -> dict[str, str]:
         """Who stands still, with how: those that somebody stopped; where there is none, those that have long slept.
