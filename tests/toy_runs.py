@@ -59,6 +59,7 @@ def run_toys(
             **os.environ,
             **(environment or {}),
             "PALPATE_SCENARIO": "none",
+            "PALPATE_ABSENT": ",".join(name for name in contract().roles if contract().roles[name].optional),
             "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         }
         started = {
