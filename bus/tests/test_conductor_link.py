@@ -11,7 +11,15 @@ import pytest
 from palpate_bus.contract import contract
 from palpate_bus.messages import RunControl, codec
 from palpate_bus.runtime import conductor_link
-from palpate_bus.runtime.conductor_link import BUSY_S, CONTROL_TYPE, HEARTBEAT, LOCKSTEP_SILENT_S, ConductorLink, RunAborted
+from palpate_bus.runtime.conductor_link import (
+    BUSY_S,
+    CONTROL_TYPE,
+    HEARTBEAT,
+    LOCKSTEP_BUSY_S,
+    LOCKSTEP_SILENT_S,
+    ConductorLink,
+    RunAborted,
+)
 from palpate_bus.runtime.process_state import home
 from palpate_bus.wire.transport import ReceivedSample
 
@@ -135,6 +143,12 @@ def test_in_lockstep_nothing_moves_and_it_has_longer(monkeypatch: pytest.MonkeyP
     bus = Bus(monkeypatch, "lockstep")
     link = bus.link(grace_s=9.0)
     assert LOCKSTEP_SILENT_S < bus.silence(link, 10.0) < LOCKSTEP_SILENT_S + 0.1
+
+
+def test_in_lockstep_a_conductor_without_a_core_is_waited_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = Bus(monkeypatch, "lockstep")
+    bus.runs = True
+    assert LOCKSTEP_BUSY_S < bus.silence(bus.link(grace_s=9.0), 60.0) < LOCKSTEP_BUSY_S + 0.1
 
 
 def test_one_without_a_heartbeat_is_given_the_time_that_a_start_takes(wallclock: Bus) -> None:

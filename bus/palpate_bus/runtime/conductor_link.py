@@ -39,6 +39,8 @@ GONE_S = 0.01
 said last is under way meanwhile."""
 BUSY_S = 2.0
 """A silent conductor whose process runs all the same has no core: it is lost only after this time."""
+LOCKSTEP_BUSY_S = 30.0
+"""The same in lockstep, where waiting costs nothing: an overloaded machine keeps a conductor from its core for seconds."""
 
 
 TRANSPORT_LOST: Final = "the bus is gone: its router does not answer any more"
@@ -57,8 +59,10 @@ class ConductorLink:
         self._control = member.internal_subscription("palpate/control", CONTROL_TYPE)
         self._beats = member.internal_subscription(HEARTBEAT, CONTROL_TYPE)
         self._decode = codec.decoder(CONTROL_TYPE)
-        deadline = member.rules.internal[HEARTBEAT].deadline / NS
-        self._deadline_s = deadline if Settings.read().runtime == "wallclock" else LOCKSTEP_SILENT_S
+        if Settings.read().runtime == "wallclock":
+            self._deadline_s, self._busy_s = member.rules.internal[HEARTBEAT].deadline / NS, BUSY_S
+        else:
+            self._deadline_s, self._busy_s = LOCKSTEP_SILENT_S, LOCKSTEP_BUSY_S
         self._grace_s = grace_s / (Settings.read().rate or 1.0)
         self._patience_s = CONDUCTOR_AWAITED_S
         self._granted = self._beating = False
@@ -116,7 +120,7 @@ class ConductorLink:
         before, self._missed = self._missed, CONDUCTOR in self._member.gone()
         if before and self._missed:
             self._lose(TRANSPORT_LOST if self._member.transport_lost() else "the conductor is gone")
-        elif self._silent_s > self._patience_s and (self._silent_s > BUSY_S or not (self._pid and runs(self._pid))):
+        elif self._silent_s > self._patience_s and (self._silent_s > self._busy_s or not (self._pid and runs(self._pid))):
             self._lose(f"nothing heard of the conductor for {self._silent_s:.2f} s")
 
     def _take(self, beat: bytes) -> None:
