@@ -101,5 +101,5 @@ def test_a_file_that_is_no_pattern_is_told_with_its_line(tmp_path: Path, text: s
 
 
 def test_a_name_that_is_none_is_refused_with_what_there_is() -> None:
-    with pytest.raises(ScenarioError, match=r"exam\.pattern = 'snak': .*lines, raster, snake, or the path.*mean snake\?"):
+    with pytest.raises(ScenarioError, match=r"exam\.pattern = 'snak': .*lines, raster, snake, search, or the path.*mean snake\?"):
         load_scenario("clean", ["exam.pattern=snak"])

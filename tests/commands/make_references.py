@@ -20,6 +20,8 @@ SETTINGS = (
     "camera.frames=2", "camera.width_px=160", "camera.height_px=120", "camera.focal_px=146",
 )  # fmt: skip
 """A small examination with small messages: a coarse abdomen and a camera of few pixels."""
+SEARCH = ("exam.region_m=[0.06, 0.06]", "exam.pattern=search", "exam.budget.presses=4")
+"""What is set beside that in the examination that searches."""
 CUTS = {
     "robot": (0.0, 0.1),
     "control": (29.0, 0.1),
@@ -29,22 +31,29 @@ CUTS = {
     "assessment": (28.0, 2.0),
     "camera": (0.0, 1.2),
     "perception": (0.0, 1.5),
+    "search": (0.0, 60.0),
 }
 """What of the run a service is held to: from, and how long [s]."""
 
 
 def main() -> None:
     """Runs and cuts."""
-    palpate = str(Path(sys.executable).with_name("palpate"))
     with tempfile.TemporaryDirectory(prefix="palpate-references-") as folder:
-        words = [word for setting in SETTINGS for word in ("--set", setting)]
-        subprocess.run(
-            [palpate, "run", "clean", "--composed", "--record", "full", "--quiet", "--out", folder, *words], check=True
-        )
+        examine(Path(folder, "scan"), SETTINGS)
+        examine(Path(folder, "search"), (*SETTINGS, *SEARCH))
         for role, (begin, length) in CUTS.items():
+            run = Path(folder, "search" if role == "search" else "scan")
             target = FOLDER / f"{role}.mcap"
-            make_reference(prepare(Path(folder), role), target, round(begin * NS), round((begin + length) * NS))
+            make_reference(prepare(run, role), target, round(begin * NS), round((begin + length) * NS))
             print(f"{target}: {target.stat().st_size} bytes")
+
+
+def examine(folder: Path, settings: tuple[str, ...]) -> None:
+    """Runs an examination and records all of it."""
+    palpate = str(Path(sys.executable).with_name("palpate"))
+    words = [word for setting in settings for word in ("--set", setting)]
+    command = [palpate, "run", "clean", "--composed", "--record", "full", "--quiet", "--out", str(folder), *words]
+    subprocess.run(command, check=True)
 
 
 if __name__ == "__main__":
