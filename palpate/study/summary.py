@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -13,6 +14,7 @@ from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.report.files import write_text
 from palpate.study import human_line
 from palpate.study.page import render
+from palpate.study.spec import load_study, study_names
 from palpate.study.statistics.analysis import Analysis, analyse
 from palpate.study.statistics.comparison import Comparison, compare
 from palpate.study.statistics.detectability import Surface
@@ -171,8 +173,8 @@ def analysed_tables(tables: Tables) -> Analysed:
         study=tables.study,
         splits=tables.splits,
         version=version("palpate"),
-        command=" ".join(["palpate study", tables.study, *(f"--split {split}" for split in tables.splits)]),
-        patients={str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()},
+        command=command_of(tables.study, tables.splits, _patients(tables)),
+        patients=_patients(tables),
         reference=reference.name,
         methods={analysis.name: _method(analysis) for analysis in analyses},
         comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
@@ -182,6 +184,22 @@ def analysed_tables(tables: Tables) -> Analysed:
         human=human_line.as_json(),
     )
     return Analysed(summary, analyses)
+
+
+def _patients(tables: Tables) -> dict[str, int]:
+    """How many patients there are, by population."""
+    return {str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()}
+
+
+def command_of(study: str, splits: Sequence[str], patients: Mapping[str, int]) -> str:
+    """The words that run the study again, with the number of patients where it is not the study's own."""
+    words = ["palpate study", study, *(f"--split {split}" for split in splits)]
+    counts = set(patients.values())
+    if study in study_names() and len(splits) == 1 and len(counts) == 1:
+        own = {name: getattr(row.number, splits[0]) for name, row in load_study(study).populations.items()}
+        if own != patients:
+            words.append(f"--number {counts.pop()}")
+    return " ".join(words)
 
 
 def _method(a: Analysis) -> MethodRow:

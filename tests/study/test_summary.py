@@ -12,8 +12,9 @@ import synthetic
 
 from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.study.leaderboard import write_leaderboard
+from palpate.study.spec import load_study
 from palpate.study.statistics.reading import TablesError
-from palpate.study.summary import read_summary, summarise
+from palpate.study.summary import command_of, read_summary, summarise
 
 FOLDS = 100
 
@@ -160,3 +161,10 @@ def test_a_json_of_another_kind_is_refused(tmp_path: Path) -> None:
     path.write_text("{}", encoding="utf-8")
     with pytest.raises(TablesError, match=r"study\.json.*methods"):
         write_leaderboard([path], tmp_path / "leaderboard.md")
+
+
+@pytest.mark.parametrize(("each", "words"), [(None, ""), (8, " --number 8")])
+def test_the_command_says_how_many_patients_where_they_are_not_the_studys_own(each: int | None, words: str) -> None:
+    own = {name: population.number.test for name, population in load_study("release").populations.items()}
+    patients = own if each is None else dict.fromkeys(own, each)
+    assert command_of("release", ("test",), patients) == f"palpate study release --split test{words}"
