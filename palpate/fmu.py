@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.console import Console
@@ -12,16 +12,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from palpate_fmu.compiling import PLATFORMS, CompileError, native, platforms
-from palpate_fmu.export import build_scenario_fmu
-from palpate_fmu.instance import FmuError, FmuInstance, read_variables
-from palpate_fmu.phantom_file import ExportError
-from palpate_fmu.probing import plot_probing, probe, write_csv
-from palpate_fmu.running import run_and_plot
-from palpate_models.load import ScenarioError, load_scenario
-from palpate_models.patient import Phantom
-from palpate_models.phantom import MeshError
-from palpate_models.scenario import Scenario
+if TYPE_CHECKING:
+    from palpate_models.scenario import Scenario
 
 EXIT_BAD_INPUT = 2
 DENSE = 2000
@@ -40,6 +32,10 @@ def _fail(console: Console, message: str) -> NoReturn:
 
 def _scenario(name: str, settings: list[str]) -> Scenario:
     """A scenario by name or file, or the default one with a mesh as its phantom."""
+    from palpate_models.load import load_scenario
+    from palpate_models.patient import Phantom
+    from palpate_models.scenario import Scenario
+
     if Path(name).suffix.lower() in MESHES:
         return Scenario(name=Path(name).stem, phantom=Phantom(kind="mesh", mesh=name))
     return load_scenario(name, settings)
@@ -53,7 +49,9 @@ def build(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            "--platform", metavar="NAME", help=f"Binaries for: {', '.join(p.tuple_3 for p in PLATFORMS)}. All by default."
+            "--platform",
+            metavar="NAME",
+            help="Binaries for it, such as x86_64-linux; may be repeated. All by default.",
         ),
     ] = None,
     settings: Annotated[
@@ -62,6 +60,12 @@ def build(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
     """Write the abdomen as an FMU: sources, and binaries cross-compiled on this machine."""
+    from palpate_fmu.compiling import CompileError, platforms
+    from palpate_fmu.export import build_scenario_fmu
+    from palpate_fmu.phantom_file import ExportError
+    from palpate_models.load import ScenarioError
+    from palpate_models.phantom import MeshError
+
     console = Console(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     try:
@@ -100,8 +104,10 @@ def _states(count: int) -> str:
 @app.command()
 def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     """Show an FMU's interface, variables and platforms."""
-    import fmpy  # noqa: PLC0415  (slow to import)
-    from fmpy.model_description import ValidationError  # noqa: PLC0415
+    import fmpy
+    from fmpy.model_description import ValidationError
+
+    from palpate_fmu.instance import read_variables
 
     console = Console()
     try:
@@ -139,6 +145,11 @@ def simulate(
     hold: Annotated[float, typer.Option(min=0, max=60, help="How long it is held [s].")] = 1.0,
 ) -> None:
     """Press into an abdomen, hold and withdraw, and plot the force against the depth; run any other FMU and plot its outputs."""
+    from palpate_fmu.compiling import native
+    from palpate_fmu.instance import FmuError, FmuInstance
+    from palpate_fmu.probing import plot_probing, probe, write_csv
+    from palpate_fmu.running import run_and_plot
+
     console = Console(stderr=True)
     try:
         with FmuInstance(file) as fmu:

@@ -9,15 +9,14 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from palpate_bus.contract import contract
-from palpate_models.load import load_scenario, scenario_names
-
 WIDE = 160
 """Columns of the table of topics, where the terminal has fewer or there is none."""
 
 
 def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False) -> None:
     """List the scenarios that come with Palpate."""
+    from palpate_models.load import load_scenario, scenario_names
+
     if as_json:
         print(json.dumps([load_scenario(name).model_dump(mode="json") for name in scenario_names()]))
         return
@@ -30,6 +29,8 @@ def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them a
 
 def topics() -> None:
     """Show the contract: every topic with type, rate, who writes and who reads it."""
+    from palpate_bus.contract import contract
+
     table = Table("topic", "type", "producer", "period", "QoS", "hashed", "readers", box=None)
     for topic in contract().topics.values():
         table.add_row(

@@ -28,6 +28,7 @@ EXTRA_OF = {
     "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
     "palpate.live.dashboard": "all",  # the command line on what the dashboard draws
+    "palpate.live.viewing": "all",
     "palpate.fuzz": "fuzz",
     "palpate.search": "library",
     "palpate.search.environment": "learn-env",

@@ -54,15 +54,14 @@ PARTS = {
 """The modules that measure the parts; each has a function `measure()`."""
 
 
-GROUPS = ("parts", "runs")
-"""What `measure` can measure."""
-
-
 Save = Callable[[dict[str, Any]], None]
 
 
 def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], save: Save) -> dict[str, Any]:
-    """The figures of some of `GROUPS`, by name. `save` gets what there is after each: an interrupted call leaves its part."""
+    """The figures of some groups (see `bench_command.GROUPS`), by name.
+
+    `save` gets what there is after each: an interrupted call leaves its part.
+    """
     figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
     parts = PARTS if "parts" in groups else {}
     cases: dict[str, Callable[[Path], RunResult]] = {
@@ -122,7 +121,7 @@ def tables(figures: dict[str, Any]) -> list[Table]:
     return [table for table in (runs, blame, small) if table.row_count]
 
 
-def bench(scenario: str, out: Path, console: Console, groups: Sequence[str] = GROUPS, quiet: bool = False) -> None:
+def bench(scenario: str, out: Path, console: Console, groups: Sequence[str], quiet: bool = False) -> None:
     """Measures, prints the tables and writes bench.json; shows on a terminal how far it is, unless `quiet`."""
 
     def save(figures: dict[str, Any]) -> None:

@@ -9,10 +9,9 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import output_file
-from palpate.run.inputs import usable
-from palpate_benchmarks.bench import GROUPS
-from palpate_benchmarks.bench import bench as run_bench
 
+GROUPS = ("parts", "runs")
+"""What can be measured."""
 WIDE = 160
 """Columns of the wide tables, where the terminal has fewer or there is none."""
 
@@ -27,5 +26,8 @@ def bench(
     for group in only or ():
         if group not in GROUPS:
             raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
+    from palpate.run.inputs import usable
+    from palpate_benchmarks.bench import bench as run_bench
+
     usable(scenario)
     run_bench(scenario, out, Console(width=max(WIDE, Console().width)), only or GROUPS, quiet)

@@ -20,7 +20,8 @@ from palpate.run.forks import Forks
 from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, choice, write_scenario_files
-from palpate_benchmarks.faulty import CHANGES, InjectedFault, command
+from palpate_benchmarks.fault_kinds import MESSAGE_KINDS, PROCESS_KINDS
+from palpate_benchmarks.faulty import InjectedFault, command
 from palpate_bus.contract import Topic, contract
 from palpate_bus.implementations import module
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
@@ -49,10 +50,6 @@ MORE_N: Final = 2.0
 """How much the force may rise above its highest before a fault in contact ..."""
 CONTACT_N: Final = 1.0
 """... where it was more than this."""
-PROCESS_KINDS: Final = ("kill", "freeze", "jump")
-MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGES)
-KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, "partition")
-"""All but the last are done to a part (`run_case`), some of them to whole runs, too (`whole_cases`)."""
 WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
 COMPLETE: Final = "complete"
 WENT_WITHOUT: Final = "went on without what was struck"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -15,9 +15,10 @@ from palpate.case_display import CaseDisplay
 from palpate.command_line import EXIT_FAILED, output_file, refuse
 from palpate.report.files import write_text
 from palpate.report.marked import docs_option, write_part
-from palpate_benchmarks.campaign import KINDS, FaultFinding, as_json, cases, forks, run_case
-from palpate_benchmarks.campaign_tables import csv_text, markdown, table
-from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
+from palpate_benchmarks.fault_kinds import KINDS
+
+if TYPE_CHECKING:
+    from palpate_benchmarks.campaign import FaultFinding
 
 WIDE = 200
 
@@ -38,6 +39,10 @@ def faults(  # noqa: PLR0913 - the options of a command
     seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
 ) -> None:
     """Kill, freeze, delay, drop, corrupt...: every service and topic in turn, in contact; print what came of each."""
+    from palpate_benchmarks.campaign import as_json, cases, forks, run_case
+    from palpate_benchmarks.campaign_tables import csv_text, markdown, table
+    from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
+
     console = Console(stderr=True, width=max(WIDE, Console().width))
     wanted_modes, wanted_kinds = mode or ["lockstep", "wallclock"], kind or list(KINDS)
     for name, given, known in (("--mode", wanted_modes, ("lockstep", "wallclock")), ("--kind", wanted_kinds, KINDS)):
@@ -73,6 +78,8 @@ def faults(  # noqa: PLR0913 - the options of a command
 
 
 def _load(path: Path) -> list[FaultFinding]:
+    from palpate_benchmarks.campaign import FaultFinding
+
     if not path.exists():
         return []
     try:

@@ -10,7 +10,8 @@ from statistics import median
 from rich.markup import escape
 from rich.table import Table
 
-from palpate_benchmarks.campaign import KINDS, UNHARMED, FaultFinding
+from palpate_benchmarks.campaign import UNHARMED, FaultFinding
+from palpate_benchmarks.fault_kinds import KINDS
 
 COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
 SUMMARY = (

@@ -29,6 +29,7 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
+from palpate_benchmarks.fault_kinds import MESSAGE_KINDS
 from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
@@ -173,7 +174,7 @@ CHANGES: Final[dict[str, Callable[[bytes, Topic], bytes]]] = {
     "nan": _nan,
     "stamp": _stamp,
 }
-KINDS: Final = ("delay", "drop", "duplicate", *CHANGES, "jump")
+KINDS: Final = (*MESSAGE_KINDS, "jump")
 
 
 def command(role: str, fault: InjectedFault) -> tuple[str, ...]:

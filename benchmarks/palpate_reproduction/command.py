@@ -12,11 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from palpate.command_line import fail, output_file, output_folder, refuse
-from palpate.report.archive import EvidenceError, completed
-from palpate.run.inputs import usable
 from palpate.run.options import Settings
-from palpate_reproduction import reproduction
-from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, RunError, perform, record_graph
 
 
 class _Steps:
@@ -60,6 +56,11 @@ def reproduce(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Reproduce the seed paper: figures 3, 5, 6, 7, 8 and what it claims, from our own runs. Takes some ten minutes."""
+    from palpate.report.archive import EvidenceError, completed
+    from palpate.run.inputs import usable
+    from palpate_reproduction import reproduction
+    from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, RunError, perform, record_graph
+
     console = Console(stderr=True)
     quiet = quiet or as_json
     cases = CASES if every else (SNAKE, POINTS)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from palpate.case_display import CaseDisplay
 from palpate.command_line import output_file, output_folder, refuse
-from palpate_validation.check import PageSection
-from palpate_validation.report import failures, table, write, write_page
+
+if TYPE_CHECKING:
+    from palpate_validation.check import PageSection
 
 EXIT_MISSED = 3
 SECTIONS = {
@@ -52,6 +53,8 @@ def validate(
     docs: Annotated[Path | None, output_file("Also write this Markdown page, PNGs next to it.")] = None,
 ) -> None:
     """Measure the physics against Hertz, DART, MuJoCo and theory. Leaves with status 3 if a bound is missed."""
+    from palpate_validation.report import failures, table, write, write_page
+
     console = Console(stderr=True)
     unknown = [name for name in only or () if name not in SECTIONS]
     if unknown:

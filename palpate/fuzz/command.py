@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.markup import escape
 
 from palpate.command_line import EXIT_FAILED, refuse
-from palpate.fuzz.fuzz import campaign, choose, guided_campaign
 
 
 def fuzz(
@@ -20,6 +19,8 @@ def fuzz(
     coverage: Annotated[bool, typer.Option("--coverage", help="Guided by coverage, with atheris.")] = False,
 ) -> None:
     """Feed broken bytes to all that reads from the bus, and see that each is refused as it should be."""
+    from palpate.fuzz.fuzz import campaign, choose, guided_campaign
+
     console = Console(stderr=True)
     try:
         chosen = choose(names or [])

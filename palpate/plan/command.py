@@ -29,14 +29,14 @@ def plan(
 
       palpate plan person --seed 3 --set exam.spacing_m=0.02 -o plan.png
     """
-    from rich.console import Console  # noqa: PLC0415 - help does not wait for what plans
+    from rich.console import Console
 
-    from palpate.command_line import refuse  # noqa: PLC0415
-    from palpate.plan.drawing import draw  # noqa: PLC0415
-    from palpate.plan.prospect import NoPathError, prospect  # noqa: PLC0415
-    from palpate.run.inputs import usable  # noqa: PLC0415
-    from palpate_models.pattern_choice import PatternError  # noqa: PLC0415
-    from palpate_models.phantom import build_phantom  # noqa: PLC0415
+    from palpate.command_line import refuse
+    from palpate.plan.drawing import draw
+    from palpate.plan.prospect import NoPathError, prospect
+    from palpate.run.inputs import usable
+    from palpate_models.pattern_choice import PatternError
+    from palpate_models.phantom import build_phantom
 
     chosen = usable(scenario, settings, seed)
     try:

@@ -1,27 +1,11 @@
-"""`palpate replay`."""
+"""`palpate replay`: its options. What it does is imported when it is done, so that its help does not wait for it."""
 
 from __future__ import annotations
 
-import json
-import logging
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
-
-from palpate.command_line import fail, refuse
-from palpate.replay.compare import RELATIVE, Tolerance, TopicResult
-from palpate.replay.golden import GoldenCase, make_reference, prepare, replay_service
-from palpate.replay.play import Player, PlayError
-from palpate_bus.contract import contract
-from palpate_bus.implementations import ChoiceError
-from palpate_bus.messages.stamps import NS
-from palpate_bus.recordings import RecordingError, open_recording
-from palpate_bus.settings import BusConfigError
-from palpate_models.load import ScenarioError
 
 
 def replay(  # noqa: PLR0913 - the options of a command
@@ -40,7 +24,7 @@ def replay(  # noqa: PLR0913 - the options of a command
     drive: Annotated[bool, typer.Option("--drive", help="Play even where a living service would act on it.")] = False,
     tolerance: Annotated[
         list[str] | None,
-        typer.Option(metavar="X|TOPIC:FIELD=X", help=f"As a part of each field's range ({RELATIVE:g}), or in a field's unit."),
+        typer.Option(metavar="X|TOPIC:FIELD=X", help="As a part of each field's range (1e-06), or in a field's unit."),
     ] = None,
     scenario: Annotated[Path | None, typer.Option(help="Scenario of the service; by default the run's own.")] = None,
     update_refs: Annotated[Path | None, typer.Option(help="With --service: write its reference to this file.")] = None,
@@ -62,93 +46,12 @@ def replay(  # noqa: PLR0913 - the options of a command
 
       palpate replay tissue.mcap --service tissue --update-refs tissue.mcap                renews it
     """
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    start = round(begin * NS)
-    try:
-        if service is None:
-            until = None if length is None else start + round(length * NS)
-            _play(file, rate, start, until, topics, listen, hold, drive)
-            return
-        case = prepare(file, service, scenario)
-        if update_refs is not None:
-            end = case.end if length is None else start + round(length * NS)
-            make_reference(case, update_refs, start, end)
-            Console(stderr=True).print(f"{update_refs}: {update_refs.stat().st_size} bytes", highlight=False)
-            return
-        results = replay_service(case, parse_tolerance(tolerance or []))
-    except (RecordingError, ChoiceError, ScenarioError, PlayError, BusConfigError, OSError) as error:
-        refuse(error)
-    if as_json:
-        print(json.dumps({name: as_dict(result) for name, result in results.items()}, indent=2))
+    from palpate.replay.perform import Part, Playing, play, run_again, write_reference
+
+    part = Part(begin, length)
+    if service is None:
+        play(file, part, Playing(rate, topics, listen, hold, drive))
+    elif update_refs is not None:
+        write_reference(file, service, scenario, part, update_refs)
     else:
-        _print(case, results)
-    if not all(result.agrees for result in results.values()):
-        fail(f"{case.role} no longer sends what {file} holds; where that is meant, renew it with --update-refs")
-
-
-def parse_tolerance(words: list[str]) -> Tolerance:
-    """`--tolerance` options. Raises ChoiceError that names the one that cannot be."""
-    relative, absolute = RELATIVE, {}
-    for word in words:
-        name, _, number = word.rpartition("=")
-        try:
-            value = float(number)
-        except ValueError:
-            raise ChoiceError(f"--tolerance {word}: want a number, or TOPIC:FIELD=NUMBER") from None
-        if not value >= 0:
-            raise ChoiceError(f"--tolerance {word}: want at least 0")
-        if not name:
-            relative = value
-            continue
-        topic = name.partition(":")[0]
-        if topic not in contract().topics:
-            raise ChoiceError(f"--tolerance {word}: the contract has no topic {topic!r}")
-        absolute[name] = value
-    return Tolerance(relative, absolute)
-
-
-def _play(
-    file: Path,
-    rate: float,
-    start: int,
-    until: int | None,
-    topics: list[str] | None,
-    listen: str | None,
-    hold: bool,
-    drive: bool,
-) -> None:
-    console = Console(stderr=True)
-    with Player(open_recording(file), rate, topics, listen, drive) as player:
-        console.print(f"playing {file} at {rate:g} x {player.where}; Ctrl-C ends", highlight=False)
-        try:
-            player.play(start, until)
-            console.print(f"played {player.sent} messages up to {player.now / NS:.3f} s, {player.lag_ms:.1f} ms late at worst")
-            if hold:
-                console.print("holding; Ctrl-C ends")
-                player.hold()
-        except KeyboardInterrupt:
-            console.print(f"ended at {player.now / NS:.3f} s after {player.sent} messages")
-
-
-def as_dict(result: TopicResult) -> dict[str, Any]:
-    """A result for `--json`."""
-    row = asdict(result)
-    row["agrees"] = result.agrees
-    row["worst"] = [{**asdict(d), "ratio": d.ratio} for d in sorted(result.worst.values(), key=lambda d: -d.ratio)]
-    return row
-
-
-def _print(case: GoldenCase, results: dict[str, TopicResult]) -> None:
-    table = Table("topic", "messages", "identical", "missing", "extra", "worst field", "off by", "allowed", "at \\[s]", box=None)
-    for result in results.values():
-        worst = max(result.worst.values(), key=lambda d: d.ratio, default=None)
-        counts = [str(n) for n in (result.messages, result.identical, result.missing, result.extra)]
-        cells = ["", "", "", ""] if worst is None else [
-            worst.name,
-            f"{worst.deviation:.3g}" if worst.deviation != float("inf") else f"{worst.recorded} -> {worst.got}",
-            f"{worst.tolerance:.3g}",
-            f"{worst.stamp / NS:.3f}",
-        ]  # fmt: skip
-        style = None if result.agrees else "red"
-        table.add_row(result.topic, *counts, *cells, style=style)
-    Console(width=max(140, Console().width)).print(table)
+        run_again(file, service, scenario, tolerance or [], as_json)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
-import tempfile
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -14,37 +11,6 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import refuse
-from palpate.report.archive import EvidenceError
-from palpate.report.page import write_page
-from palpate.report.recover import recovered
-from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
-PRINT_TIMEOUT_S = 120
-
-
-class PrintError(RuntimeError):
-    """A page that no browser could print. Says what to do."""
-
-
-def write_pdf(page: Path) -> Path:
-    """Prints report.html to report.pdf beside it, with a Chromium browser. Raises PrintError."""
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if browser is None:
-        raise PrintError(f"--pdf needs a Chromium browser ({', '.join(BROWSERS)}): none is on the PATH; {page} prints as well")
-    target = page.with_suffix(".pdf")
-    target.unlink(missing_ok=True)
-    with tempfile.TemporaryDirectory(prefix="palpate-print-") as profile:
-        command = [browser, "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        command += [f"--user-data-dir={profile}", "--no-pdf-header-footer", "--virtual-time-budget=5000"]
-        command += [f"--print-to-pdf={target}", page.resolve().as_uri()]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=PRINT_TIMEOUT_S, check=False)
-        except subprocess.TimeoutExpired as error:
-            raise PrintError(f"{browser} did not print {page} within {PRINT_TIMEOUT_S} s") from error
-    if done.returncode or not target.is_file():
-        raise PrintError(f"{browser} could not print {page} (status {done.returncode}): {done.stderr.strip()[-300:]}")
-    return target
 
 
 def report(
@@ -57,6 +23,12 @@ def report(
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
 ) -> None:
     """Make report.html of a run again: one page for a clinician or an engineer, without references to anything outside."""
+    from palpate.report.archive import EvidenceError
+    from palpate.report.page import write_page
+    from palpate.report.printing import PrintError, write_pdf
+    from palpate.report.recover import recovered
+    from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
+
     console = Console(stderr=True)
     try:
         with nullcontext() if quiet or as_json else console.status("writing the report"):

@@ -79,8 +79,8 @@ def run(  # noqa: PLR0913 - the options of a command
 
       palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
     """
-    from palpate.run.examine import How, examine, examine_again  # noqa: PLC0415 - see above
-    from palpate.run.inputs import usable  # noqa: PLC0415
+    from palpate.run.examine import How, examine, examine_again
+    from palpate.run.inputs import usable
 
     how = How(
         out=out,
@@ -116,8 +116,8 @@ def prepare(
 
     scenario.yaml is for tissue, observers and scoring, plant.yaml for robot and camera, exam.yaml for everybody else.
     """
-    from palpate.run.inputs import usable  # noqa: PLC0415 - see above
-    from palpate.run.roles import write_scenario_files  # noqa: PLC0415
+    from palpate.run.inputs import usable
+    from palpate.run.roles import write_scenario_files
 
     write_scenario_files(usable(scenario, settings, seed, elsewhere=True), out)
 
@@ -130,6 +130,6 @@ def conduct(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
 ) -> None:
     """Conduct services that are started by others (containers, other machines) and write the report."""
-    from palpate.run.examine import conduct_others  # noqa: PLC0415 - see above
+    from palpate.run.examine import conduct_others
 
     conduct_others(out, tuple(name for name in observers.split(",") if name), realtime, wallclock, quiet)
