@@ -46,7 +46,7 @@ Change = Callable[[ForceSample, float], ForceSample]
 
 
 @dataclass(frozen=True)
-class Row:
+class Disturbance:
     """One disturbance."""
 
     name: str
@@ -74,23 +74,23 @@ def _lengthened(length_m: float) -> Phantom:
 
 
 ROWS: Final = (
-    Row("default patients"),
-    Row("persons", Phantom(kind="person")),
-    Row("slim persons", Phantom(kind="person", build=Build.SLIM)),
-    Row("obese persons", Phantom(kind="person", build=Build.OBESE)),
-    Row("wall length 10 mm", _lengthened(0.010)),
-    Row("wall length 20 mm", _lengthened(0.020)),
-    Row("background of 17.5 mm, cv 0.3", Phantom(background=Background(cv=0.3, correlation_m=0.0175))),
-    Row("two stiff rectus bands", rectus=True),
-    Row("no errors", errors=CLEAN),
-    Row("smooth surface error of 0.5 mm alone", errors=replace(CLEAN, field_m=5e-4)),
-    Row("depth off by 1 mm", change=_deeper),
-    Row("tare off by 0.3 N", change=_harder),
-    Row("drift of 0.3 N a minute", change=_drifting),
+    Disturbance("default patients"),
+    Disturbance("persons", Phantom(kind="person")),
+    Disturbance("slim persons", Phantom(kind="person", build=Build.SLIM)),
+    Disturbance("obese persons", Phantom(kind="person", build=Build.OBESE)),
+    Disturbance("wall length 10 mm", _lengthened(0.010)),
+    Disturbance("wall length 20 mm", _lengthened(0.020)),
+    Disturbance("background of 17.5 mm, cv 0.3", Phantom(background=Background(cv=0.3, correlation_m=0.0175))),
+    Disturbance("two stiff rectus bands", rectus=True),
+    Disturbance("no errors", errors=CLEAN),
+    Disturbance("smooth surface error of 0.5 mm alone", errors=replace(CLEAN, field_m=5e-4)),
+    Disturbance("depth off by 1 mm", change=_deeper),
+    Disturbance("tare off by 0.3 N", change=_harder),
+    Disturbance("drift of 0.3 N a minute", change=_drifting),
 )
 
 
-def examined(row: Row, seed: int, region: float = REGION_M) -> tuple[int, float]:
+def examined(row: Disturbance, seed: int, region: float = REGION_M) -> tuple[int, float]:
     """Findings in the patient of a seed, and the part of a square of side `region` [m] on which the band holds."""
     patient = felt_patient(row.phantom, seed)
     if row.rectus:
@@ -117,7 +117,7 @@ def _with_rectus(patient: FeltPatient) -> FeltPatient:
     return FeltPatient(patient.force * band, patient.healthy * band)
 
 
-def line(row: Row, seeds: range, region: float = REGION_M) -> str:
+def line(row: Disturbance, seeds: range, region: float = REGION_M) -> str:
     """A row of the table."""
     results = [examined(row, seed, region) for seed in seeds]
     ill = sum(findings > 0 for findings, _ in results)

@@ -38,7 +38,7 @@ class Following(StrEnum):
     """It does not follow, as if the patient did not breathe."""
 
 
-class Budget(Section):
+class SearchBudget(Section):
     """How much a search may take."""
 
     presses: Annotated[int, Field(ge=1, le=1000)] = 60
@@ -82,7 +82,7 @@ class Exam(Section):
     """Width (x) and height (y) of the examined region about `centre_m`."""
     centre_m: Vec2 = (0.0, 0.0)
     """Centre of the region in the abdomen frame."""
-    budget: Budget = Budget()
+    budget: SearchBudget = SearchBudget()
     """Of a search."""
     false_findings: Annotated[float, Field(ge=1e-4, le=0.5)] = 0.02
     """The operating point: how probable a finding may be in a healthy examination. Less of it misses more."""

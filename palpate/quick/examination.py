@@ -79,7 +79,7 @@ class Way:
 
 
 @dataclass
-class Row:
+class PeriodRow:
     """One period of an examination."""
 
     time: float
@@ -136,11 +136,11 @@ class QuickExamination:
         self._depth = -HOP_M
         self._count = self._stroke_number = 0
 
-    def run(self) -> list[Row]:
+    def run(self) -> list[PeriodRow]:
         """Carries it out: what was measured, and what was true."""
         scan = scan_of(self._exam, self._believed.in_A)
         xy = scan.targets
-        rows: list[Row] = []
+        rows: list[PeriodRow] = []
         usable = np.ones(len(xy), dtype=bool)
         exam = self._exam
         before: Array | None = None
@@ -196,7 +196,7 @@ class QuickExamination:
 
     # --- the sequence of a stroke, as `palpate_planning.palpation` has it ------------------------------------------------
 
-    def _stroke(self, way: Way) -> Iterator[Row]:
+    def _stroke(self, way: Way) -> Iterator[PeriodRow]:
         motion, exam = self._motion, self._exam
         motion.start(way.segment)
         for _ in range(round((REST_S + TARE_S) / PERIOD_S)):
@@ -236,12 +236,12 @@ class QuickExamination:
             motion.brake()
             yield self._period(way, StrokeStage.LIFT)
 
-    def _travel(self, way: Way) -> Iterator[Row]:
+    def _travel(self, way: Way) -> Iterator[PeriodRow]:
         self._motion.start(way.segment)
         while not self._motion.travel(way.segment.path.length):
             yield self._period(way, StrokeStage.TRANSFER)
 
-    def _period(self, way: Way, stage: StrokeStage) -> Row:
+    def _period(self, way: Way, stage: StrokeStage) -> PeriodRow:
         """The indenter follows the motion for a period, with this examination's errors."""
         motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
         self._count += 1
@@ -262,7 +262,7 @@ class QuickExamination:
         limited = motion.regulation.limited or (motion.short_of_depth and stage in AT_DEPTH)
         fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
         steady = self._touching and self._open and (stage is StrokeStage.HOLD or (stage is StrokeStage.SLIDE and fast))
-        return Row(
+        return PeriodRow(
             time=patient.time,
             way=way,
             at=at,

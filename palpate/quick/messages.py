@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate.quick.examination import QuickExamination, Row
+from palpate.quick.examination import PeriodRow, QuickExamination
 from palpate.quick.patient import Patient
 from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.geometry import pose_message
@@ -21,7 +21,7 @@ _NO_TRIANGLES: Final = np.empty(0, np.uint32)
 _NO_SHARES: Final = np.empty(0, np.float32)
 
 
-def collected(examination: QuickExamination, rows: list[Row]) -> Collected:
+def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected:
     """What a conductor would have collected of it before the assessment. The last state is in phase ASSESS."""
     X_WA = examination.patient.X_WA
     model = examination.patient.tissue.model
@@ -44,7 +44,7 @@ def collected(examination: QuickExamination, rows: list[Row]) -> Collected:
     )
 
 
-def _state(row: Row, phase: int, time: float, sigma: float) -> Any:
+def _state(row: PeriodRow, phase: int, time: float, sigma: float) -> Any:
     """`exam/state`."""
     over = phase == ExamState.PHASE_ASSESS
     return ExamState(
@@ -71,7 +71,7 @@ def _state(row: Row, phase: int, time: float, sigma: float) -> Any:
     )
 
 
-def _indentations(patient: Patient, rows: list[Row]) -> list[Any]:
+def _indentations(patient: Patient, rows: list[PeriodRow]) -> list[Any]:
     """`truth/indentation` of every period."""
     place = np.array([row.way.place[row.at] for row in rows])
     outward = np.array([row.way.normal[row.at] for row in rows])

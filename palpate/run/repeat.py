@@ -28,7 +28,7 @@ FEWEST: Final = 3
 
 
 @dataclass(frozen=True)
-class Sample:
+class ProcessSample:
     """One process at one moment."""
 
     at_s: float
@@ -60,7 +60,7 @@ class Soak:
     """Notes the memory of a run's processes while it is on."""
 
     def __init__(self) -> None:
-        self.samples: list[Sample] = []
+        self.samples: list[ProcessSample] = []
         self.number = 0
         self._began = monotonic()
         self._over = threading.Event()
@@ -84,7 +84,7 @@ class Soak:
                     role = HERE if process == here else _role(process.cmdline())
                     if role:
                         rss = process.memory_info().rss / 1e6
-                        self.samples.append(Sample(monotonic() - self._began, self.number, role, rss, process.num_fds()))
+                        self.samples.append(ProcessSample(monotonic() - self._began, self.number, role, rss, process.num_fds()))
 
     def growths(self) -> list[Growth]:
         """By role."""
@@ -108,7 +108,7 @@ class Soak:
         """Writes soak.csv and soak.json."""
         with (folder / "soak.csv").open("w", newline="", encoding="utf-8") as file:
             rows = csv.writer(file, lineterminator="\n")
-            rows.writerow(Sample.__dataclass_fields__)
+            rows.writerow(ProcessSample.__dataclass_fields__)
             rows.writerows((f"{s.at_s:.1f}", s.number, s.role, f"{s.rss_mb:.1f}", s.descriptors) for s in self.samples)
         growths = [asdict(growth) for growth in self.growths()]
         (folder / "soak.json").write_text(json.dumps(growths, indent=1) + "\n", encoding="utf-8")

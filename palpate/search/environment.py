@@ -23,7 +23,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from palpate.search.hand import PatientHand, SurrogateHand
-from palpate.search.population import Case, case
+from palpate.search.population import SearchCase, case
 from palpate_models.frames import Array
 from palpate_search.posterior import Posterior
 from palpate_search.presses import seconds
@@ -94,7 +94,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         told = {"lump": self._posterior.lump, "truth": self._truth()} if over else {}
         return self._observed(), float(reward), over, False, told
 
-    def _begin(self, patient: Case) -> None:
+    def _begin(self, patient: SearchCase) -> None:
         hands = SurrogateHand(patient.scenario, felt=patient.felt) if self._kind == "surrogate" else PatientHand(patient.scenario)
         self._case, self._hand, self._count = patient, hands, 0
         self._posterior = Posterior(hands.task, models=ONE_MODEL)

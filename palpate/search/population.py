@@ -25,7 +25,7 @@ _ROUNDS: Final = 5
 
 
 @dataclass(frozen=True)
-class Case:
+class SearchCase:
     """One patient."""
 
     scenario: Scenario
@@ -35,13 +35,13 @@ class Case:
     """Of his lump [m], shape (2,); None for a person without one."""
 
 
-def case(seed: int, errors: str = "typical") -> Case:
+def case(seed: int, errors: str = "typical") -> SearchCase:
     """The patient of a seed: with a lump where the seed is odd. The modulus is such that the felt contrast is CONTRAST."""
     settings = [f"errors={errors}", "phantom.breathing.kind=quiet", "phantom.draw.lumps=[0, 0]"]
     settings += [f"exam.budget.presses={PRESSES}", "exam.budget.seconds=3600"]
     if seed % 2 == 0:
         scenario = load_scenario("person", settings, seed)
-        return Case(scenario, felt_patient(scenario.phantom, seed), None)
+        return SearchCase(scenario, felt_patient(scenario.phantom, seed), None)
     region = load_scenario("person", settings, seed).exam
     half = 0.5 * np.array(region.region_m) - BORDER_M
     centre = generator(seed, "search lump").uniform(-half, half) + region.centre_m
@@ -53,4 +53,4 @@ def case(seed: int, errors: str = "typical") -> Case:
         felt = felt_patient(scenario.phantom, seed)
         excess = float(felt.excess_at(centre[None])[0])
         low, high = (middle, high) if excess < np.log(CONTRAST) else (low, middle)
-    return Case(scenario, felt, centre)
+    return SearchCase(scenario, felt, centre)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_validation.disturbances import ROWS, Row, examined, line
+from palpate_validation.disturbances import ROWS, Disturbance, examined, line
 
 
-def row(name: str) -> Row:
+def row(name: str) -> Disturbance:
     (found,) = [row for row in ROWS if row.name == name]
     return found
 

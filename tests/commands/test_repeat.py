@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from palpate.run import repeat as soaking
-from palpate.run.repeat import Sample, Soak, repeat
+from palpate.run.repeat import ProcessSample, Soak, repeat
 
 
 def test_each_has_a_folder_and_a_failure_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -22,8 +22,8 @@ def test_each_has_a_folder_and_a_failure_is_counted(tmp_path: Path, monkeypatch:
             pass
         return number != 2
 
-    def noted() -> list[Sample]:
-        return kept[-1].samples if kept else [Sample(0.0, 0, "", 0.0, 0)] * len(done)
+    def noted() -> list[ProcessSample]:
+        return kept[-1].samples if kept else [ProcessSample(0.0, 0, "", 0.0, 0)] * len(done)
 
     kept: list[Soak] = []
     begin = Soak.__init__
@@ -41,7 +41,7 @@ def test_the_slope_is_of_the_highest_of_each_examination() -> None:
     soak = Soak()
     for number in range(1, 5):
         for second, rss in enumerate((50.0, 100.0 + number, 60.0)):
-            soak.samples.append(Sample(3600.0 * number + second, number, "planning", rss, 20 + number))
+            soak.samples.append(ProcessSample(3600.0 * number + second, number, "planning", rss, 20 + number))
     (growth,) = soak.growths()
     assert growth.percent_an_hour == pytest.approx(100 / 102.5, abs=0.01)
     assert growth.low is not None

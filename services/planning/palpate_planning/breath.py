@@ -28,7 +28,7 @@ UNTOLD = 1.3
 """What a forecast errs by over what its successor tells of that, for the successor errs with it (1.0 to 1.3: tuning seeds)."""
 
 
-class Motion(NamedTuple):
+class BreathObservation(NamedTuple):
     """One word of perception's about the breath."""
 
     stamp: int
@@ -49,7 +49,7 @@ class Breath:
     """How far the wall is moved where it moves most. Without a motion it is at the end of expiration and at rest."""
 
     def __init__(self) -> None:
-        self._motion: Motion | None = None
+        self._motion: BreathObservation | None = None
         self._gap, self._since = 0.0, 0
         """The last step from one forecast to the next [m], and when that was [ns]."""
         self._seen: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
@@ -57,7 +57,7 @@ class Breath:
         self._steps, self._growths = 0.0, 0.0
         """Number of steps, and sum of the r^2 [m^2/s^2] of `uncertainty` that they tell, the older the less they count."""
 
-    def hear(self, motion: Motion, t: int) -> None:
+    def hear(self, motion: BreathObservation, t: int) -> None:
         """Takes perception's newest motion at `t` [ns]."""
         before, last = self.displacement(t), self._motion
         self._motion, self._gap = motion, 0.0

@@ -9,7 +9,7 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.frames import Array
-from palpate_planning.breath import HIDDEN_M, Motion
+from palpate_planning.breath import HIDDEN_M, BreathObservation
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.status import ExamStatus
 from palpate_planning.wall import TouchedSkin
@@ -57,10 +57,12 @@ def path_message(t: int, poses_WI: Array) -> Message:
     return Path(header(t, "world"), [PoseStamped(header(t, "world"), pose_message(X[:3, :3], X[:3, 3])) for X in poses_WI])
 
 
-def motion_of(message: Message) -> Motion:
+def motion_of(message: Message) -> BreathObservation:
     """The motion in a `palpation_msgs/SurfaceMotion`. While the wall is hidden the forecast goes on, as long as it is good."""
     hidden = message.state == SurfaceMotion.LOST and message.uncertainty < HIDDEN_M
     calm = message.state == SurfaceMotion.QUIET or hidden
     moved = bool(message.state == SurfaceMotion.MOVED)
     shift = (float(message.shift.x), float(message.shift.y))
-    return Motion(nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved, shift)
+    return BreathObservation(
+        nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved, shift
+    )

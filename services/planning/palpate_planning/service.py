@@ -19,7 +19,7 @@ from palpate_bus.settings import Settings
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Following, Scenario
 from palpate_planning.background import WORKER
-from palpate_planning.breath import Motion
+from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
@@ -140,7 +140,7 @@ class PlanningService(Service):
             surface=surface,
         )
 
-    def _motion(self, inbox: Inbox) -> Motion | None:
+    def _motion(self, inbox: Inbox) -> BreathObservation | None:
         """The wall's newest motion, if there is one and it is to be followed."""
         heard = [motion_of(message) for message in inbox.new("perception/motion")]
         return heard[-1] if heard and self._known.exam.breathing is not Following.IGNORE else None

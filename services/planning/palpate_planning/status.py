@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.frames import Array
-from palpate_planning.breath import Motion
+from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.palpation import StrokeStage
@@ -67,7 +67,7 @@ class Observation(NamedTuple):
     """None before the first joint states."""
     perceived: PerceivedAbdomen | PerceptionFailure | None = None
     """Perception's answer, at the step at which it came."""
-    motion: Motion | None = None
+    motion: BreathObservation | None = None
     """Perception's newest word about the breath, at the step at which it came."""
     findings_final: bool = False
     """Whether the assessment has sent its final findings."""

@@ -34,7 +34,7 @@ UNFITTED_M = 0.001
 """The same where no law can be fitted, as on bone, where force rises within a few samples: d0 is where force began."""
 
 
-class Touch(NamedTuple):
+class SkinDepth(NamedTuple):
     """Where the skin was felt."""
 
     depth: float
@@ -55,7 +55,7 @@ class Onset:
         self._rows.append((depth, force))
         self._moving.append((t, displacement))
 
-    def touch(self) -> Touch:
+    def touch(self) -> SkinDepth:
         """The touch in what was collected."""
         return find_touch(np.array(self._rows))
 
@@ -64,20 +64,20 @@ class Onset:
         """When it was collected [ns], shape (n,)."""
         return np.array([t for t, _ in self._moving])
 
-    def touch_again(self, displacement: Array) -> Touch:
+    def touch_again(self, displacement: Array) -> SkinDepth:
         """The touch, had the wall been displaced as is known by now [m], shape (n,)."""
         rows = np.array(self._rows)
         rows[:, 0] += displacement - np.array([lifted for _, lifted in self._moving])
         return find_touch(rows)
 
 
-def find_touch(rows: Array) -> Touch:
+def find_touch(rows: Array) -> SkinDepth:
     """The touch in a descent's rows of depth [m] and force [N], shape (n, 2), of which the last is the deepest and firmest."""
     rows = rows[rows[:, 0] > rows[-1, 0] - WINDOW_M]
     depth, force = rows.T
     quiet = np.flatnonzero(force < BEGUN_N)
     begun = float(depth[quiet[-1]]) if len(quiet) else float(depth[0])
-    guess = Touch(begun, UNFITTED_M)
+    guess = SkinDepth(begun, UNFITTED_M)
     if len(rows) < SAMPLES_MIN:
         return guess
     scale = (force[-1] - force[0]) / max(depth[-1] - begun, 1e-4) ** ONSET_EXPONENT
@@ -88,7 +88,7 @@ def find_touch(rows: Array) -> Touch:
     variance = float(covariance[2, 2])
     if not (slope > 0 and depth[0] < d0 < depth[-1] and variance < UNFITTED_M**2):
         return guess
-    return Touch(float(d0), math.hypot(METHOD_M, math.sqrt(variance)))
+    return SkinDepth(float(d0), math.hypot(METHOD_M, math.sqrt(variance)))
 
 
 def _force(depth: Array, bias: float, slope: float, onset: float) -> Array:

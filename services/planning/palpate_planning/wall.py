@@ -19,7 +19,7 @@ from palpate_models.frames import Array
 from palpate_planning.breath import Breath
 from palpate_planning.surface import Foot, PerceivedSurface
 from palpate_planning.surface_correction import SurfaceCorrection
-from palpate_planning.touch import Onset, Touch
+from palpate_planning.touch import Onset, SkinDepth
 
 
 class TouchedSkin(NamedTuple):
@@ -81,7 +81,7 @@ class Wall:
         """Standard deviation of where the wall is [m] at a place, shape (2,), at `t` [ns]."""
         return math.hypot(self.correction.sigma(xy_A), self.perceived.breathing(xy_A) * self.breath.uncertainty(t))
 
-    def touched(self, foot: Foot, touch: Touch, stroke: int, t: int) -> tuple[TouchedSkin, float]:
+    def touched(self, foot: Foot, touch: SkinDepth, stroke: int, t: int) -> tuple[TouchedSkin, float]:
         """Learns from a touch under `foot` at `t` [ns]; also returns how far the wall there moved outward by it [m]."""
         before, before_sigma = self.correction.height(foot.xy_A), self.correction.sigma(foot.xy_A)
         sigma = math.hypot(touch.sigma, self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t))

@@ -14,7 +14,7 @@ from palpate_models.frames import Array, apply
 from palpate_models.load import exam_input
 from palpate_models.scenario import Exam as ExamSettings
 from palpate_models.scenario import ExamInput, Robot, Scenario
-from palpate_planning.breath import FORECAST_STEP, Motion
+from palpate_planning.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
@@ -164,12 +164,12 @@ class World:
         self.t += PERIODS.step
         return outcome
 
-    def _motion(self) -> Motion:
+    def _motion(self) -> BreathObservation:
         """Perception's word about an exposure 0.1 s ago."""
         assert self.excursion is not None
         stamp = self.t - 100 * MS
         forecast = np.array([self.excursion((stamp + k * FORECAST_STEP) / SECOND) for k in range(11)])
-        return Motion(stamp, forecast, 3e-4, self.calm, self.moved, self.shift_A)
+        return BreathObservation(stamp, forecast, 3e-4, self.calm, self.moved, self.shift_A)
 
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
         """Steps until the exam has ended (or `until`), at most `seconds` of simulated time."""

@@ -8,7 +8,7 @@ from planning_fakes import World, known
 
 from palpate_bus.messages import SurfaceMotion
 from palpate_models.scenario import Following
-from palpate_planning.breath import FORECAST_STEP, JOIN_S, Breath, Motion
+from palpate_planning.breath import FORECAST_STEP, JOIN_S, Breath, BreathObservation
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.status import PerceptionFailure, Phase
@@ -17,8 +17,8 @@ from palpate_planning.wall_watch import CALM_S, LOST_MAX, LOST_S, WallWatch
 DT = 0.01
 
 
-def motion(stamp: int, *forecast: float, calm: bool = True, moved: bool = False) -> Motion:
-    return Motion(stamp, np.array(forecast), 3e-4, calm, moved)
+def motion(stamp: int, *forecast: float, calm: bool = True, moved: bool = False) -> BreathObservation:
+    return BreathObservation(stamp, np.array(forecast), 3e-4, calm, moved)
 
 
 def breathing(t_s: float) -> float:

@@ -38,7 +38,7 @@ class Near(NamedTuple):
         return radius == self.radius and math.dist(p, self.origin) <= self.reach
 
 
-class Search:
+class VertexSearch:
     """Finds the vertices near a sphere among some at rest. Everything is in A."""
 
     def __init__(self, vertices: Array, normals: Array, excursion: float, margin: float) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate_models.frames import Array
 from palpate_tissue.backends.elastic.contact import ContactSolver
-from palpate_tissue.backends.elastic.springs import Springs, resistance
+from palpate_tissue.backends.elastic.springs import VertexSprings, resistance
 from palpate_tissue.friction import Push
 from palpate_tissue.near import RIM, Near
 
@@ -101,7 +101,7 @@ class SprungPatch(ElasticPatch):
         breathing: Array,
         state: Array,
         compliance: Array,
-        springs: Springs,
+        springs: VertexSprings,
         deepest: float,
     ) -> None:
         """`breathing` is of the k, the others of all `vertex` (m,). `deepest` [m] is how far they may be displaced."""

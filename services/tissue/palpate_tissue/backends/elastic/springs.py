@@ -17,7 +17,7 @@ so that the press that defines the ratio of guarding would feel 3 % less. With i
 
 
 @dataclass(frozen=True)
-class Springs:
+class VertexSprings:
     """Elastic springs in parallel with the solid, one a vertex, m of them.
 
     q(u) = k_w A [sigma(u) + tension a max(u, 0)]
@@ -30,9 +30,9 @@ class Springs:
     tension: Array
     """[1], shape (m,)."""
 
-    def at(self, index: NDArray[np.intp]) -> Springs:
+    def at(self, index: NDArray[np.intp]) -> VertexSprings:
         """Those of some of the vertices."""
-        return Springs(self.gain[index], self.stiffening[index], self.tension[index])
+        return VertexSprings(self.gain[index], self.stiffening[index], self.tension[index])
 
     def table(self) -> Array:
         """What `resistance` takes of them, shape (m, 3)."""

@@ -29,9 +29,9 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
 from palpate_tissue.backends.elastic.patch import ElasticPatch, SprungPatch
-from palpate_tissue.backends.elastic.springs import MUSCLE, Springs
+from palpate_tissue.backends.elastic.springs import MUSCLE, VertexSprings
 from palpate_tissue.friction import Sphere, rub
-from palpate_tissue.near import Search
+from palpate_tissue.near import VertexSearch
 
 _MARGIN_M = 0.0025
 """The vertices near the sphere are searched anew when it has moved this far."""
@@ -88,12 +88,12 @@ class ElasticTissue(TissueBackend):
         self._excursion = 0.0
         free = compliance.free
         self._breathing = model.breathing[free]
-        self._springs = Springs(
+        self._springs = VertexSprings(
             compliance.young / YOUNG_OVER_K_W * model.areas[free], model.stiffening[free], MUSCLE * model.tension[free]
         )
         self._resists = bool(model.stiffening.any() or model.tension.any())
         self._beside = _BESIDE_MUSCLE_M if model.tension.any() else _BESIDE_M
-        self._search = Search(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M)
+        self._search = VertexSearch(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M)
         self._state = np.zeros((len(self._feed), len(free)))
         """u and y_k of the free vertices as they were `_behind` steps ago."""
         self._behind = 0

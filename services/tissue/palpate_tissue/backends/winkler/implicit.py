@@ -23,7 +23,7 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler import implicit_kernel as kernel
 from palpate_tissue.backends.winkler.implicit_kernel import ImplicitPatch, ImplicitWall
 from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
-from palpate_tissue.near import Near, Search
+from palpate_tissue.near import Near, VertexSearch
 
 SWEEPS: Final = 3
 """Of over-relaxation in a step near the sphere."""
@@ -60,7 +60,7 @@ class ImplicitTissue(TissueBackend):
         self._every = max(1, round(FAR_S / dt))
         self._wall = implicit_wall(model, stiffness, dt, self._every)
         self._free = np.flatnonzero(~model.fixed)
-        self._search = Search(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
+        self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._tree = cKDTree(model.vertices[self._free])
         self._steps = self._sprung = 0
         self._excursion = 0.0

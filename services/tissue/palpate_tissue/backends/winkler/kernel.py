@@ -27,7 +27,7 @@ _USUAL = 7
 """Entries of most rows of the field's matrix: a vertex and its six neighbours."""
 
 
-class Wall(NamedTuple):
+class Membrane(NamedTuple):
     """The wall: n vertices and b Prony branches, with its matrices for steps of h."""
 
     u: Array
@@ -72,7 +72,14 @@ _BETA2, _BENT, _TENSION = 0, 1, 2
 
 @compiled
 def step(
-    wall: Wall, patch: Patch, bristle: Bristle, motion: Array, radius: float, excursion: float, disturbed: bool, wrench: Array
+    wall: Membrane,
+    patch: Patch,
+    bristle: Bristle,
+    motion: Array,
+    radius: float,
+    excursion: float,
+    disturbed: bool,
+    wrench: Array,
 ) -> bool:
     """One step at a breathing `excursion` [m]. Whether the sphere touches: then `wrench` (6,) gets force and torque on it.
 
@@ -92,7 +99,7 @@ def step(
 
 
 @compiled
-def move_freely(wall: Wall) -> None:
+def move_freely(wall: Membrane) -> None:
     """The wall as it moves by itself: u += A (u - sum_k y_k) - h k_w A / C (sigma(u) + tension a max(u, 0))."""
     u, rate, indices = wall.u, wall.rate, wall.indices
     strain = u.copy()
@@ -115,7 +122,7 @@ def move_freely(wall: Wall) -> None:
 
 
 @compiled
-def stiffen(wall: Wall) -> None:
+def stiffen(wall: Membrane) -> None:
     """What the springs beside the linear wall do to a displacement in a step. The law is in `palpate_models.wall`."""
     u, beta2, straight_from, tension = wall.u, wall.spring[_BETA2], wall.spring[_BENT], wall.spring[_TENSION]
     share, activation = wall.share, wall.activation[0]
@@ -127,7 +134,7 @@ def stiffen(wall: Wall) -> None:
 
 
 @compiled
-def hold(wall: Wall, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bool, Push]:
+def hold(wall: Membrane, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bool, Push]:
     """Holds the vertices under the sphere on its surface, at a breathing `excursion` [m]. Whether there are any, and the push.
 
     A vertex X of outward normal n moves along it; with d = p - X and s = -d.n it meets the sphere's lower side at
@@ -164,7 +171,7 @@ def hold(wall: Wall, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bo
 
 
 @compiled
-def relax(wall: Wall) -> None:
+def relax(wall: Membrane) -> None:
     """The Prony branches, exact for a displacement held over the step: y_k = e_k y_k + (1 - e_k) g_k u."""
     for k in range(len(wall.y)):
         y, e, feed = wall.y[k], wall.prony[k, 0], wall.prony[k, 1]

@@ -25,10 +25,10 @@ from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
-from palpate_tissue.backends.winkler.kernel import Patch, Wall
+from palpate_tissue.backends.winkler.kernel import Membrane, Patch
 from palpate_tissue.backends.winkler.mechanics import assemble
 from palpate_tissue.backends.winkler.presses import press_in_turn
-from palpate_tissue.near import Near, Search
+from palpate_tissue.near import Near, VertexSearch
 
 _NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 _MARGIN_M = 0.005
@@ -63,7 +63,7 @@ class WinklerTissue(TissueBackend):
         self._gain = self.mechanics.damping / h
         self._excursion = 0.0
         self._free = np.flatnonzero(~model.fixed)
-        self._search = Search(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
+        self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._near: Near | None = None
         self._patch = self._nothing = self._patch_of(_NONE)
         self._motion: Array = np.zeros((3, 3))
@@ -145,7 +145,7 @@ class WinklerTissue(TissueBackend):
         table = np.column_stack((model.normals[index], model.vertices[index], model.breathing[index], self._gain[index]))
         return Patch(index.astype(np.uint32), table, np.zeros(len(index)))
 
-    def _wall_of(self, stiffness: Stiffness, h: float) -> Wall:
+    def _wall_of(self, stiffness: Stiffness, h: float) -> Membrane:
         """The wall with its matrices for steps of `h` [s]."""
         A = -h * self.mechanics.stiffness
         A.data /= np.repeat(self.mechanics.damping, np.diff(A.indptr))  # row i by C_i
@@ -155,7 +155,7 @@ class WinklerTissue(TissueBackend):
         decay: Array = np.exp(-h / np.array(stiffness.prony_tau_s))
         feed: Array = np.array(stiffness.prony_g) * (1 - decay)
         prony, share = np.column_stack((decay, feed)), h / stiffness.dashpot_s
-        return Wall(
+        return Membrane(
             self.displacement,
             self.branches,
             indptr,
