@@ -20,7 +20,8 @@ from typing import Any, ClassVar, Protocol
 from palpate_bus.messages.codec import Message
 
 Outbox = Mapping[str, "Message | list[Message]"]
-"""Messages by topic: one, or a list for an event topic. Their arrays must not be changed after the step."""
+"""Messages by topic: one, or a list for an event topic. They must not be changed after the step: readers in the same
+process may get them as they are."""
 
 
 class Inbox(Protocol):

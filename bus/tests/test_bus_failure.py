@@ -8,7 +8,7 @@ from palpate_bus.contract import Edge, contract
 from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.failure import described
-from palpate_bus.runtime.lockstep import InputBuffer, Received
+from palpate_bus.runtime.lockstep import InputBuffer, Packet
 
 ROW = contract().topics["joint_states"]
 NAMES = [f"lbr_A{k}" for k in range(1, 8)]
@@ -16,7 +16,7 @@ NAMES = [f"lbr_A{k}" for k in range(1, 8)]
 
 def buffer(payload: bytes) -> InputBuffer:
     held = InputBuffer(ROW, Edge.SAME_TICK, contract().roles["robot"].period)
-    held.deliver(Received(payload, 0, 1))
+    held.deliver(Packet(payload, 0, 1))
     held.take(0)
     return held
 

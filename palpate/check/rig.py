@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
-from palpate_bus.runtime.lockstep import Received, Sent, Stepper
+from palpate_bus.runtime.lockstep import Packet, Sent, Stepper
 from palpate_bus.service import Service
 from palpate_models.scenario import Scenario
 
@@ -117,14 +117,13 @@ class ServiceRig(Rig):
         """Delivers a message, by its bytes as the wire would."""
         self._sequences[topic] += 1
         buffer = self._stepper.buffers[topic]
-        received = Received(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic])
-        buffer.deliver(received)
+        buffer.deliver(Packet(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic]))
 
     def lose(self, role: str) -> None:
         """Marks a role lost."""
         self._stepper.inbox.lost_roles.add(role)
 
     def _take(self, sent: list[Sent]) -> None:
-        for port, payload, sequence in sent:
-            message = codec.decode(payload, port.topic.type)
-            self.log[port.topic.name].append(HeardMessage(self.t, message, sequence, self.t))
+        for port, packet in sent:
+            message = codec.decode(packet.payload, port.topic.type)
+            self.log[port.topic.name].append(HeardMessage(self.t, message, packet.sequence, self.t))

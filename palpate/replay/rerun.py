@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.recordings import RecordedMessage
-from palpate_bus.runtime.lockstep import Received, Stepper
+from palpate_bus.runtime.lockstep import Packet, Stepper
 from palpate_bus.service import Service
 
 
@@ -19,21 +19,21 @@ def rerun(service: Service, rules: Contract, inputs: Iterable[RecordedMessage], 
     """
     stepper = Stepper(service, rules)
     late = {name for name, buffer in stepper.buffers.items() if buffer.edge is Edge.OBSERVE}
-    for port, payload, sequence in stepper.start():
-        yield RecordedMessage(0, port.topic.name, payload, sequence)
+    for port, packet in stepper.start():
+        yield RecordedMessage(0, port.topic.name, packet.payload, packet.sequence)
     source = iter(inputs)
     following = next(source, None)
     held: list[RecordedMessage] = []
     for t in range(0, end + 1, stepper.role.period):
         for message in held:
-            stepper.buffers[message.topic].deliver(Received(message.payload, message.stamp, message.sequence))
+            stepper.buffers[message.topic].deliver(Packet(message.payload, message.stamp, message.sequence))
         held.clear()
         while following is not None and following.stamp <= t:
             if following.topic in late and following.stamp == t:
                 held.append(following)
             else:
-                received = Received(following.payload, following.stamp, following.sequence)
-                stepper.buffers[following.topic].deliver(received)
+                packet = Packet(following.payload, following.stamp, following.sequence)
+                stepper.buffers[following.topic].deliver(packet)
             following = next(source, None)
-        for port, payload, sequence in stepper.step(t):
-            yield RecordedMessage(t, port.topic.name, payload, sequence)
+        for port, packet in stepper.step(t):
+            yield RecordedMessage(t, port.topic.name, packet.payload, packet.sequence)

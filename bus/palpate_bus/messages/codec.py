@@ -31,6 +31,7 @@ __all__ = [
     "Message",
     "decode",
     "decoder",
+    "decodes_to_itself",
     "definition",
     "encode",
     "encoder",
@@ -90,6 +91,22 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
         return message
 
     return decode
+
+
+@cache
+def decodes_to_itself(name: str) -> bool:
+    """Whether a message of this type comes back equal when it is encoded and decoded: it has no arrays and no float32.
+
+    An array may have another type or layout than its field, and its owner may go on writing into it.
+    """
+    for _, (kind, detail) in store.get_msgdef(name).fields:
+        item_kind, item = detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
+        if item_kind == Nodetype.NAME:
+            if not decodes_to_itself(item):
+                return False
+        elif item[0] == "float32" or (kind != item_kind and item[0] != "string"):
+            return False
+    return True
 
 
 def _rosbags_encoder(name: str) -> Callable[[Message], bytes]:

@@ -52,11 +52,11 @@ class Composed:
         """A sentence for each."""
 
     def _send(self, sent: Sequence[Sent], t: int) -> None:
-        self._group.deliver(sent, t)
+        self._group.deliver(sent)
         for tap in self._taps:
             try:
-                for port, payload, sequence in sent:
-                    tap(port.topic, payload, t, sequence)
+                for port, packet in sent:
+                    tap(port.topic, packet.payload, t, packet.sequence)
             except Exception as error:
                 self._taps = tuple(other for other in self._taps if other is not tap)
                 self._leave_out("recorder", t, f"{type(error).__name__}: {error}")

@@ -96,7 +96,7 @@ class LockstepNode(Node):
         seat.tick = t
 
     def _send(self, seat: Seat, sent: Sequence[Sent], t: int) -> None:
-        self._group.deliver(sent, t)
+        self._group.deliver(sent)
         seat.output.send(sent)
 
     def _attend(self, waiting_for: str = "") -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from palpate_bus.contract.conformance import Checker
 from palpate_bus.implementations import OWN
 from palpate_bus.messages.codec import CodecError, Message
-from palpate_bus.runtime.lockstep import InputBuffer, Received
+from palpate_bus.runtime.lockstep import InputBuffer, Packet
 
 
 def described(error: BaseException, buffers: Iterable[InputBuffer]) -> str:
@@ -45,7 +45,7 @@ def invalid_inputs(buffers: Iterable[InputBuffer]) -> list[str]:
     return found
 
 
-def _wrong(buffer: InputBuffer, received: Received) -> str:
+def _wrong(buffer: InputBuffer, received: Packet) -> str:
     try:
         message: Message = received.message or buffer.decode(received.payload)
     except CodecError:

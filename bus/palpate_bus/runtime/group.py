@@ -1,9 +1,10 @@
 """The services of one process, stepped in the contract's order: what one of them sends, the others hear at once.
 
-A message is encoded once, since the run hash covers its bytes, and decoded by the first reader that looks at it. Whoever drives a
-group, `composed` without any transport or `distributed` between others, does so in the same order: by tick, then as the same_tick
-edges of the contract demand among all roles, not only those of the group. So of all the steps that are still to be made anywhere,
-the first in this order has all its inputs, and groups that wait for each other always go on.
+A message is encoded once, since the run hash covers its bytes. Readers get the message itself where decoding would give back its
+equal, and else the first that looks at it decodes it. Whoever drives a group, `composed` without any transport or `distributed`
+between others, does so in the same order: by tick, then as the same_tick edges of the contract demand among all roles, not only
+those of the group. So of all the steps that are still to be made anywhere, the first in this order has all its inputs, and groups
+that wait for each other always go on.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable, Sequence
 from math import gcd, lcm
 
 from palpate_bus.contract import Contract
-from palpate_bus.runtime.lockstep import OutputPort, Received, Sent, Stepper
+from palpate_bus.runtime.lockstep import OutputPort, Packet, Sent, Stepper
 from palpate_bus.service import Service
 
 
@@ -27,7 +28,7 @@ class Group:
         self.steppers = {role: Stepper(by_role[role], rules, strict) for role in order}
         self.period = gcd(*(stepper.role.period for stepper in self.steppers.values()))
         """Simulated time [ns] from one tick of the group to the next."""
-        self._readers: dict[OutputPort, tuple[Callable[[Received], None], ...]] = {
+        self._readers: dict[OutputPort, tuple[Callable[[Packet], None], ...]] = {
             port: tuple(stepper.buffers[name].deliver for stepper in self.steppers.values() if name in stepper.buffers)
             for sender in self.steppers.values()
             for name, port in sender.ports.items()
@@ -48,13 +49,11 @@ class Group:
         """Steps the services of `roles` no more."""
         self._schedule = self._scheduled(roles)
 
-    def deliver(self, sent: Sequence[Sent], t: int) -> None:
-        """Hands what was sent at `t` [ns] to its readers in the group."""
-        for port, payload, sequence in sent:
-            if readers := self._readers[port]:
-                received = Received(payload, t, sequence)
-                for deliver in readers:
-                    deliver(received)
+    def deliver(self, sent: Sequence[Sent]) -> None:
+        """Hands what was sent to its readers in the group."""
+        for port, packet in sent:
+            for deliver in self._readers[port]:
+                deliver(packet)
 
     def digests(self) -> dict[str, str]:
         """Digest of each hashed topic that the group sends."""

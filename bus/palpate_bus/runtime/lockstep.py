@@ -32,16 +32,16 @@ class LockstepError(RuntimeError):
     """The dataflow broke: a gap in a sequence, or a service that does not keep to its contract."""
 
 
-class Received:
-    """A message as bytes, decoded when first looked at."""
+class Packet:
+    """A message as bytes with its stamp [ns] and sequence number, decoded when first looked at unless the message is known."""
 
     __slots__ = ("message", "payload", "sequence", "stamp")
 
-    def __init__(self, payload: bytes, stamp: int, sequence: int) -> None:
+    def __init__(self, payload: bytes, stamp: int, sequence: int, message: Message | None = None) -> None:
         self.payload = payload
         self.stamp = stamp
         self.sequence = sequence
-        self.message: Message | None = None
+        self.message = message
 
 
 class InputBuffer:
@@ -64,12 +64,12 @@ class InputBuffer:
         self.grid = topic.period if topic.periodic else producer_period
         self.decode = codec.decoder(topic.type)
         self.advanced = NEVER
-        self.latest: Received | None = None
-        self.new: list[Received] = []
+        self.latest: Packet | None = None
+        self.new: list[Packet] = []
         self.lost = False
         self._blocks, self._latched, self._periodic = edge.blocking, edge is Edge.LATCHED, topic.periodic
-        self.pending: deque[Received] = deque()
-        self._unstamped: deque[Received] = deque()
+        self.pending: deque[Packet] = deque()
+        self._unstamped: deque[Packet] = deque()
         self._advances: deque[tuple[int, int]] = deque()
         self._last_sequence = 0
 
@@ -93,12 +93,12 @@ class InputBuffer:
         self._last_sequence = sequence
         if self._periodic:
             stamp = (sequence - 1) * self.period
-            self.pending.append(Received(payload, stamp, sequence))
+            self.pending.append(Packet(payload, stamp, sequence))
             self.advanced = stamp
         elif self.topic.latched:
-            self.pending.append(Received(payload, 0, sequence))
+            self.pending.append(Packet(payload, 0, sequence))
         else:
-            self._unstamped.append(Received(payload, NEVER, sequence))
+            self._unstamped.append(Packet(payload, NEVER, sequence))
             self._settle()
 
     def advance(self, tick: int, sequence: int) -> None:
@@ -110,9 +110,9 @@ class InputBuffer:
         while self._advances and self._advances[0][1] <= self._last_sequence:
             tick, sequence = self._advances.popleft()
             while self._unstamped and self._unstamped[0].sequence <= sequence:
-                received = self._unstamped.popleft()
-                received.stamp = tick
-                self.pending.append(received)
+                packet = self._unstamped.popleft()
+                packet.stamp = tick
+                self.pending.append(packet)
             self.advanced = tick
 
     @property
@@ -125,10 +125,10 @@ class InputBuffer:
         """Whether any message has come."""
         return bool(self.pending) or self.latest is not None
 
-    def deliver(self, received: Received) -> None:
+    def deliver(self, packet: Packet) -> None:
         """Takes a message whose stamp is known (composed run, observers)."""
-        self.pending.append(received)
-        self.advanced = received.stamp
+        self.pending.append(packet)
+        self.advanced = packet.stamp
 
     def take(self, t: int) -> None:
         """Moves what the reader may see at `t` into `new` and `latest`."""
@@ -154,20 +154,20 @@ class TickInbox:
         self._blame = blame
         self.lost_roles: set[str] = set()
 
-    def _decode(self, buffer: InputBuffer, received: Received) -> Message:
+    def _decode(self, buffer: InputBuffer, packet: Packet) -> Message:
         start = perf_counter_ns()
-        message = received.message = buffer.decode(received.payload)
+        message = packet.message = buffer.decode(packet.payload)
         self._blame.decode += perf_counter_ns() - start
         return message
 
     def latest(self, topic: str) -> Message | None:
         """The newest message, or None before the first."""
         buffer = self._buffers[topic]
-        received = buffer.latest
-        if received is None:
+        packet = buffer.latest
+        if packet is None:
             return None
-        message = received.message
-        return self._decode(buffer, received) if message is None else message
+        message = packet.message
+        return self._decode(buffer, packet) if message is None else message
 
     def new(self, topic: str) -> list[Message]:
         """The messages since the step before, oldest first."""
@@ -176,7 +176,7 @@ class TickInbox:
             return []
         return [self._decode(buffer, one) if one.message is None else one.message for one in buffer.new]
 
-    def raw(self, topic: str) -> Sequence[Received]:
+    def raw(self, topic: str) -> Sequence[Packet]:
         """The messages since the step before, undecoded."""
         return self._buffers[topic].new
 
@@ -193,7 +193,7 @@ class TickInbox:
 class OutputPort:
     """One topic that a service writes: its sequence and the digest over all that it sent."""
 
-    __slots__ = ("_digest", "encode", "event", "latched", "period", "sequence", "topic")
+    __slots__ = ("_digest", "_exact", "encode", "event", "latched", "period", "sequence", "topic")
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
@@ -201,33 +201,34 @@ class OutputPort:
         self.event = topic.event
         self.latched = topic.latched
         self.encode = codec.encoder(topic.type)
+        self._exact = codec.decodes_to_itself(topic.type)
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
 
-    def pack(self, message: Message) -> Sent:
-        """Encodes and numbers a message."""
+    def pack(self, message: Message, t: int) -> Sent:
+        """Encodes and numbers a message that is sent at `t` [ns]."""
         sequence = self.sequence = self.sequence + 1
-        return self, self.encode(message), sequence
+        return self, Packet(self.encode(message), t, sequence, message if self._exact else None)
 
-    def chain(self, payload: bytes, stamp: int, sequence: int) -> None:
+    def chain(self, packet: Packet) -> None:
         """Takes a sent message into the digest."""
         digest = self._digest
         if digest is None:
             return
-        size = len(payload)
+        size = len(packet.payload)
         if size <= _SMALL:
-            digest.update(_CHAIN.pack(stamp, sequence, size) + payload)
+            digest.update(_CHAIN.pack(packet.stamp, packet.sequence, size) + packet.payload)
         else:
-            digest.update(_CHAIN.pack(stamp, sequence, size))
-            digest.update(payload)
+            digest.update(_CHAIN.pack(packet.stamp, packet.sequence, size))
+            digest.update(packet.payload)
 
     def digest(self) -> str | None:
         """Hexadecimal digest, None for a topic that is not hashed."""
         return None if self._digest is None else self._digest.hexdigest()
 
 
-Sent = tuple[OutputPort, bytes, int]
-"""A message on its way out: port, payload, sequence."""
+Sent = tuple[OutputPort, Packet]
+"""A message on its way out."""
 
 
 class Stepper:
@@ -251,8 +252,8 @@ class Stepper:
             periodic = ()
         self._steady = tuple(port for port in periodic if port.period == self.role.period)
         self._rarer = tuple(port for port in periodic if port.period != self.role.period)
-        self._unchained: list[tuple[int, list[Sent]]] = []
-        """What has been sent, by tick, and is not in the digests yet: many small messages are hashed in one go."""
+        self._unchained: list[list[Sent]] = []
+        """What each part of a step has sent and is not in the digests yet: many small messages are hashed in one go."""
         self._chain_every = max(_CHAIN_NS // self.role.period, 1)
 
     def start(self) -> list[Sent]:
@@ -262,9 +263,9 @@ class Stepper:
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
-            _, payload, sequence = port.pack(message)
-            port.chain(payload, 0, sequence)
-            sent.append((port, payload, sequence))
+            packed = port.pack(message, 0)
+            port.chain(packed[1])
+            sent.append(packed)
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
             raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
@@ -282,7 +283,7 @@ class Stepper:
             stepped = perf_counter_ns()
             sent += self._pack(outbox, t)
             blame.encode += perf_counter_ns() - stepped
-        self._unchained.append((t, sent))
+        self._unchained.append(sent)
         self._close(t)
         blame.compute += perf_counter_ns() - begin - (blame.decode - decoded) - (blame.encode - encoded)
         return sent
@@ -295,7 +296,7 @@ class Stepper:
             stepped = perf_counter_ns()
             blame.compute += stepped - begin - (blame.decode - decoded)
             sent = self._pack(outbox, t)
-            self._unchained.append((t, sent))
+            self._unchained.append(sent)
             blame.encode += perf_counter_ns() - stepped
             yield sent
             begin, decoded = perf_counter_ns(), blame.decode
@@ -328,9 +329,9 @@ class Stepper:
 
     def _chain(self) -> None:
         """Brings the digests up to date."""
-        for t, sent in self._unchained:
-            for port, payload, sequence in sent:
-                port.chain(payload, t, sequence)
+        for sent in self._unchained:
+            for port, packet in sent:
+                port.chain(packet)
         self._unchained.clear()
 
     def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
@@ -339,11 +340,11 @@ class Stepper:
         for name, message in outbox.items():
             port = ports.get(name) or self._port(name)
             if port.event:
-                sent += map(port.pack, message) if isinstance(message, list) else (port.pack(message),)
+                sent += [port.pack(one, t) for one in (message if isinstance(message, list) else (message,))]
             elif t % port.period:
                 raise LockstepError(f"{self.role.name} sent {name} at {t} ns, which is no tick of its period {port.period} ns")
             else:
-                sent.append(port.pack(message))
+                sent.append(port.pack(message, t))
         return sent
 
     def _port(self, name: str) -> OutputPort:

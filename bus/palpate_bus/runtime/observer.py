@@ -14,7 +14,7 @@ import zenoh
 from palpate_bus.contract import Topic
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
-from palpate_bus.runtime.lockstep import NEVER, Received, Stepper
+from palpate_bus.runtime.lockstep import NEVER, Packet, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process_state import whereabouts
 from palpate_bus.service import Service
@@ -97,8 +97,8 @@ class ObservedService:
         period = self.stepper.role.period
         due = self.now - self.now % period
         if busy and due >= 0 and (due > self._stepped or not self.stepper.ports):
-            for port, payload, sequence in self.stepper.step(due):
-                self.publishers[port.topic.name].put(payload, sequence)
+            for port, packet in self.stepper.step(due):
+                self.publishers[port.topic.name].put(packet.payload, packet.sequence)
             self._stepped = due
         return busy
 
@@ -114,9 +114,8 @@ class ObservedService:
                 self.now = max(self.now, (received[-1][0] - 1) * topic.period)
             buffer = self.stepper.buffers[topic.name]
             for sequence, payload, message in received:
-                arrival = Received(payload, (sequence - 1) * topic.period if topic.periodic else max(self.now, 0), sequence)
-                arrival.message = message
-                buffer.deliver(arrival)
+                stamp = (sequence - 1) * topic.period if topic.periodic else max(self.now, 0)
+                buffer.deliver(Packet(payload, stamp, sequence, message))
         return busy
 
     def counters(self) -> dict[str, object]:

@@ -29,15 +29,15 @@ class ServiceOutput:
     def send(self, sent: Sequence[Sent]) -> None:
         """Sends what a part of a step produced."""
         publishers = self._publishers
-        for port, payload, sequence in sent:
-            publishers[port.topic.name].put(payload, sequence)
+        for port, packet in sent:
+            publishers[port.topic.name].put(packet.payload, packet.sequence)
 
     def record(self, sent: Sequence[Sent], t: int) -> None:
         """Passes what a step at `t` [ns] sent on to the recorder, if the run has one."""
         writer = self._writer
         if writer is not None:
-            for port, payload, sequence in sent:
-                writer.add(port.topic.name, payload, t, sequence)
+            for port, packet in sent:
+                writer.add(port.topic.name, packet.payload, packet.stamp, packet.sequence)
             if writer.due(t):
                 self.flush(t)
 

@@ -15,7 +15,7 @@ import numpy as np
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.messages import Advance, codec
 from palpate_bus.runtime.conductor_link import POLL_S
-from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Received, Stepper
+from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Packet, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.wire.transport import ReceivedSample, Sender, Subscription
 
@@ -72,7 +72,7 @@ class RemoteInputs:
         for buffer in self._observed:
             data = self._data[buffer.topic.name]
             while (sample := data.get(0)) is not None:
-                buffer.deliver(Received(sample.payload, t, sample.sequence))
+                buffer.deliver(Packet(sample.payload, t, sample.sequence))
 
     def _await(self, buffer: InputBuffer, t: int, idle: Callable[[str], None]) -> None:
         begin = perf_counter_ns()

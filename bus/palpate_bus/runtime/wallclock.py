@@ -20,7 +20,7 @@ from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
 from palpate_bus.runtime.latency import LatencyHistogram
-from palpate_bus.runtime.lockstep import NEVER, Received, Sent, Stepper
+from palpate_bus.runtime.lockstep import NEVER, Packet, Sent, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.priority import by_period, give_way
@@ -187,16 +187,15 @@ class WallClockNode(Node):
                     self.gaps += sample.sequence - last - 1
                 self._sequences[name] = sample.sequence
                 self._ages[name].add(now - sample.sent)
-                received = Received(sample.payload, t - buffer.delay, sample.sequence)
                 try:
                     # Now, not when the service looks: broken bytes must not end a driver whose arm is in contact.
-                    received.message = buffer.decode(sample.payload)
+                    message = buffer.decode(sample.payload)
                 except CodecError as error:
                     self.undecodable += 1
                     if self.undecodable == 1:
                         log.error("%s: %s; it and its like are dropped and counted", name, error)
                     continue
-                buffer.deliver(received)
+                buffer.deliver(Packet(sample.payload, t - buffer.delay, sample.sequence, message))
 
     def _send(self, seat: Seat, sent: Sequence[Sent], t: int) -> None:
         seat.output.send(sent)

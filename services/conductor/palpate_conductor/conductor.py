@@ -102,8 +102,8 @@ class Conductor:
         """Passes an operator's request on to robot, supervisor and planning; see `palpation_msgs/OperatorRequest`."""
         port = self._observed.stepper.ports["operator/request"]
         t = max(self._observed.now, 0)
-        _, payload, sequence = port.pack(OperatorRequest(header(t), request, reason))
-        self._observed.publishers["operator/request"].put(payload, sequence)
+        _, packet = port.pack(OperatorRequest(header(t), request, reason), t)
+        self._observed.publishers["operator/request"].put(packet.payload, packet.sequence)
 
     def abort(self, reason: str) -> None:
         """Tells every service to stop at once."""
