@@ -42,7 +42,7 @@ class WeighedPatient:
 
     seed: int
     features: Array
-    """Of the candidates, shape (k, f)."""
+    """Features of the candidates, shape (k, f)."""
     real: Array
     """Whether each is a lump of felt contrast FELT or more, shape (k,)."""
     contrast: float

@@ -20,7 +20,7 @@ RADIUS_M = 0.015
 DEPTH_M = 0.010
 THICKNESS_M = 0.12
 PITCH_M = 0.020
-"""Of the elastic tier's finite elements; with half of it the effect of a lump of 20 mm, 10 mm deep, is 3 % greater."""
+"""Spacing of the elastic tier's finite elements; with half of it the effect of a lump of 20 mm, 10 mm deep, is 3 % greater."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from palpate_validation.felt_scans import ScanErrors, felt_samples
 
 LENGTHS_M: Final = (0.015, 0.05, 0.15)
 NATURAL_SD: Final = 0.2
-"""Of the logarithm, between places of one person (docs/persons.md)."""
+"""Standard deviation of the logarithm, between places of one person (docs/persons.md)."""
 LEVEL_N: Final = 2.5
 CONTRASTS: Final = (1.3, 2.0)
 """Felt contrast of the lumps, evenly spread in its logarithm."""

@@ -17,11 +17,11 @@ from palpate_tissue.backends.winkler.tissue import WinklerTissue
 HALF_M = 0.08
 """Half width of the flat wall; with 0.13 m the forces are the same within 0.1 %."""
 EDGE_M = 0.0025
-"""Of its mesh: with half of the default edge the force of so small a sphere is within 1 % of the continuum's from 3 mm on."""
+"""Edge of its mesh: with half of the default the force of so small a sphere is within 1 % of the continuum's from 3 mm on."""
 XY_M = (0.00125, 0.0)
 """Where it is pressed: in the middle of an edge, where the force is within 0.3 % of its mean over the lattice."""
 SPACING_M = 1e-4
-"""Of the depths at which a force is taken."""
+"""Spacing of the depths at which a force is taken."""
 REACH_M = 0.022
 """How deep a curve goes: 20 mm and the largest zero offset."""
 

@@ -41,7 +41,7 @@ COLUMNS = (
     "activated_ratio",
     "tension",
 )
-"""Of `fitted.csv`."""
+"""Columns of `fitted.csv`."""
 
 Simulated = Callable[[float, float], Array]
 """Force over k_w [m^3] at each `SPACING_M`, by wall length [m] and stiffening [1/m]."""

@@ -57,7 +57,7 @@ class Tier:
     figures: dict[str, float]
     """By the names of MARGINS; NaN where it has none."""
     apparent: Array
-    """Of the map [N], shape (n,)."""
+    """Apparent stiffness of the map [N], shape (n,)."""
     scanned: NDArray[np.bool_]
 
 

@@ -1,4 +1,4 @@
-"""An operator's keys: read from a terminal of our own alone, and passed on to the conductor's desk."""
+"""An operator's keys: read from a terminal of our own alone, and passed on to the conductor."""
 
 from __future__ import annotations
 

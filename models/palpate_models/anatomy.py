@@ -68,7 +68,7 @@ class Anatomy(Section):
     dome_m: Annotated[float, Field(ge=-0.03, le=0.08)] = 0.014
     """Fall of the crown line from the umbilicus to both ends of the belly; negative where a slim belly sinks in."""
     exponent: Annotated[float, Field(ge=1.8, le=4)] = 2.4
-    """Of the cross section's superellipse: 2 is an ellipse, more is flatter in front."""
+    """Exponent of the cross section's superellipse: 2 is an ellipse, more is flatter in front."""
     skeleton: Skeleton = Skeleton()
     muscles: Muscles = Muscles()
     variation: Variation = Variation()

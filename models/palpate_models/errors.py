@@ -178,7 +178,7 @@ def table() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
 
 @cache
 def levels() -> dict[str, dict[str, dict[str, float]]]:
-    """Of each level that is in the table, of each section, the fields' values."""
+    """The fields' values by level of the table and by section."""
     return {
         level: {section: {name: row[level] for name, row in rows.items()} for section, rows in table().items()}
         for level in ("typical", "poor")

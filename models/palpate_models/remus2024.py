@@ -34,7 +34,7 @@ class Curve:
     name: str
     """Region and id, such as "R3 P07"."""
     coefficients: Array
-    """Of the polynomial from depth [mm] to force [N], highest power first, shape (n + 1,)."""
+    """Coefficients of the polynomial from depth [mm] to force [N], highest power first, shape (n + 1,)."""
     deepest_m: float
     """Depth to which it was measured."""
 

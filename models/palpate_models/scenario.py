@@ -60,7 +60,7 @@ class Exam(Section):
     """What is examined, and how."""
 
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
+    """Seed of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Annotated[str, AfterValidator(known)] = "lines"
@@ -83,7 +83,7 @@ class Exam(Section):
     centre_m: Vec2 = (0.0, 0.0)
     """Centre of the region in the abdomen frame."""
     budget: SearchBudget = SearchBudget()
-    """Of a search."""
+    """How much a search may take."""
     false_findings: Annotated[float, Field(ge=1e-4, le=0.5)] = 0.02
     """The operating point: how probable a finding may be in a healthy examination. Less of it misses more."""
 
@@ -193,9 +193,9 @@ class Limits(Section):
     joint_margin_rad: Annotated[float, Field(ge=0, le=0.5)] = 0.05
     """Distance that is kept from the ends of each joint's range."""
     speed_mps: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Of the tool in free motion."""
+    """Speed of the tool in free motion."""
     contact_speed_mps: Annotated[float, Field(gt=0, le=0.5)] = 0.25
-    """Of the tool while it presses: at this the supervisor stops."""
+    """Speed of the tool while it presses: at this the supervisor stops."""
     workspace_min_m: Vec3 = (-0.7, -0.6, -0.1)
     """Least x, y, z of the tool in the abdomen frame ..."""
     workspace_max_m: Vec3 = (0.7, 0.6, 1.2)

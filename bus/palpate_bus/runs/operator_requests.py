@@ -20,7 +20,7 @@ WORDS = {
     "end": OperatorRequest.END,
 }
 """What can be asked of the examination, with the request it is passed on as."""
-PACE = ("pause", "resume", "step")
+TIME_REQUESTS = ("pause", "resume", "step")
 """What can be asked of the conductor of a lockstep run: to grant no more time, to grant it again, to grant a little."""
 
 
@@ -34,7 +34,7 @@ def request_key(domain: int) -> str:
 
 
 def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0) -> tuple[str, float]:
-    """Sends a request of `WORDS` or `PACE` to the run on this bus; returns its answer and how long the confirmation took [ms].
+    """Sends a request of `WORDS` or `TIME_REQUESTS` to the run on this bus; returns its answer and how long the confirmation took [ms].
 
     `ms` is for `step`: the simulated time to grant. Raises NotAnswered.
     """

@@ -26,7 +26,7 @@ class HealthyWall(NamedTuple):
     """A person's wall over the wall's mean, at n points."""
 
     stiffness: Array
-    """Of the foundation modulus [1], shape (n,)."""
+    """Factor on the foundation modulus [1], shape (n,)."""
     stiffening: Array
     """Stiffening [1/m], shape (n,)."""
 

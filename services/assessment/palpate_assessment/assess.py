@@ -46,7 +46,7 @@ class AssessedMap:
     """Lower end of its 90 % band [N]."""
     upper: Array
     unassessed: NDArray[np.uint8]
-    """Of `Reason`, shape (n,)."""
+    """Values of `Reason`, shape (n,)."""
     background: float
     """Robust level of the unremarkable wall's apparent stiffness [N]."""
     findings: list[Area]

@@ -40,7 +40,7 @@ FELT = 1.3
 FEATURES = ("strength", "beyond", "log-radius", "softer")
 """What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, sign."""
 ALIKE, HALF = 1.5, 0.5
-"""Of two strokes over a lump that say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
+"""Where two strokes over a lump say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
 bump is so high."""
 SURE = 4.0
 """So many standard deviations below FELT a contrast is surely none: 0 of 35 such candidates of tuning patients were lumps."""

@@ -37,7 +37,7 @@ ILIAC_M, ILIAC_WIDTH_M = (0.135, -0.12), 0.04
 NATURAL_SD, BONE_SD = 0.08, 0.5
 """Prior medians of the amplitudes: of a factor of 0.2 over all lengths from 10 to 150 mm each field's share; of bone."""
 LEVEL_SD = 3.0
-"""Of the patient's own level about the median of his samples."""
+"""Standard deviation of the patient's own level about the median of his samples."""
 BREATHING_S = 1.0
 """How long what following leaves of breathing stays alike."""
 LEAST_DEPTH_ERROR_M = 0.0001

@@ -23,7 +23,7 @@ from palpate_conductor.freezes import FreezeWatch
 from palpate_conductor.grants import Grants
 from palpate_conductor.handover import Places
 from palpate_conductor.heartbeat import Heartbeat
-from palpate_conductor.operator import OperatorDesk
+from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, RunOutcome
 from palpate_conductor.service_health import service_statuses
 from palpate_conductor.timing import Timing
@@ -82,7 +82,7 @@ class Conductor:
         self._contract = ContractWatch(session, rules, domain, timing.wallclock and timing.rate == 1.0)
         collector.diagnose = self._diagnose
         self.grants = Grants(lambda tick, last: self._say(RunControl.GRANT, tick, last), timing)
-        self._desk = OperatorDesk(session, domain, self.request, self.grants.pace)
+        self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace)
         self._started_at = 0.0
         self._complained = False
         self.started_at_perf = 0.0
@@ -171,7 +171,7 @@ class Conductor:
             self.outcome.failure = self.outcome.failure or why
             self.outcome.wall_time_s = monotonic() - self._started_at
             self.abort(why)
-        self._desk.close()
+        self._operator_requests.close()
         self._contract.close()
         self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
         self._observed.drain_and_step()
@@ -249,7 +249,7 @@ class Conductor:
             for role, how in self._places.expired().items():
                 self._lose(role, f"{how}; nobody took its place within {self._places.patience_s:.0f} s")
             self._suspect([*self._member.complaints(), *self._member.suspicions()])
-            self._desk.attend(self._collector.collected.supervisor)
+            self._operator_requests.attend(self._collector.collected.supervisor)
             self._contract.attend()
             self._extend()
             self._watch()

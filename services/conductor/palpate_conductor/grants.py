@@ -12,7 +12,7 @@ from time import monotonic, time_ns
 
 from palpate_bus.contract import MS
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runs.operator_requests import PACE
+from palpate_bus.runs.operator_requests import TIME_REQUESTS
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_conductor.outcome import RunFailed
 from palpate_conductor.timing import Timing
@@ -96,7 +96,7 @@ class Grants:
             self.grant(self.horizon, self.last)
 
     def pace(self, word: str, ms: int) -> str:
-        """Does a word of `desk.PACE` and says what came of it; `ms` of simulated time for `step`.
+        """Carries out one of `TIME_REQUESTS` and says what came of it; `ms` of simulated time for `step`.
 
         Raises ValueError when it cannot be done.
         """
@@ -104,8 +104,8 @@ class Grants:
             raise ValueError("time is the wall's in this run: nothing can hold it")
         if self.last:
             raise ValueError("the run is ending")
-        if word not in PACE:
-            raise ValueError(f"{word}: want one of {', '.join(PACE)}")
+        if word not in TIME_REQUESTS:
+            raise ValueError(f"{word}: want one of {', '.join(TIME_REQUESTS)}")
         if word == "pause":
             self.paused = True
         elif not self.paused:

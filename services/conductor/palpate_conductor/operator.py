@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from palpate_bus.messages import SupervisorState
-from palpate_bus.runs.operator_requests import CONFIRM_S, PACE, WORDS, request_key
+from palpate_bus.runs.operator_requests import CONFIRM_S, TIME_REQUESTS, WORDS, request_key
 
 
 @dataclass
@@ -27,7 +27,7 @@ class _Pending:
     refusals: int
 
 
-class OperatorDesk:
+class OperatorRequestServer:
     """The conductor's side. `attend` it often."""
 
     def __init__(
@@ -35,7 +35,7 @@ class OperatorDesk:
     ) -> None:
         """`send(request, reason)` passes a request on, see `palpation_msgs/OperatorRequest`.
 
-        `pace(word, ms)` does a word of `desk.PACE` and says what came of it, or raises ValueError with why not.
+        `pace(word, ms)` carries out one of `TIME_REQUESTS` and says what came of it, or raises ValueError with why not.
         """
         self._pace = pace
         self._key = request_key(domain)
@@ -62,9 +62,9 @@ class OperatorDesk:
         try:
             asked = json.loads(query.payload.to_bytes())
             word, reason, ms = asked["word"], str(asked["reason"]), int(asked.get("ms", 0))
-            request = None if word in PACE else WORDS[word]
+            request = None if word in TIME_REQUESTS else WORDS[word]
         except (AttributeError, KeyError, TypeError, ValueError):
-            self._reply(query, False, f"no request: want a word out of {', '.join((*WORDS, *PACE))} and a reason", 0.0)
+            self._reply(query, False, f"no request: want a word out of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
             return
         if request is None:
             try:

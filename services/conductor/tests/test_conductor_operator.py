@@ -8,7 +8,7 @@ from typing import Any
 
 from palpate_bus.messages import SupervisorState
 from palpate_bus.messages.stamps import header
-from palpate_conductor.operator import OperatorDesk
+from palpate_conductor.operator import OperatorRequestServer
 
 
 class Query:
@@ -27,7 +27,7 @@ class Query:
 
 
 class Session:
-    """Takes the desk's queryable."""
+    """Takes the server's queryable."""
 
     def declare_queryable(self, key: str, handler: Any) -> Any:
         return SimpleNamespace(undeclare=lambda: None)
@@ -43,13 +43,13 @@ def never(word: str, ms: int) -> str:
 
 def asked(word: str, before: Any, after: Any) -> tuple[bool, str]:
     sent: list[int] = []
-    desk = OperatorDesk(Session(), 0, lambda request, reason: sent.append(request), never)  # type: ignore[arg-type]
+    server = OperatorRequestServer(Session(), 0, lambda request, reason: sent.append(request), never)  # type: ignore[arg-type]
     query = Query(word)
-    desk._asked.put(query)
-    desk.attend(before)
+    server._asked.put(query)
+    server.attend(before)
     assert sent
     assert query.answer is None, "nothing is confirmed by what was there before"
-    desk.attend(after)
+    server.attend(after)
     assert query.answer is not None
     return query.answer["done"], query.answer["words"]
 
@@ -65,9 +65,9 @@ def test_a_refusal_says_why() -> None:
 
 def test_words_about_time_are_answered_by_the_conductor_itself() -> None:
     for pace, answer in ((lambda word, ms: f"{word} {ms}", (True, "step 3")), (never, (False, "time is the wall's"))):
-        desk = OperatorDesk(Session(), 0, lambda request, reason: None, pace)  # type: ignore[arg-type]
+        server = OperatorRequestServer(Session(), 0, lambda request, reason: None, pace)  # type: ignore[arg-type]
         query = Query("step", 3)
-        desk._asked.put(query)
-        desk.attend(None)
+        server._asked.put(query)
+        server.attend(None)
         assert query.answer is not None
         assert (query.answer["done"], query.answer["words"]) == answer

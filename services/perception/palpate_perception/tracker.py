@@ -74,7 +74,7 @@ class Followed:
     sigma: float
     """Standard deviation of the displacement [m]."""
     shift: Array
-    """Of the body since the first look, in A [m], shape (3,)."""
+    """Displacement of the body since the first look, in A [m], shape (3,)."""
 
 
 NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 0.1, np.zeros(3))

@@ -61,7 +61,7 @@ class BreathingMode:
     high: Array
     """... and largest."""
     coefficients: Array
-    """Of the products of Legendre polynomials that `basis` gives."""
+    """Coefficients of the products of Legendre polynomials that `basis` gives."""
 
     def __call__(self, p_A: Array) -> Array:
         """The mode, between 0 and 1, at places in A [m], shape (n, 2 or 3): shape (n,)."""
@@ -90,7 +90,7 @@ class SeenWall:
     r_W: Array
     """Viewing rays of unit z in the camera's frame, shape (n, 3)."""
     camera: Intrinsics
-    """Of the small image."""
+    """Intrinsics of the small image."""
 
     def depth_per_metre(self, camera: Intrinsics, window: tuple[slice, slice]) -> Image:
         """By how much depth changes for a displacement of 1 m, g m, in a window (rows, columns) of another of its images."""

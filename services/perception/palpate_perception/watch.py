@@ -29,7 +29,7 @@ class Watch:
 
     def __init__(self, camera: Intrinsics, X_WA: Array, exam: Exam) -> None:
         self.camera = camera
-        """Of the small image."""
+        """Intrinsics of the small image."""
         self._X_WA, self._exam = X_WA, exam
         X_CA = inverse(camera.X_WC) @ X_WA
         self.window = cloud.window(wall.watched(exam), X_CA, camera.K, camera.shape)

@@ -51,7 +51,7 @@ class ExamPlan:
     skipped: dict[int, str]
     """Reason by target."""
     presses: PressPlanner | None = None
-    """Of the presses that a search asks for; None where there is no search."""
+    """Plans the presses that a search asks for; None where there is no search."""
 
     def poses(self, radius: float, depth: float) -> Array:
         """Poses of the indenter at depth along all strokes, about 5 mm apart, shape (n, 4, 4)."""

@@ -91,7 +91,7 @@ class _Fit(NamedTuple):
     weights: Array
     """(K + S)^-1 y [1/m]."""
     log_probability: float
-    """Of the touches and the roughness, but for a constant."""
+    """Logarithm of the probability of the touches and the roughness, but for a constant."""
 
 
 def _fit(roughness: float, places: Array, heights: Array, variances: Array) -> _Fit:

@@ -40,7 +40,7 @@ class FtSensor:
         self._wander = given.tare_n * self._scale * self._slow.standard_normal(6)
         self._walk = np.zeros(6)
         self._errors: list[Array] = []
-        """Of readings to come, the last one first, shape (6,) each."""
+        """Errors of the readings to come, the last one first, shape (6,) each."""
 
     def read(self, wrench: Sequence[float]) -> list[float]:
         """A reading of the true wrench."""

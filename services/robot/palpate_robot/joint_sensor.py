@@ -52,7 +52,7 @@ class JointSensor:
         self._deviation = np.repeat((given.position_noise_rad, given.velocity_noise_radps), 7)
         self._rng = rng
         self._noise: list[Array] = []
-        """Of measurements to come, the last one first: of a tick's positions, then its velocities."""
+        """Noise of the measurements to come, the last one first: of a tick's positions, then its velocities."""
         self.q: Array
         self.v: Array
         self.q, self.v = _read(self._table, q, np.zeros(7), torque, 0.0)

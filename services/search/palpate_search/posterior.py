@@ -217,7 +217,7 @@ class Posterior:
         joint = np.exp(joint - logsumexp(joint))
         self._weights = joint.sum(axis=1)
         self.probability: Array = joint[:, :-1].sum(axis=0)
-        """Of each hypothesis, shape (h,)."""
+        """Probability of each hypothesis, shape (h,)."""
         self.none = float(joint[:, -1].sum())
         """Probability that there is no lump besides those accepted."""
 

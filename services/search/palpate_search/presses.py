@@ -62,9 +62,9 @@ class Task:
     """What is searched, and how it may be pressed."""
 
     centre: tuple[float, float]
-    """Of the region, in the abdomen frame [m]."""
+    """Centre of the region, in the abdomen frame [m]."""
     size: tuple[float, float]
-    """Of the region along x and y [m]."""
+    """Size of the region along x and y [m]."""
     depth: float = 0.010
     """Usual depth of a press [m]."""
     deepest: float = 0.014
@@ -76,7 +76,7 @@ class Task:
     budget: Budget = Budget(100, 600.0)
     """At the beginning."""
     seed: int = 0
-    """Of what a policy draws."""
+    """Seed of what a policy draws."""
 
     @property
     def shallowest(self) -> float:

@@ -33,14 +33,14 @@ class SearchService(Service):
     role: ClassVar[str] = "search"
 
     def __init__(self, scenario: Scenario) -> None:
-        """Of the examination's view of a scenario. Raises PolicyError for a policy that there is not."""
+        """Starts from the examination's view of a scenario. Raises PolicyError for a policy that there is not."""
         self._posterior = Posterior(Task.of(exam_input(scenario)))
         self._policy = policy(scenario.search.policy)
         self._missed = scenario.search.missed
         self._begin: int | None = None
         """When the first press was asked for [ns]."""
         self._number = 0
-        """Of the latest request."""
+        """Number of the latest request."""
         self._felt: list[Press] = []
         """Samples since that."""
         self._spent_s = 0.0

@@ -21,7 +21,7 @@ from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, Task
 
 LENGTH_M: Final = 0.020
-"""Of the process: the radius of the lumps sought."""
+"""Length scale of the process: the radius of the lumps sought."""
 NOISE: Final = 0.15
 """White noise of an observation, of the process's standard deviation."""
 FIRST: Final = 4
@@ -29,7 +29,7 @@ FIRST: Final = 4
 UCB: Final = 2.0
 """Standard deviations of the upper confidence bound."""
 STRADDLE: Final = 1.96
-"""Of the straddle (Bryan et al. 2005)."""
+"""Weight of the standard deviation in the straddle (Bryan et al. 2005)."""
 LEVEL: Final = 0.5
 """The level sought, between the least and the greatest mean."""
 GARG: Final = 0.5
@@ -38,7 +38,7 @@ LOCALISED: Final = 30
 """Presses after which Yan and Pan's search has localised the lump."""
 
 Acquisition = Callable[[Array, Array, Array], Array]
-"""Of mean and standard deviation at the places, shape (p,) each, and of what was felt, shape (n,)."""
+"""A function of mean and standard deviation at the places, shape (p,) each, and of what was felt, shape (n,)."""
 
 
 def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:

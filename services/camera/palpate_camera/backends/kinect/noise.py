@@ -58,7 +58,7 @@ class _Statistics:
     u: NDArray[np.int32]
     v: NDArray[np.int32]
     axial: Vector
-    """Of every pixel of the image, flat: the noise is that of the surface which a jittered ray meets."""
+    """One value for every pixel of the image, flat: the noise is that of the surface which a jittered ray meets."""
     lateral: Vector
     grazing: NDArray[np.intp]
     """Indices into the n at which loss is possible."""

@@ -26,7 +26,7 @@ from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
 from palpate_tissue.near import Near, VertexSearch
 
 SWEEPS: Final = 3
-"""Of over-relaxation in a step near the sphere."""
+"""Sweeps of over-relaxation in a step near the sphere."""
 FAR_SWEEPS: Final = 20
 """The same in a step of the others, at most."""
 REACHED: Final = 1.5

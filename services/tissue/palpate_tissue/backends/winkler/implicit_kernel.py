@@ -39,7 +39,7 @@ class ImplicitWall(NamedTuple):
     clock: NDArray[np.int64]
     """To which step each vertex has come, shape (n,); those near the sphere are at the newest."""
     table: Array
-    """Of each vertex the columns `DRAG` to `TENSION`, shape (n, 6)."""
+    """The columns `DRAG` to `TENSION` of each vertex, shape (n, 6)."""
     indptr: NDArray[np.uint32]
     indices: NDArray[np.uint32]
     K: Array
@@ -61,7 +61,7 @@ class ImplicitPatch(NamedTuple):
     within: NDArray[np.intp]
     """Where in `near` those stand that might be held, shape (m,)."""
     table: Array
-    """Of these outward normal (three), place at rest [m] (three), and share of the breathing excursion, shape (m, 7)."""
+    """Their outward normal (three), place at rest [m] (three), and share of the breathing excursion, shape (m, 7)."""
     f: Array
     """Their contact forces along the inward normals after the step [N], shape (m,). Changed in place."""
     room: Array

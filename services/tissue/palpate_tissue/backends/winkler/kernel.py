@@ -59,7 +59,7 @@ class Patch(NamedTuple):
     vertex: NDArray[np.uint32]
     """Which vertices, shape (m,)."""
     table: Array
-    """Of each the columns `_N`, `_X`, `_BETA` and `_GAIN`, shape (m, 8)."""
+    """Their columns `_N`, `_X`, `_BETA` and `_GAIN`, shape (m, 8)."""
     f: Array
     """Their contact forces along the inward normals after the step [N], shape (m,). Changed in place."""
 

@@ -44,9 +44,9 @@ class Course(NamedTuple):
     """What every press does."""
 
     radius: float
-    """Of the sphere [m]."""
+    """Radius of the sphere [m]."""
     ends: Array
-    """Of the steps [s], shape (n,)."""
+    """Lengths of the steps [s], shape (n,)."""
     depths: Array
     """How deep the sphere is then [m], shape (n,)."""
     prony: Array
