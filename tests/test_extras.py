@@ -84,7 +84,7 @@ DISTRIBUTION = {
     "zenoh": "eclipse-zenoh",
 }
 """Distributions whose name is not that of what is imported."""
-OPTIONAL = {"atheris", "zenoh_ros2_sdk"}
+OPTIONAL = {"zenoh_ros2_sdk"}
 """Looked for with find_spec before they are imported: a fuzzer and a client to compare with, in no extra."""
 WHEN_ASKED_FOR = {"playwright": "picture", "palpate_robot.plant.Plant": "robot"}
 """Imported by one function alone, which only those call who have the extra that is named here."""

@@ -1,20 +1,17 @@
 """What a message costs on its way, ours and others' side by side in one run, between this process and another.
 
 Round trips of a joint state (300 B) and one way of a depth image (640 x 480 floats) at 200 Hz, written and read, with the session
-settings of a run: raw zenoh, ours (`Publisher`, `Subscription`), ours over a secure router, and whole messages, encoding and
-decoding included, through a router: ours against PyPI's zenoh-ros2-sdk, where that is installed.
+settings of a run: raw zenoh, ours (`Publisher`, `Subscription`), and ours over a secure router.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from statistics import quantiles
@@ -32,7 +29,7 @@ from palpate_bus.security.keys import init
 from palpate_bus.settings import Settings
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.transport import Publisher, Subscription
-from palpate_bus.wire.zenoh_config import BusOptions, close_session, free_port, mesh, open_session, session
+from palpate_bus.wire.zenoh_config import BusOptions, free_port, mesh, session
 
 ROUNDS = 1500
 REPEATS = 3
@@ -193,8 +190,6 @@ def measure() -> dict[str, float]:
     found["300B_ours_over_raw"] = found["300B_round_trip_ours_p50_us"] / found["300B_round_trip_raw_p50_us"]
     found["300B_secure_over_ours"] = found["300B_round_trip_secure_p50_us"] / found["300B_round_trip_ours_p50_us"]
     found["image_ours_over_raw"] = found["image_one_way_ours_p50_us"] / found["image_one_way_raw_p50_us"]
-    if find_spec("zenoh_ros2_sdk") is not None:
-        found |= _against_sdk()
     return found
 
 
@@ -209,149 +204,10 @@ def _secure() -> list[float]:
         return _round_trips(*stack.enter_context(_pair(here, there, "ours")))
 
 
-# -- whole messages through a router: ours against zenoh-ros2-sdk
-
-
-def _joint_state(t: int) -> Any:
+def _joint_state(t: int) -> JointState:
     values = np.arange(7, dtype=np.float64)
     return JointState(header(t), [f"lbr_A{i}" for i in range(1, 8)], values, values, values)
 
 
-def _against_sdk() -> dict[str, float]:
-    """Round trips of whole joint states, encoding and decoding at both ends, over one router."""
-    figures: dict[str, float] = {}
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="palpate-bench-")))
-        _write_definitions(folder)
-        port = free_port()
-        router = open_session(BusOptions(mode="router", listen=(f"tcp/127.0.0.1:{port}",)))
-        stack.callback(close_session, router)
-        sides = ("sdk", "message")
-        runs: dict[str, list[dict[str, float]]] = {side: [] for side in sides}
-        for _ in range(REPEATS):
-            for side in sides:
-                runs[side].append(_figures(f"joint_state_round_trip_by_router_{side}", _messages(side, port, folder)))
-        for side in sides:
-            figures |= _best(runs[side])
-    sdk, ours = (figures[f"joint_state_round_trip_by_router_{side}_p50_us"] for side in ("sdk", "message"))
-    return {**figures, "message_over_sdk": ours / sdk}
-
-
-def _messages(side: str, port: int, folder: Path) -> list[float]:
-    words = [sys.executable, "-m", "palpate_benchmarks.wire", side]
-    pong = subprocess.Popen([*words, "pong", str(port), str(folder)])
-    try:
-        ping = subprocess.run([*words, "ping", str(port), str(folder)], capture_output=True, text=True, timeout=180, check=True)
-    finally:
-        pong.kill()
-        pong.wait()
-    times: list[float] = json.loads(ping.stdout.strip().splitlines()[-1])
-    return times
-
-
-def _sdk_end(port: int, folder: Path, out: str, back: str, hear: Callable[[Any], None]) -> Callable[[], None]:
-    """Joint states by the other client: `hear` is called in its thread for each on `back`; returns what sends one on `out`."""
-    from zenoh_ros2_sdk import (  # noqa: PLC0415  (optional)
-        ROS2Publisher,
-        ROS2Subscriber,
-        ZenohSession,
-        get_message_class,
-        get_registry,
-    )
-
-    where = {"domain_id": 0, "router_port": port}
-    ZenohSession.get_instance("127.0.0.1", port)
-    get_registry(str(folder))
-    kept = ROS2Subscriber(f"/{back}", TYPE, hear, **where)
-    publisher = ROS2Publisher(f"/{out}", TYPE, **where)
-    values = np.arange(7, dtype=np.float64)
-    fields = {
-        "header": get_message_class("std_msgs/msg/Header")(get_message_class("builtin_interfaces/msg/Time")(0, 0), ""),
-        "name": [f"lbr_A{i}" for i in range(1, 8)],
-        **dict.fromkeys(("position", "velocity", "effort"), values),
-    }
-
-    def send(_kept: object = kept) -> None:  # a subscriber that is let go ends
-        publisher.publish(**fields)
-
-    return send
-
-
-def _message_end(port: int, out: str, back: str) -> tuple[Callable[[], None], Callable[[float], Any]]:
-    """Joint states by our own means: what sends one on `out`, and what takes one from `back`, decoded, None for none in time."""
-    opened = open_session(BusOptions(mode="client", router=f"tcp/127.0.0.1:{port}"))
-    row = contract().topics[OUT]
-    keys = [topic_key(row.model_copy(update={"name": name}), 0) for name in (out, back)]
-    subscription = Subscription(opened, keys[1])
-    publisher = Publisher(opened, keys[0], contract().qos["control"], GID)
-    encode, decode, message = codec.encoder(TYPE), codec.decoder(TYPE), _joint_state(0)
-    sequence = 0
-
-    def send() -> None:
-        nonlocal sequence
-        sequence += 1
-        publisher.put(encode(message), sequence)
-
-    def receive(timeout: float) -> Any:
-        sample = subscription.get(timeout)
-        return None if sample is None else decode(sample.payload)
-
-    return send, receive
-
-
-def _pong(side: str, port: int, folder: Path) -> None:
-    """Answers each joint state with one, each side in the way that it offers."""
-    if side == "sdk":
-        answer: list[Callable[[], None]] = []
-        answer.append(_sdk_end(port, folder, "bench/back", "bench/out", lambda _: answer[0]() if answer else None))
-        sleep(120)
-        return
-    send, receive = _message_end(port, "bench/back", "bench/out")
-    end = monotonic() + 120
-    while monotonic() < end:
-        if receive(1.0) is not None:
-            send()
-
-
-def _ping(side: str, port: int, folder: Path) -> list[float]:
-    """Round trips [us]."""
-    receive: Callable[[float], Any]
-    if side == "sdk":
-        came: SimpleQueue[Any] = SimpleQueue()
-        send = _sdk_end(port, folder, "bench/out", "bench/back", came.put)
-
-        def receive(timeout: float) -> Any:
-            try:
-                return came.get(timeout=timeout)
-            except Empty:
-                return None
-    else:
-        send, receive = _message_end(port, "bench/out", "bench/back")
-    _open_way(lambda _: send(), receive)
-    times = []
-    for _ in range(ROUNDS):
-        start = perf_counter_ns()
-        send()
-        if receive(5.0) is not None:
-            times.append((perf_counter_ns() - start) / 1e3)
-    return times
-
-
-def _write_definitions(folder: Path) -> None:
-    """The .msg files that the other client would clone."""
-    for file, text in codec.interface_files(TYPE).items():
-        path = folder / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-
-
 if __name__ == "__main__":
-    if len(sys.argv) == 2:
-        echo(BusOptions.from_settings(Settings.read()), sys.argv[1])
-    else:
-        chosen, place, folder = sys.argv[1], int(sys.argv[3]), Path(sys.argv[4])
-        if sys.argv[2] == "pong":
-            _pong(chosen, place, folder)
-        else:
-            print(json.dumps(_ping(chosen, place, folder)), flush=True)
-        os._exit(0)
+    echo(BusOptions.from_settings(Settings.read()), sys.argv[1])

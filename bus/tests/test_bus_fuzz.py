@@ -2,19 +2,13 @@
 
 import math
 import random
-import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from palpate.command_line import EXIT_BAD_INPUT
 from palpate.fuzz.bus_targets import Broken, FuzzTarget
-from palpate.fuzz.command import fuzz
-from palpate.fuzz.fuzz import Find, all_targets, attempt, campaign, choose, guided, mutate
+from palpate.fuzz.fuzz import all_targets, attempt, campaign, choose, mutate
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
 from palpate_models.load import ScenarioError, load_scenario
@@ -39,27 +33,6 @@ def test_a_broken_target_is_found() -> None:
     done = campaign([FuzzTarget("long", check, lambda _: [b"12345678"])], 500)
     assert [find.error for find in done.finds] == ["Broken: too long"]
     assert len(done.finds[0].data) > 8
-
-
-def test_without_atheris_a_guided_campaign_is_no_find(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate.fuzz.command.find_spec", lambda _: None)
-    app = typer.Typer()
-    app.command()(fuzz)
-    called = CliRunner().invoke(app, ["attachment", "--coverage"])
-    assert called.exit_code == EXIT_BAD_INPUT
-    assert "pip install atheris" in called.output
-
-
-def test_what_a_guided_campaign_finds_comes_with_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fuzzer(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-        (prefix,) = (word.partition("=")[2] for word in command if word.startswith("-artifact_prefix="))
-        assert [path.read_bytes() for path in Path(command[-1]).iterdir()] == [b"seed"]
-        Path(f"{prefix}crash-1").write_bytes(b"\x01\x02")
-        return subprocess.CompletedProcess(command, 77, "", " === Uncaught Python exception: ===\nIndexError: [2]\nTraceback")
-
-    monkeypatch.setattr(subprocess, "run", fuzzer)
-    found = guided(FuzzTarget("mine", lambda _: None, lambda _: [b"seed"]), 10, 0)
-    assert found == Find("mine", b"\x01\x02", "IndexError: [2]")
 
 
 def test_choosing_targets() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Annotated
 
 import typer
@@ -14,22 +13,18 @@ from palpate.command_line import EXIT_FAILED, refuse
 
 def fuzz(
     names: Annotated[list[str] | None, typer.Argument(help="Targets or patterns, e.g. 'codec:*'; all by default.")] = None,
-    inputs: Annotated[int, typer.Option(min=1, help="Inputs in all; with --coverage for each target.")] = 100_000,
+    inputs: Annotated[int, typer.Option(min=1, help="Inputs in all.")] = 100_000,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same inputs.")] = 0,
-    coverage: Annotated[bool, typer.Option("--coverage", help="Guided by coverage, with atheris.")] = False,
 ) -> None:
     """Feed broken bytes to all that reads from the bus, and see that each is refused as it should be."""
-    from palpate.fuzz.fuzz import campaign, choose, guided_campaign
+    from palpate.fuzz.fuzz import campaign, choose
 
     console = Console(stderr=True)
     try:
         chosen = choose(names or [])
     except ValueError as error:
         refuse(error)
-    if coverage and find_spec("atheris") is None:
-        refuse("--coverage wants atheris, which is not installed: pip install atheris")
-    conduct = guided_campaign if coverage else campaign
-    done = conduct(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
+    done = campaign(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
     for find in done.finds:
         console.print(f"[red]{find.target}[/] {escape(find.error)}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
     rate = sum(done.inputs.values()) / done.seconds

@@ -1,7 +1,6 @@
 """Fuzzing of everything that takes bytes or words from others.
 
-    palpate fuzz --inputs 1000000            mutations of valid inputs, shared out among the targets; same seed, same inputs
-    palpate fuzz --inputs 100000 --coverage  guided by coverage, with Google's atheris (`pip install atheris`)
+    palpate fuzz --inputs 1000000     mutations of valid inputs, shared out among the targets; same seed, same inputs
 
 A find is printed with its input in hexadecimal and the exception; it belongs into a test, and then it is fixed.
 """
@@ -9,14 +8,9 @@ A find is printed with its input in hexadecimal and the exception; it belongs in
 from __future__ import annotations
 
 import random
-import re
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter, thread_time
 
 from palpate.fuzz import bus_targets, scenario_targets
@@ -126,39 +120,6 @@ def campaign(
 def all_targets() -> list[FuzzTarget]:
     """The readers of the bus and of scenarios."""
     return [*bus_targets.targets(), *scenario_targets.targets()]
-
-
-def guided(target: FuzzTarget, inputs: int, seed: int) -> Find | None:
-    """Fuzzes one target in a process of its own with atheris, from its valid inputs on; returns its first find, if any."""
-    with TemporaryDirectory(prefix="palpate-fuzz-") as scratch:
-        corpus, broken = Path(scratch, "corpus"), Path(scratch, "broken")
-        corpus.mkdir()
-        broken.mkdir()
-        for number, data in enumerate(target.seeds(random.Random(f"{seed} {target.name}"))):
-            (corpus / str(number)).write_bytes(data)
-        options = [f"-runs={inputs}", f"-seed={seed + 1}", "-max_len=4096", f"-artifact_prefix={broken}/", str(corpus)]
-        command = [sys.executable, "-m", "palpate.fuzz.guided", target.name, *options]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
-        if not done.returncode:
-            return None
-        data = b"".join(path.read_bytes() for path in sorted(broken.iterdir())[:1])
-        said = done.stderr + done.stdout
-        error = re.search(r"^ *=== Uncaught Python exception: ===\n(.*)$", said, re.MULTILINE)
-        return Find(target.name, data, error[1] if error else said.strip()[-500:])
-
-
-def guided_campaign(chosen: Sequence[FuzzTarget], inputs: int, seed: int, tell: Callable[[str], None]) -> FuzzCampaign:
-    """Up to `inputs` for each target; one ends with its first find."""
-    done = FuzzCampaign(seed)
-    begin = perf_counter()
-    for target in chosen:
-        find = guided(target, inputs, seed)
-        if find is not None:
-            done.finds.append(find)
-        done.inputs[target.name] = inputs
-        tell(f"{target.name}: up to {inputs} inputs, {'nothing' if find is None else 'a find'}")
-    done.seconds = perf_counter() - begin
-    return done
 
 
 def choose(patterns: Sequence[str]) -> list[FuzzTarget]:

@@ -34,7 +34,7 @@ def request_key(domain: int) -> str:
 
 
 def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0) -> tuple[str, float]:
-    """Sends a request of `WORDS` or `TIME_REQUESTS` to the run on this bus; returns its answer and how long the confirmation took [ms].
+    """Sends a request of `WORDS` or `TIME_REQUESTS` to the run on this bus; returns its answer, and when it was confirmed [ms].
 
     `ms` is for `step`: the simulated time to grant. Raises NotAnswered.
     """

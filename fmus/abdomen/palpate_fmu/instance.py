@@ -297,31 +297,6 @@ class FmuInstance:
         if status > 1:
             self._check(status, f"step from {t_s:g} s by {dt_s:g} s")
 
-    def save(self) -> bytes:
-        """The state of the FMU, serialised."""
-        fmu = self._fmu
-        if self.version == 2:
-            state = fmu.getFMUstate()
-            saved = bytes(fmu.serializeFMUstate(state))
-            fmu.freeFMUstate(state)
-        else:
-            state = fmu.getFMUState()
-            saved = bytes(fmu.serializeFMUState(state))
-            fmu.freeFMUState(state)
-        return saved
-
-    def restore(self, saved: bytes) -> None:
-        """Back to a state that `save` gave."""
-        fmu = self._fmu
-        if self.version == 2:
-            state = fmu.deSerializeFMUstate(saved)
-            fmu.setFMUstate(state)
-            fmu.freeFMUstate(state)
-        else:
-            state = fmu.deserializeFMUState(saved)
-            fmu.setFMUState(state)
-            fmu.freeFMUState(state)
-
     def close(self) -> None:
         """Frees the instance, its library and its unpacked files."""
         if self._fmu is not None:

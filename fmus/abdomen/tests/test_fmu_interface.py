@@ -174,14 +174,40 @@ def test_parameters_that_disagree_are_refused(fmu: Path) -> None:
         FmuInstance(fmu, values={"dashpot": 1e-4})
 
 
+def save(instance: FmuInstance) -> bytes:
+    """The state of the FMU, serialised, by FMPy's names of FMI 2.0 and 3.0."""
+    fmu = instance._fmu
+    get, serialize, free = (
+        ("getFMUstate", "serializeFMUstate", "freeFMUstate")
+        if instance.version == 2
+        else ("getFMUState", "serializeFMUState", "freeFMUState")
+    )
+    state = getattr(fmu, get)()
+    saved = bytes(getattr(fmu, serialize)(state))
+    getattr(fmu, free)(state)
+    return saved
+
+
+def restore(instance: FmuInstance, saved: bytes) -> None:
+    fmu = instance._fmu
+    deserialize, set_state, free = (
+        ("deSerializeFMUstate", "setFMUstate", "freeFMUstate")
+        if instance.version == 2
+        else ("deserializeFMUState", "setFMUState", "freeFMUState")
+    )
+    state = getattr(fmu, deserialize)(saved)
+    getattr(fmu, set_state)(state)
+    getattr(fmu, free)(state)
+
+
 def test_a_state_can_be_saved_and_loaded_even_by_another_instance(fmu: Path) -> None:
     with FmuInstance(fmu, values={"friction": 0.5}) as one, FmuInstance(fmu) as other:
         press(one)
-        saved = one.save()
+        saved = save(one)
         ahead = press(one, 200, 300)
-        one.restore(saved)
+        restore(one, saved)
         np.testing.assert_array_equal(press(one, 200, 300), ahead)
-        other.restore(saved)
+        restore(other, saved)
         assert other.get("friction") == 0.5
         np.testing.assert_array_equal(press(other, 200, 300), ahead)
 

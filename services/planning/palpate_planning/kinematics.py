@@ -64,10 +64,6 @@ class ArmKinematics:
         J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
 
-    def within_limits(self, q: Array) -> bool:
-        """Whether q keeps the joint margin."""
-        return bool(np.all(np.abs(q) <= self.upper))
-
     def solve(
         self,
         X_WI: Array,

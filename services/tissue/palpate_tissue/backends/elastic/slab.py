@@ -10,11 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import brentq
 
 from palpate_models.breathing import STILL, BreathingCurve
 from palpate_models.frames import Array
@@ -34,19 +32,6 @@ def hertz_force(young_pa: float, poisson: float, radius_m: float, depth_m: float
     4/3 E / (1 - nu^2) sqrt(R) d^(3/2).
     """
     return float(4 / 3 * young_pa / (1 - poisson**2) * math.sqrt(radius_m) * depth_m**1.5)
-
-
-def sphere_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:
-    """Force [N] on a true sphere at depth d in a half-space (Sneddon 1965): Hertz's, less 2 % at d = R/5 and less 6 % at 2R/3.
-
-    d = a/2 ln((R + a)/(R - a)),  F = E / (1 - nu^2) [(a^2 + R^2)/2 ln((R + a)/(R - a)) - a R].
-    """
-
-    def depth(a: float) -> float:
-        return 0.5 * a * math.log((radius_m + a) / (radius_m - a))
-
-    a = float(brentq(lambda a: depth(a) - depth_m, 0.0, radius_m * (1 - 1e-12), xtol=1e-12))
-    return young_pa / (1 - poisson**2) * (0.5 * (a**2 + radius_m**2) * math.log((radius_m + a) / (radius_m - a)) - a * radius_m)
 
 
 @dataclass(frozen=True)
@@ -116,11 +101,6 @@ class FlatSlab:
             displacement[free] = self._matrix[:, near] @ force[free[near]]
         area = float(self.model.areas[force > 0].sum())
         return PressedSlab(float(force.sum()), displacement, force, math.sqrt(area / math.pi))
-
-    @cached_property
-    def border_m(self) -> float:
-        """How far from the origin the slab can be touched."""
-        return float(np.abs(self.vertices[self.compliance.free, :2]).max(axis=0).min())
 
     def tissue(self, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3) -> ElasticTissue:
         """The same slab as a tissue that steps in time: `tissue.step(t_s, p_A, v_A, radius)` gives force and torque."""
