@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.messages.arrays import array_dtype, fitted
 from palpate_bus.messages.cdr import ENCAPSULATION
-from palpate_bus.messages.struct_codecs import STRUCT_CODECS
+from palpate_bus.messages.struct_codecs import STRUCT_CODECS, fitted
 from palpate_bus.messages.typestore import (
     CodecError,
+    array_dtype,
     definition,
     interface_files,
     message_type,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from struct import Struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,6 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
 )
-from palpate_bus.messages.arrays import fitted
 from palpate_bus.messages.cdr import LENGTH, StructCodec, pack_header, pack_text, padding, read_characters, read_header, read_text
 
 _FLOAT64 = np.dtype(np.float64)
@@ -37,6 +37,25 @@ _WRENCH = Struct("<6d")  # force, torque
 _TOOL = Struct("<3d4d6dd")  # position, orientation, twist, radius
 _COMMAND = Struct("<56siII")  # torques, seconds and nanoseconds of valid_for, length of problem with its NUL
 _JOINTS = {gap: Struct(f"<I{gap}x56sI4x56sI4x56s") for gap in (0, 4)}  # position, velocity, effort of seven joints
+
+
+def fitted(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDArray[Any]:
+    """`value` as a contiguous array of `dtype`, shape (length,), or of any length where that is None.
+
+    Raises ValueError that names the field if the shape is another, or if numbers would lose their meaning (text, complex numbers,
+    fractions for an integer field).
+    """
+    array: NDArray[Any]
+    if value.__class__ is np.ndarray and value.dtype == dtype and value.flags.c_contiguous:
+        array = value
+    else:
+        array = np.asarray(value)
+        if not (np.can_cast(array.dtype, dtype, "same_kind") or array.size == 0):
+            raise ValueError(f"{field}: has {array.dtype}, wants {dtype}")
+        array = np.ascontiguousarray(array, dtype) if array.ndim else array
+    if array.ndim != 1 or (length is not None and array.size != length):
+        raise ValueError(f"{field}: has shape {array.shape}, wants ({'n' if length is None else length},)")
+    return array
 
 
 def encode_wrench_stamped(message: WrenchStamped) -> bytes:

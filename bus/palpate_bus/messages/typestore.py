@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 
@@ -77,3 +78,8 @@ def type_hash(name: str) -> str:
     """The RIHS01 hash of a message type, `RIHS01_<64 hex digits>`, which rmw_zenoh puts into the key."""
     message_type(name)
     return str(store.hash_rihs01(name))
+
+
+def array_dtype(base: str) -> np.dtype[Any]:
+    """The type of an array of a ROS base type: ROS's char is an unsigned byte."""
+    return np.dtype("uint8" if base == "char" else base)

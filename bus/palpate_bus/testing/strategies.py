@@ -9,8 +9,8 @@ import numpy as np
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.messages.arrays import array_dtype
 from palpate_bus.messages.codec import message_type, store
+from palpate_bus.messages.typestore import array_dtype
 
 LONGEST = 4
 """Items in a sequence, at most."""
