@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import rerun.blueprint as rrb
@@ -56,13 +57,25 @@ def _map(layer: str, name: str, region_m: tuple[float, float], centre_m: tuple[f
     )
 
 
-def _plot(name: str, origin: str, low: float, high: float, hidden: str | None = None) -> Any:
+PAST_S, LEGEND_S = 60.0, 35.0
+"""How much of the past a curve shows [s], and the room to its right [s], where the legend stands beside the traces."""
+
+
+def _plot(name: str, origin: str, bounds: tuple[float, float] | None = None, hidden: Sequence[str] = ()) -> Any:
+    """The curves below `origin` over the last minute, without those that are `hidden` at first.
+
+    Without `bounds` the axis fits the data.
+    """
+    window = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-PAST_S), end=rrb.TimeRangeBoundary.cursor_relative(seconds=LEGEND_S)
+    )
     return rrb.TimeSeriesView(
         name=name,
         origin=origin,
-        axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        overrides={} if hidden is None else {hidden: _HIDDEN},
+        axis_x=rrb.TimeAxis(view_range=window),
+        axis_y=None if bounds is None else rrb.ScalarAxis(range=bounds, zoom_lock=False),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+        overrides={f"{origin}/{name}": _HIDDEN for name in hidden},
     )
 
 
@@ -80,10 +93,8 @@ def _force_depth(bounds: Bounds) -> Any:
     )
 
 
-def blueprint(
-    region_m: tuple[float, float], centre_m: tuple[float, float], depth_m: float, force_limit_n: float, plane: Bounds
-) -> Any:
-    """The layout for an exam of `region_m` about `centre_m` at `depth_m`, with its working limit.
+def blueprint(region_m: tuple[float, float], centre_m: tuple[float, float], depth_m: float, plane: Bounds) -> Any:
+    """The layout for an exam of `region_m` about `centre_m` at `depth_m`.
 
     `plane`: what of the force-depth plane is shown.
     """
@@ -110,15 +121,15 @@ def blueprint(
             rrb.TextDocumentView(name="TRUTH", origin="/text/truth"),
         ),
         rrb.StateTimelineView(name="Phase and driver", origin="/state"),
-        _plot("Normal force [N]", "/plots/force", -1.0, 1.1 * force_limit_n, "/plots/force/true"),
-        _plot("Depth [mm]", "/plots/depth", -5.0, 1.8e3 * depth_m, "/plots/depth/true"),
+        _plot("Normal force [N]", "/plots/force", hidden=("true", "limit")),
+        _plot("Depth [mm]", "/plots/depth", (-2.0, 1.4e3 * depth_m), hidden=("true",)),
         rrb.Tabs(
-            _plot("Joint torque [% of limit]", "/plots/torque", -60.0, 60.0),
-            _plot("Real-time factor [1]", "/plots/pace", 0.0, 4.0),
-            _plot("Blame [%]", "/plots/blame", 0.0, 100.0),
-            _plot("Progress [%]", "/plots/progress", 0.0, 100.0),
-            _plot("Wall [mm]", "/plots/wall", -2.0, 30.0),
-            _plot("TRUTH: patient [mm]", "/plots/truth", -2.0, 30.0),
+            _plot("Joint torque [% of limit]", "/plots/torque"),
+            _plot("Real-time factor [1]", "/plots/speed"),
+            _plot("Waited for [%]", "/plots/waits", (0.0, 100.0)),
+            _plot("Progress [%]", "/plots/progress", (0.0, 100.0)),
+            _plot("Wall [mm]", "/plots/wall"),
+            _plot("TRUTH: patient [mm]", "/plots/truth"),
         ),
         row_shares=[1.6, 0.85, 1.2, 1.2, 1.2],
     )

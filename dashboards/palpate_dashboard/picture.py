@@ -1,14 +1,16 @@
-"""A picture of the dashboard at a moment of a recorded run, by a headless browser: the one in the README is made so.
+"""A picture or a film of the dashboard of a recorded run, by a headless browser: those in the README are made with it.
 
 palpate dashboard DIR --picture docs/images/dashboard.png --at 105
+palpate dashboard DIR --film docs/images/examination.gif
 """
 
 from __future__ import annotations
 
 import io
 import shutil
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,10 @@ SETTLED = 0.001
 DRAWN = 3_000
 """Colours of a page on which the scene is drawn; before that it has some hundreds to two thousand."""
 COLOURS = 256
+BAR_PX = 36
+"""Height of the viewer's own top bar, which is left out: it says what machine the picture was made on."""
+FRAMES, FRAME_S, LAST_S, FILM_PX = 28, 0.4, 3.0, (960, 578)
+"""Frames of a film, how long each of them and the last are shown [s], and their size."""
 
 Page = Any
 Pixels = NDArray[np.uint8]
@@ -62,32 +68,62 @@ def page_at(port: int, width: int, height: int) -> Iterator[Page]:
 
 
 def look(page: Page) -> Pixels:
-    """What the page shows a few seconds from now, shape (height, width, 3)."""
+    """What the page shows below its bar a few seconds from now, shape (height - BAR_PX, width, 3)."""
     page.wait_for_timeout(1000 * LOOK_S)
-    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[BAR_PX:]
 
 
-def take(folder: Path, target: Path, at_s: float, port: int, width: int, height: int, tell: Callable[[str], None]) -> None:
-    """Writes the dashboard at `at_s` [s] of the run in `folder` to the PNG file `target`.
+@contextmanager
+def _shown(folder: Path, port: int, size: tuple[int, int]) -> Iterator[tuple[DashboardService, Callable[[], Page]]]:
+    """The dashboard of a recorded run with nothing drawn yet, and what opens its page. Raises NoPicture and OSError."""
+    if not recording_of(folder):
+        raise NoPicture(f"{folder}: no recording there; give the folder of a run that was recorded")
+    service = DashboardService(load_scenario(str(folder / "scenario.yaml")), None, Live(serve_port=port), paced=False)
+    with ExitStack() as stack:
+        stack.callback(service.finish)
+        yield service, lambda: stack.enter_context(page_at(port, *size))
+
+
+def take(folder: Path, target: Path, at_s: float, port: int, size: tuple[int, int], tell: Callable[[str], None]) -> None:
+    """Writes the dashboard at `at_s` [s] of the run in `folder` to the PNG file `target`; `size` [px] is the browser's.
 
     Raises NoPicture, also when the run was not recorded, and OSError.
     """
-    recording, scenario = recording_of(folder), folder / "scenario.yaml"
-    if not recording:
-        raise NoPicture(f"{folder}: no recording there; give the folder of a run that was recorded")
-    service = DashboardService(load_scenario(str(scenario)), None, Live(serve_port=port), paced=False)
-    try:
+    with _shown(folder, port, size) as (service, open_page):
         tell(f"drawing {folder} up to {at_s:g} s")
-        draw(takewhile(lambda item: item[0] <= at_s * 1e9, messages(recording)), service)
+        draw(takewhile(lambda item: item[0] <= at_s * 1e9, messages(recording_of(folder))), service)
         service.flush()
         tell("waiting for the browser to draw it")
-        with page_at(port, width, height) as page:
-            image = _settled(page)
-    finally:
-        service.finish()
+        image = _settled(open_page())
     target.parent.mkdir(parents=True, exist_ok=True)
-    small = Image.fromarray(image).quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)  # keeps rare colours
-    small.save(target, optimize=True)
+    _small(image).save(target, optimize=True)
+
+
+def film(folder: Path, target: Path, port: int, size: tuple[int, int], tell: Callable[[str], None]) -> None:
+    """Writes the whole run in `folder`, sped up, to the GIF file `target`; `size` [px] is the browser's.
+
+    Raises NoPicture, also when the run was not recorded, and OSError.
+    """
+    frames: list[Image.Image] = []
+    with _shown(folder, port, size) as (service, open_page):
+        recorded = deque(messages(recording_of(folder)))
+        end, page = recorded[-1][0], None
+        for number in range(1, FRAMES + 1):
+            until = end * number // FRAMES
+            draw((recorded.popleft() for _ in range(sum(1 for item in recorded if item[0] <= until))), service)
+            service.flush()
+            page = page or open_page()
+            image = Image.fromarray(_settled(page) if number == 1 else look(page))
+            frames.append(image.resize(FILM_PX, Image.Resampling.LANCZOS).quantize(COLOURS, dither=Image.Dither.NONE))
+            tell(f"frame {number} of {FRAMES}, at {until / 1e9:.0f} s")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    durations = [round(1e3 * FRAME_S)] * (len(frames) - 1) + [round(1e3 * LAST_S)]
+    frames[0].save(target, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+
+
+def _small(image: Pixels) -> Image.Image:
+    """The picture in few colours, rare ones among them."""
+    return Image.fromarray(image).quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 
 def _settled(page: Page) -> Pixels:

@@ -1,4 +1,4 @@
-"""The curves and words beside the scene: force, depth, torque, pace, phase, log. Numbers in, rerun entities out."""
+"""The curves and words beside the scene: force, depth, torque, speed, phase, log. Numbers in, rerun entities out."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ JOINT_COLORS: Final = (
     (80, 120, 230),
     (170, 90, 220),
 )
-BLAMED: Final = (*(name for name, role in contract().roles.items() if not role.observer), "grant")
+AWAITED: Final = (*(name for name, role in contract().roles.items() if not role.observer), "grant")
 """Who can be waited for: the services, and the conductor's grant of simulated time."""
 DEPTH_FLOOR_M: Final = -0.02
 """Above the surface by more than this the depth curve pauses: free motion would flatten the contact to a line."""
@@ -78,8 +78,8 @@ class Plots:
         self._series("plots/wall/forecast", [("forecast 0.2 s before [mm]", (230, 230, 230))], width=1.0)
         names = [f"A{i + 1} [% of limit]" for i in range(7)]
         self._series("plots/torque/joints", list(zip(names, JOINT_COLORS, strict=True)))
-        self._series("plots/pace/real_time_factor", [("real-time factor [1]", (70, 180, 200))])
-        self._series("plots/blame/roles", list(zip(BLAMED, cycle((*JOINT_COLORS, (190, 190, 190))), strict=False)))
+        self._series("plots/speed/real_time_factor", [("real-time factor [1]", (70, 180, 200))])
+        self._series("plots/waits/roles", list(zip(AWAITED, cycle((*JOINT_COLORS, (190, 190, 190))), strict=False)))
         self._series("plots/progress/targets", [("targets visited [%]", (70, 190, 90))])
         for path, states in (("state/phase", PHASES), ("state/driver", MODES)):
             shown = rr.StateConfiguration(values=[name for name, _ in states], colors=[color for _, color in states])
@@ -128,13 +128,13 @@ class Plots:
         """How many of the targets are done."""
         self._add("plots/progress/targets", t, 100.0 * visited / total if total else 0.0)
 
-    def pace(self, t: int, real_time_factor: float) -> None:
+    def speed(self, t: int, real_time_factor: float) -> None:
         """Simulated over wall time, over the last simulated second."""
-        self._add("plots/pace/real_time_factor", t, real_time_factor)
+        self._add("plots/speed/real_time_factor", t, real_time_factor)
 
-    def blame(self, t: int, share: Array) -> None:
-        """The part [1] of the observed waits that each of `BLAMED` was waited for, shape (k,)."""
-        self._columns.add("plots/blame/roles", scalars, t, 100.0 * share)
+    def waits(self, t: int, share: Array) -> None:
+        """The part [1] of the observed waits that each of `AWAITED` was waited for, shape (k,)."""
+        self._columns.add("plots/waits/roles", scalars, t, 100.0 * share)
 
     def state(self, t: int, path: str, name: str) -> bool:
         """A state, written when it changes; returns whether it did."""

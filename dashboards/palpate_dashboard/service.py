@@ -80,7 +80,7 @@ class DashboardService(Service):
     role = "dashboard"
 
     def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True, full: bool = True) -> None:
-        """Of the truth in `scenario` it makes a page, no more; `paced`: whether the pace is worth showing.
+        """Of the truth in `scenario` it makes a page, no more; `paced`: whether its speed is worth showing.
 
         Without a `path` nothing is kept in a file. Unless it is `full`, meshes and images come seldom where nobody watches.
 
@@ -92,7 +92,7 @@ class DashboardService(Service):
         self._X_WA = np.array(given.X_WA)
         exam, limit = given.exam, given.limits.force_working_n
         plane = ForceDepthPlane(exam.depth_m, limit)
-        layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, limit, plane.bounds)
+        layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, plane.bounds)
         self._recording = open_recording(path, live, layout, scenario.name, "" if path is None else run_of(path.parent))
         self._force_depth = ForceDepth(self._recording, plane)
         self._region = (exam.region_m, exam.centre_m)
@@ -107,7 +107,7 @@ class DashboardService(Service):
         lens = given.camera
         k = np.array(((lens.focal_px, 0, lens.width_px / 2), (0, lens.focal_px, lens.height_px / 2), (0, 0, 1)))
         self._scene.lens(k, lens.width_px, lens.height_px)  # the messages' own follows; who joins late has missed them
-        self._waits = np.zeros(len(plots.BLAMED))
+        self._waits = np.zeros(len(plots.AWAITED))
         self._producers = {topic.name: topic.producer for topic in contract().topics.values()}
         self._undressed = True
         self._seen: dict[str, Message] = {}
@@ -119,9 +119,9 @@ class DashboardService(Service):
         self._found: list[str] = []
         self._unassessed: list[str] = []
         self._robot = "no status yet"
-        self._paced = paced
-        self._pace: float | None = None
-        self._pace_mark = (0, perf_counter())
+        self._tells_speed = paced
+        self._speed: float | None = None
+        self._speed_mark = (0, perf_counter())
         self._steps = 0
         self._busy_s = 0.0
         often = full or live != Live()
@@ -156,9 +156,9 @@ class DashboardService(Service):
                     self._seen[topic] = message
                     self._due[topic] = t + period
                     draw(t, message)
-        if self._paced and self._is_due("pace", t, 1000 * MS):
-            self._due["pace"] = t + 1000 * MS
-            self._measure_pace(t)
+        if self._tells_speed and self._is_due("speed", t, 1000 * MS):
+            self._due["speed"] = t + 1000 * MS
+            self._measure_speed(t)
         if self._is_due("send", t, self._send_period):
             self._due["send"] = t + self._send_period
             self._columns.send()
@@ -185,14 +185,14 @@ class DashboardService(Service):
     def _is_due(self, key: str, t: int, period: int) -> bool:
         return period == 0 or t >= self._due.get(key, 0)
 
-    def _measure_pace(self, t: int) -> None:
+    def _measure_speed(self, t: int) -> None:
         """Simulated over wall time since the last call: the only use of a wall clock, and it goes to the screen alone."""
-        before, then = self._pace_mark
+        before, then = self._speed_mark
         now = perf_counter()
-        self._pace_mark = (t, now)
+        self._speed_mark = (t, now)
         if t > before > 0:
-            self._pace = (t - before) / 1e9 / (now - then)
-            self._plots.pace(t, self._pace)
+            self._speed = (t - before) / 1e9 / (now - then)
+            self._plots.speed(t, self._speed)
 
     def _link_poses(self, t: int, message: Message) -> None:
         transforms = {item.child_frame_id: item.transform for item in message.transforms}
@@ -286,7 +286,7 @@ class DashboardService(Service):
         if not self._is_due("text", t, TEXT_PERIOD):
             return
         self._due["text"] = t + TEXT_PERIOD
-        self._plots.document(t, "text/status", words.status(self._name, phase, message, self._robot, self._pace))
+        self._plots.document(t, "text/status", words.status(self._name, phase, message, self._robot, self._speed))
 
     def _indentation(self, t: int, message: Message) -> None:
         self._plots.true_contact(t, message.depth, message.normal_force)
@@ -335,14 +335,14 @@ class DashboardService(Service):
             self._count_wait(row.values.get("waiting_for", ""))
             self._plots.health(t, row)
         share = self._waits / max(1.0, self._waits.sum())
-        self._plots.blame(t, share)
-        self._plots.document(t, "text/services", words.services(rows, zip(plots.BLAMED, share, strict=True)))
+        self._plots.waits(t, share)
+        self._plots.document(t, "text/services", words.services(rows, zip(plots.AWAITED, share, strict=True)))
 
     def _count_wait(self, what: str) -> None:
         """A service was seen waiting for a topic, or for the grant; a wait of observers says nothing."""
         role = self._producers.get(what, what)
-        if role in plots.BLAMED:
-            self._waits[plots.BLAMED.index(role)] += 1
+        if role in plots.AWAITED:
+            self._waits[plots.AWAITED.index(role)] += 1
 
 
 def create(scenario: Scenario) -> DashboardService:

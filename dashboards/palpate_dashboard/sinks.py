@@ -45,8 +45,11 @@ class Live:
 
 
 def address(port: int) -> str:
-    """Where a browser on this machine sees the recording that is served at `port`."""
-    return f"http://localhost:{port + 1}/?url={quote(f'rerun+http://localhost:{port}/proxy', safe='')}"
+    """Where a browser on this machine sees the recording that is served at `port`.
+
+    The theme is dark whatever the browser prefers: the colours of the scene and of the curves are chosen for it.
+    """
+    return f"http://localhost:{port + 1}/?url={quote(f'rerun+http://localhost:{port}/proxy', safe='')}&theme=dark"
 
 
 def _serve(port: int) -> Any:

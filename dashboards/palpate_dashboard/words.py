@@ -42,7 +42,7 @@ LEGEND = """
 | TRUTH: patient | what no sensor tells: how far the breath lifts the wall, and how far the patient has moved |
 | joint torque | applied, gravity excluded, in percent of each joint's limit |
 | health | a line each for every service, and for every topic as the contract's monitor sees it; why is in the log |
-| blame | of the waits seen since the start of the run, the part that each service was waited for |
+| waited for | of the waits seen since the start of the run, the part that each service was waited for |
 | time | simulated |
 """
 
@@ -51,7 +51,7 @@ def status(scenario: str, phase: str, exam: ExamState, robot: str, real_time_fac
     """The page on the state of the examination; `robot` is the driver's mode in words."""
     flags = [name.replace("_", " ") for name in CONTACT_FLAGS if getattr(exam, name)]
     depth_mm = 1e3 * exam.depth
-    pace = [] if real_time_factor is None else [f"| pace | {real_time_factor:.1f} x real time |"]
+    speed = [] if real_time_factor is None else [f"| speed | {real_time_factor:.1f} x real time |"]
     depth = f"{depth_mm:.1f} mm" if exam.depth > FREE_M else "not in contact"
     return "\n".join((
         f"**{scenario}: {phase}.** {exam.message}",
@@ -62,7 +62,7 @@ def status(scenario: str, phase: str, exam: ExamState, robot: str, real_time_fac
         f"| normal force | {exam.normal_force:.1f} N |",
         f"| contact | {', '.join(flags) or 'none'} |",
         f"| driver | {robot} |",
-        *pace,
+        *speed,
     ))  # fmt: skip
 
 
@@ -90,7 +90,7 @@ class Health:
         return LEVELS[self.level] if 0 <= self.level < len(LEVELS) else str(self.level)
 
 
-def services(rows: Sequence[Health], blame: Iterable[tuple[str, float]] = ()) -> str:
+def services(rows: Sequence[Health], waits: Iterable[tuple[str, float]] = ()) -> str:
     """Health of every service, then who was waited for, as parts [1], then every topic against its contract, the worst first."""
     lines = ["| service | state | | at | silent for |", "|---|---|---|---|---|"]
     for row in rows:
@@ -98,7 +98,7 @@ def services(rows: Sequence[Health], blame: Iterable[tuple[str, float]] = ()) ->
             tick = f"{row.values['tick_s']} s" if "tick_s" in row.values else ""
             age = f"{row.values['report_age_s']} s" if "report_age_s" in row.values else ""
             lines.append(f"| {row.name} | {row.word} | {row.message} | {tick} | {age} |")
-    waited = [f"{role} {100 * share:.0f} %" for role, share in blame if share > 0]
+    waited = [f"{role} {100 * share:.0f} %" for role, share in waits if share > 0]
     if waited:
         lines += ["", f"**Waited for**: {', '.join(waited)}"]
     topics = sorted((row for row in rows if row.is_topic), key=lambda row: -SEVERITY[row.word])

@@ -19,7 +19,7 @@ from palpate_bus.messages import KeyValue, codec
 from palpate_dashboard import replay
 from palpate_dashboard.columns import TIMELINE
 from palpate_dashboard.layout import blueprint
-from palpate_dashboard.plots import BLAMED
+from palpate_dashboard.plots import AWAITED
 from palpate_dashboard.service import FILE, DashboardService, create
 from palpate_dashboard.sinks import Live
 from palpate_models import lbr
@@ -91,9 +91,9 @@ def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
         "/world/perception/normals", "/world/plan/path", "/plots/force/measured", "/plots/force/true",
         "/plots/force/limit", "/plots/depth/measured", "/plots/depth/setpoint", "/plots/depth/true",
         "/plots/truth/breath", "/plots/truth/moved", "/world/truth",
-        "/plots/torque/joints", "/plots/pace/real_time_factor", "/plots/progress/targets", "/state/phase",
+        "/plots/torque/joints", "/plots/speed/real_time_factor", "/plots/progress/targets", "/state/phase",
         "/state/driver", "/text/status", "/text/services", "/log/robot", "/log/exam", "/log/findings",
-        "/log/perception", "/force_depth/past", "/force_depth/now", "/plots/blame/roles",
+        "/log/perception", "/force_depth/past", "/force_depth/now", "/plots/waits/roles",
         "/map/mean/surface", "/map/band/surface", "/map/mean/findings",
     }  # fmt: skip
     assert expected <= recording.temporal.keys()
@@ -318,8 +318,8 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
     again = Recording(replay.main(tmp_path))
     live = Recording(tmp_path / "live.rrd")
-    pace = "/plots/pace/real_time_factor"  # of wall time, which a replay does not have
-    assert live.temporal.pop(pace)
+    speed = "/plots/speed/real_time_factor"  # of wall time, which a replay does not have
+    assert live.temporal.pop(speed)
     live.temporal.pop("/text/status")
     again.temporal.pop("/text/status")
     assert again.temporal == live.temporal
@@ -344,8 +344,8 @@ def test_blame_is_of_those_who_were_waited_for(tmp_path: Path) -> None:
         for status, what in zip(new["diagnostics"].status if "diagnostics" in new else (), WAITS, strict=False):
             status.values = [KeyValue("waiting_for", what)]
     draw(tmp_path / FILE, messages, without=("sim/surface", "camera/depth/image_raw", "perception/points"))
-    rows = Recording(tmp_path / FILE).cells("/plots/blame/roles", "Scalars:scalars")
-    share = dict(zip(BLAMED, rows[-1][1].as_py(), strict=True))
+    rows = Recording(tmp_path / FILE).cells("/plots/waits/roles", "Scalars:scalars")
+    share = dict(zip(AWAITED, rows[-1][1].as_py(), strict=True))
     assert share["tissue"] == pytest.approx(200 / 3)
     assert share["grant"] == pytest.approx(100 / 3)
     assert sum(share.values()) == pytest.approx(100)

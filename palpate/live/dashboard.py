@@ -14,7 +14,7 @@ DEFAULT_PORT = 9876
 PICTURE_PX = (1500, 940)
 
 
-def dashboard(
+def dashboard(  # noqa: PLR0913 - the options of a command
     source: Annotated[
         str | None, typer.Argument(metavar="[DIR|FILE]", help="Results folder, .rrd or .mcap; none: the run that is on.")
     ] = None,
@@ -31,6 +31,9 @@ def dashboard(
         Path | None, typer.Option(metavar="PNG", help="Write how a recorded run looks at --at, by a headless browser, and end.")
     ] = None,
     at: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="With --picture: the simulated time.")] = 60.0,
+    film_file: Annotated[
+        Path | None, typer.Option("--film", metavar="GIF", help="Write a recorded run as a film, by a headless browser, and end.")
+    ] = None,
 ) -> None:
     """Watch a run: live in the browser, joined late or not, or from its recording. It slows no run down.
 
@@ -39,17 +42,22 @@ def dashboard(
     """
     from palpate.live.viewing import NothingToShow, recording, the_run, view, watch
     from palpate_bus.settings import BusConfigError
-    from palpate_dashboard.picture import NoPicture, take
+    from palpate_dashboard.picture import NoPicture, film, take
     from palpate_models.load import ScenarioError
 
     console = Console(stderr=True)
+
+    def tell(words: str) -> None:
+        console.print(words, highlight=False, soft_wrap=True)
+
     try:
-        if picture is not None:
+        if picture or film_file:
             if source is None:
-                raise NothingToShow("--picture wants the folder of a run that was recorded")
-            take(
-                Path(source), picture, at, port, *PICTURE_PX, lambda words: console.print(words, highlight=False, soft_wrap=True)
-            )
+                raise NothingToShow("--picture and --film need the folder of a run that was recorded")
+            if picture:
+                take(Path(source), picture, at, port, PICTURE_PX, tell)
+            if film_file:
+                film(Path(source), film_file, port, PICTURE_PX, tell)
         elif source is None:
             watch(the_run(chosen), port, native, show, leave, console)
         else:

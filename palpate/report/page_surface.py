@@ -19,6 +19,8 @@ from palpate_models.frames import Array
 MAX_VERTICES = 65_535
 """The viewer's indices have 16 bits."""
 _UNKNOWN = 0.80
+AXIS_M = 0.05
+"""Length of the axes of the abdomen frame."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     triangles = np.concatenate((triangles[whole], triangles[~whole]))
     if not mapped.scanned.any() or len(mapped.vertices) > MAX_VERTICES:
         return None
-    shape = mapped.vertices - mapped.vertices[mapped.scanned].mean(axis=0)
+    middle = mapped.vertices[mapped.scanned].mean(axis=0)
+    shape = mapped.vertices - middle
     radius = 0.8 * float(np.linalg.norm(shape[:, :2], axis=1).max())
     force = np.asarray(message.force, dtype=np.float64)
     ratio = mapped.apparent / float(message.background)
@@ -66,6 +69,7 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     data = {
         "radius": radius,
         "triangles": _text(triangles.astype(np.uint16)),
+        **_labels(shape, known, middle),
         "outline": _text(_outline(shape, triangles, mapped.finding >= 0)),
         "layers": [
             {
@@ -79,6 +83,34 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
         ],
     }
     return [layer for layer, *_ in layers], data
+
+
+def _labels(shape: Array, known: NDArray[np.bool_], middle: Array) -> dict[str, Any]:
+    """Axes of the abdomen frame A at the corner of the scanned region, as segments, and words with their places.
+
+    `shape`: vertices about `middle`, which is a point in A, shape (n, 3) [m]; x points to the patient's left, y to the head.
+    """
+    (left, feet, _), (right, head, _) = shape[known].min(axis=0), shape[known].max(axis=0)
+
+    def on_skin(x: float, y: float) -> Array:
+        nearest = int(np.argmin(np.hypot(shape[:, 0] - x, shape[:, 1] - y)))
+        return np.array((x, y, shape[nearest, 2] + 0.002))
+
+    beside = 0.16 * max(right - left, head - feet)
+    corner = on_skin(left, feet) - (0.3 * beside, 0.3 * beside, 0.0)
+    ends = corner + AXIS_M * np.eye(3)
+    words = {
+        "head": on_skin(0.0, head) + (0.0, beside, 0.0),
+        "feet": on_skin(0.0, feet) - (0.0, beside, 0.0),
+        "patient's right": on_skin(left, 0.0) - (beside, 0.0, 0.0),
+        "patient's left": on_skin(right, 0.0) + (beside, 0.0, 0.0),
+        **{f"{name} {1e3 * AXIS_M:.0f} mm": end for name, end in zip("xyz", ends, strict=True)},
+    }
+    navel = -middle
+    if left <= navel[0] <= right and feet <= navel[1] <= head:
+        words["navel"] = on_skin(navel[0], navel[1])
+    axes = np.array([(corner, end) for end in ends], dtype=np.float32)
+    return {"axes": _text(axes), "words": [[word, *(round(float(v), 4) for v in place)] for word, place in words.items()]}
 
 
 def _text(array: NDArray[Any]) -> str:

@@ -25,6 +25,11 @@
   const bytes = (text) => buffer(gl.ARRAY_BUFFER, decode(text, Uint8Array));
   const layers = data.layers.map((l) => ({ p: floats(l.positions), n: floats(l.normals), c: bytes(l.colors) }));
   const lines = decode(data.outline, Float32Array), outline = buffer(gl.ARRAY_BUFFER, lines);
+  const axes = buffer(gl.ARRAY_BUFFER, decode(data.axes, Float32Array)), AXES = 6;  // corners of three segments
+  const words = data.words.map(([text, ...place]) => {
+    const element = document.createElement("span"); element.className = "place"; element.textContent = text;
+    canvas.parentElement.append(element); return { element, place };
+  });
   const start = { yaw: -0.5, pitch: -0.95, zoom: 1 };
   const view = Object.assign({}, start);
   let shown = 0;
@@ -48,6 +53,18 @@
       gl.disableVertexAttribArray(at.n); gl.vertexAttrib3f(at.n, 0, 0, 1);
       gl.disableVertexAttribArray(at.c); gl.vertexAttrib3f(at.c, 0.05, 1.0, 0.9); gl.lineWidth(2);
       gl.drawArrays(gl.LINES, 0, lines.length / 3);
+    }
+    if (data.layers[shown].outlined) {
+      bind("p", axes, 3, gl.FLOAT, false);
+      gl.disableVertexAttribArray(at.n); gl.vertexAttrib3f(at.n, 0, 0, 1);
+      gl.disableVertexAttribArray(at.c); gl.vertexAttrib3f(at.c, 0.1, 0.2, 0.3);
+      gl.drawArrays(gl.LINES, 0, AXES);
+    }
+    for (const { element, place: [x, y, z] } of words) {  // beside the canvas' pixels: text of the page
+      const [u, v] = [M[0] * x + M[4] * y + M[8] * z, M[1] * x + M[5] * y + M[9] * z];
+      element.style.left = `${canvas.offsetLeft + (u + 1) / 2 * canvas.clientWidth}px`;
+      element.style.top = `${canvas.offsetTop + (1 - v) / 2 * canvas.clientHeight}px`;
+      element.hidden = Math.abs(u) > 1 || Math.abs(v) > 1;
     }
     root.dataset.drawn = String(shown);
   }
