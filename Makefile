@@ -53,7 +53,7 @@ docs: install  ## the pages that are made from contract, tables and models; then
 	$(BIN)/python -m palpate.reference
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-docs.txt
 	$(BIN)/python docs/site.py out/site-pages
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 install: $(VENV)/.installed
 
