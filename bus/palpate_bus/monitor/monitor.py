@@ -13,7 +13,7 @@ from palpate_bus.contract import MS, Contract, Topic
 from palpate_bus.contract.conformance import Checker
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.messages import codec
-from palpate_bus.monitor import pace
+from palpate_bus.monitor import timing
 from palpate_bus.monitor.health import SeenViolation, TopicHealth, Violation
 from palpate_bus.monitor.streams import WINDOW_S, Stream
 from palpate_bus.wire.liveliness import Entity, EntityKind
@@ -27,7 +27,7 @@ class Monitor:
         self.wallclock = wallclock
         self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
         """Every violation so far, by (topic, sender, kind, field)."""
-        self.time = pace.BusTime(0.0, 0, None)
+        self.time = timing.BusTime(0.0, 0, None)
         """How the bus's time moves, as of the last look."""
         self.listening: frozenset[str] = frozenset(rules.topics)
         """Topics that are listened to; the others are not judged by what does not come. See `listen`."""
@@ -113,11 +113,11 @@ class Monitor:
                 stream.ages.append((wall - stream.sent) / MS)
         rows = self.rules.topics
         periodic = [(rows[name], streams) for name, streams in self._streams.items() if rows[name].periodic]
-        self.time = pace.bus_time((stream for _, streams in periodic for stream in streams.values()), self.wallclock)
+        self.time = timing.bus_time((stream for _, streams in periodic for stream in streams.values()), self.wallclock)
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:
-                    for problem in pace.problems(topic, stream, self.time, self.wallclock, now):
+                    for problem in timing.problems(topic, stream, self.time, self.wallclock, now):
                         self._note(topic, stream.sender, problem.kind, problem.expected, problem.got, now)
         self._judge_unheard(now)
         news, self._news = self._news, []
@@ -132,7 +132,7 @@ class Monitor:
         passed = [stream.passed() for stream in streams]
         seconds = max((p.seconds for p in passed), default=0.0)
         kept = self._kept.get(topic.name)
-        if kept is not None and seconds < pace.GRACE_S:
+        if kept is not None and seconds < timing.GRACE_S:
             return self._kept_health(kept)
         messages, size = sum(p.messages for p in passed), sum(p.bytes for p in passed)
         own = [p.messages * 1e9 / p.stamps for p in passed if p.stamps]
@@ -140,7 +140,7 @@ class Monitor:
         alive: bool | None = None
         if topic.latched and senders:
             alive = bool(streams)
-        elif topic.periodic and senders and self.time.progress and seconds >= pace.GRACE_S:
+        elif topic.periodic and senders and self.time.progress and seconds >= timing.GRACE_S:
             alive = messages > 0
         rate = messages / seconds if seconds else 0.0
         return TopicHealth(
@@ -204,7 +204,7 @@ class Monitor:
             if name not in self.listening:
                 continue
             heard = {stream.sender for stream in self._streams[name].values()}
-            due = (topic.periodic and pace.is_due(topic, self.time)) or (topic.latched and self.time.passed > 0)
+            due = (topic.periodic and timing.is_due(topic, self.time)) or (topic.latched and self.time.passed > 0)
             for node in nodes - heard:
                 waited = now - self._since[name, node]
                 if waited > WINDOW_S and due:

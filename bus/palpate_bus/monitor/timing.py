@@ -44,8 +44,8 @@ class BusTime(NamedTuple):
         return self.passed / 1e9 / self.seconds if self.now is not None else None
 
 
-class PaceProblem(NamedTuple):
-    """What is wrong with the pace of a stream."""
+class TimingProblem(NamedTuple):
+    """What is wrong with the timing of a stream."""
 
     kind: Kind
     expected: str
@@ -67,7 +67,7 @@ def bus_time(streams: Iterable[Stream], wallclock: bool) -> BusTime:
     return BusTime(seconds, int(progress), int(median(newest)))
 
 
-def problems(topic: Topic, stream: Stream, time: BusTime, wallclock: bool, now: float) -> Iterator[PaceProblem]:
+def problems(topic: Topic, stream: Stream, time: BusTime, wallclock: bool, now: float) -> Iterator[TimingProblem]:
     """What is wrong with rate and age of a periodic topic's stream; `now` [s] is the clock by which it is marked."""
     own = stream.passed()
     if now - stream.began < GRACE_S or own.seconds < GRACE_S:
@@ -75,14 +75,14 @@ def problems(topic: Topic, stream: Stream, time: BusTime, wallclock: bool, now: 
     wanted = f"{1000 / topic.period_ms:g} {'Hz' if wallclock else 'Hz of simulated time'}"
     if not own.messages:
         if is_due(topic, time) and time.passed > SILENCE_NS:
-            yield PaceProblem(Kind.SILENT, wanted, f"nothing for {own.seconds:.1f} s")
+            yield TimingProblem(Kind.SILENT, wanted, f"nothing for {own.seconds:.1f} s")
         return
     spent = own.sent if wallclock else own.stamps
     if spent:
         off = abs(own.messages - spent / topic.period)
         if off > LEAST_OFF and off > RATE_TOLERANCE * spent / topic.period:
             unit = wanted.partition(" ")[2]
-            yield PaceProblem(Kind.RATE, wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
+            yield TimingProblem(Kind.RATE, wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
     yield from _age(topic, stream, time, wallclock)
 
 
@@ -91,14 +91,14 @@ def is_due(topic: Topic, time: BusTime) -> bool:
     return time.passed / topic.period > LEAST_OFF
 
 
-def _age(topic: Topic, stream: Stream, time: BusTime, wallclock: bool) -> Iterator[PaceProblem]:
+def _age(topic: Topic, stream: Stream, time: BusTime, wallclock: bool) -> Iterator[TimingProblem]:
     if topic.max_age_ms is None or len(stream.ages) < AGES:
         return
     if wallclock:
         age = median(stream.ages)
         if age > topic.max_age_ms + topic.period_ms:
-            yield PaceProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{age:.0f} ms")
+            yield TimingProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{age:.0f} ms")
     elif stream.stamp is not None and time.now is not None:
         behind = (time.now - stream.stamp) / MS - topic.period_ms
         if behind > topic.max_age_ms + SLACK_MS * max(time.progress or 0.0, 1.0):
-            yield PaceProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{behind:.0f} ms behind the others")
+            yield TimingProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{behind:.0f} ms behind the others")
