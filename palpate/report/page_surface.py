@@ -92,18 +92,19 @@ def _labels(shape: Array, known: NDArray[np.bool_], middle: Array) -> dict[str, 
     """
     (left, feet, _), (right, head, _) = shape[known].min(axis=0), shape[known].max(axis=0)
 
-    def on_skin(x: float, y: float) -> Array:
-        nearest = int(np.argmin(np.hypot(shape[:, 0] - x, shape[:, 1] - y)))
-        return np.array((x, y, shape[nearest, 2] + 0.002))
+    def on_skin(at_x: float, at_y: float) -> Array:
+        nearest = int(np.argmin(np.hypot(shape[:, 0] - at_x, shape[:, 1] - at_y)))
+        return np.array((at_x, at_y, shape[nearest, 2] + 0.002))
 
     beside = 0.16 * max(right - left, head - feet)
-    corner = on_skin(left, feet) - (0.3 * beside, 0.3 * beside, 0.0)
+    x, y, _ = beside * np.eye(3)
+    corner = on_skin(left, feet) - 0.3 * (x + y)
     ends = corner + AXIS_M * np.eye(3)
     words = {
-        "head": on_skin(0.0, head) + (0.0, beside, 0.0),
-        "feet": on_skin(0.0, feet) - (0.0, beside, 0.0),
-        "patient's right": on_skin(left, 0.0) - (beside, 0.0, 0.0),
-        "patient's left": on_skin(right, 0.0) + (beside, 0.0, 0.0),
+        "head": on_skin(0.0, head) + y,
+        "feet": on_skin(0.0, feet) - y,
+        "patient's right": on_skin(left, 0.0) - x,
+        "patient's left": on_skin(right, 0.0) + x,
         **{f"{name} {1e3 * AXIS_M:.0f} mm": end for name, end in zip("xyz", ends, strict=True)},
     }
     navel = -middle
