@@ -21,6 +21,7 @@ from palpate_benchmarks.turns import compared, in_turns
 from palpate_bus.contract import contract
 from palpate_models.breathing import BreathingCurve
 from palpate_models.frames import Array
+from palpate_models.guarding import Guarding
 from palpate_models.patient import Lesion, Phantom, Stiffness
 from palpate_models.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_tissue.backend import TissueBackend
@@ -33,6 +34,8 @@ from palpate_tissue.surface import SkinSurface
 SPEED_MPS = 0.03
 RADIUS_M = 0.015
 DEPTH_M = 0.010
+MUSCLE = Guarding(centre_m=(-0.03, 0.01))
+"""Under the whole path of `measure`."""
 SIZES = (1_000, 3_000, 10_000, 50_000)
 SURFACE_EVERY = contract().topics["sim/surface"].period // contract().roles["tissue"].period
 """Steps between two messages of the deformed surface."""
@@ -44,7 +47,8 @@ def measure(steps: int = 4000) -> dict[str, float]:
     """Cost of a step [us] on the default abdomen with a lesion 10 mm below the skin, sliding at 30 mm/s at 10 mm depth.
 
     The surface is included in its step; the time to load [s] is from the cache if it was computed before. Then processor time
-    without stiffening and with it, stepped in turns on the same solid and without the surface, and their ratios.
+    without stiffening, with it, and with voluntary guarding beside it, stepped in turns on the same solid and without the
+    surface, and the ratios of these to the first.
     """
     phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01), depth_m=0.01),))
     model = build_phantom(phantom, seed=0)
@@ -59,8 +63,14 @@ def measure(steps: int = 4000) -> dict[str, float]:
         path.append(under.position + (RADIUS_M - DEPTH_M) * under.normal)
     figures = {"vertices": len(model.vertices), "load_s": load, **_slide(tissue, np.array(path), tissue.dt)}
     linear = replace(model, stiffening=np.zeros_like(model.stiffening))
-    ways = [partial(_step, ElasticTissue(body, solid, phantom.stiffness), path) for body in (linear, model)]
-    return {**figures, **compared(in_turns(ways, steps), ("linear", "stiffening"))}
+    guarding = replace(build_phantom(phantom.model_copy(update={"guarding": (MUSCLE,)}), seed=0), voluntary=True)
+    ways = [partial(_step, ElasticTissue(body, solid, phantom.stiffness), path) for body in (linear, model, guarding)]
+    costs = in_turns(ways, steps)
+    return {
+        **figures,
+        **compared(costs[:2], ("linear", "stiffening")),
+        **compared(costs[[0, 2]], ("linear", "guarding")),
+    }
 
 
 def _step(body: TissueBackend, path: Sequence[Array], k: int) -> None:

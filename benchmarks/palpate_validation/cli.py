@@ -25,6 +25,7 @@ SECTIONS = {
     "population": "population",
     "persons": "persons",
     "buried": "buried",
+    "guarding": "guarding",
     "relaxation": "relaxation",
     "energy": "energy",
     "breathing": "breathing",

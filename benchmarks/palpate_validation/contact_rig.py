@@ -23,6 +23,7 @@ from palpate_bus.service import Service
 from palpate_bus.setpoint import TOPIC
 from palpate_control.service import create as create_control
 from palpate_models import lbr
+from palpate_models.breathing import Breathing
 from palpate_models.errors import ArmErrors, Errors
 from palpate_models.frames import Array, matrix
 from palpate_models.load import plant_input, true_pose
@@ -100,11 +101,12 @@ class Ringing:
 
 @cache
 def scenario(contrast: float) -> Scenario:
-    """A uniform abdomen `contrast` times as stiff as the default, on the default robot without sensor noise."""
-    wall = Stiffness(k_w_n_per_m3=1.7e5 * contrast)
+    """A uniform abdomen that does not breathe, `contrast` times as stiff as the default, on a robot without sensor noise."""
+    wall = Stiffness(k_w_n_per_m3=Stiffness().k_w_n_per_m3 * contrast)
     plain = Scenario()
     still = Errors(level="none", arm=ArmErrors(position_noise_rad=0.0, velocity_noise_radps=0.0))
-    phantom = Phantom(stiffness=wall, background=Background(cv=0.0, margins=1.0), edge_m=0.006)
+    held = Breathing(kind="none")
+    phantom = Phantom(stiffness=wall, background=Background(cv=0.0, margins=1.0), edge_m=0.006, breathing=held)
     return plain.model_copy(update={"phantom": phantom, "errors": still})
 
 

@@ -72,7 +72,7 @@ def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> Non
         "# Validation",
         "",
         "The physics against independent references, as `palpate validate --docs docs/validation.md` measured it.",
-        "Every bound is a test in `services/validation/tests`. Costs are of a busy two-core machine: read them as ratios.",
+        "Every bound is a test in `tests/benchmarks`. Costs are of a busy two-core machine: read them as ratios.",
     ]
     for section in sections:
         lines += ["", f"## {section.title}", "", section.text, "", "| | measured | bound | against |", "|---|---|---|---|"]

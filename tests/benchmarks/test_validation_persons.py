@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from palpate_validation import buried, persons, population
+from palpate_validation import buried, guarding, persons, population
 from palpate_validation.check import PageSection
 from palpate_validation.population import PopulationSample
 
@@ -34,6 +36,16 @@ def test_bone_is_felt_as_bone() -> None:
 
 def test_lumps_below_the_skin_against_the_elastic_tier() -> None:
     assert_bounds(buried.section())
+
+
+def test_voluntary_guarding_gives_way_under_a_press_and_more_under_strokes() -> None:
+    assert_bounds(guarding.section())
+
+
+def test_guarding_that_never_fades_would_be_found_out() -> None:
+    found = guarding.measure()
+    stubborn = {**found.strokes, "voluntary": found.strokes["involuntary"]}
+    assert any(check.passed is False for check in guarding.section(replace(found, strokes=stubborn)).checks)
 
 
 @pytest.mark.slow

@@ -118,6 +118,27 @@ def test_guarding_is_felt_where_the_muscle_is_and_is_no_lump(tmp_path: Path) -> 
     assert what.in_lump(np.array([muscle, lump.centre_m])).tolist() == [False, True]
 
 
+def test_the_truth_of_guarding_is_what_the_press_meets(tmp_path: Path) -> None:
+    """Step by step, on the whole wall: of a muscle that stays, and of one that gives way meanwhile."""
+    middle = np.array((-0.01, 0.0))
+    felt_there = {}
+    for kind in ("involuntary", "voluntary"):
+        guarding = f"{{centre_m: {middle.tolist()}, radii_m: [0.04, 0.04], ratio: 2.6, kind: {kind}}}"
+        scenario = load_scenario("clean", [REGION, "phantom.lesions=[]", f"phantom.guarding=[{guarding}]"])
+        found = press_patient(scenario)
+        tissue = Copies(scenario).with_lesions(())
+        assert found is not None
+        assert tissue is not None
+        at = np.linalg.norm(found.places[:, :2] - middle, axis=1).argsort()[:2]
+        normals = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4))).points(found.places[at, :2])[1]
+        slow, _ = TissueBackend.press(tissue, found.places[at], normals, scenario.robot.indenter_radius_m)
+        assert found.force[at] == pytest.approx(slow, rel=5e-3)
+        felt_there[kind] = found.force[at] / found.relaxed[at]
+    assert (felt_there["involuntary"] > 2.0).all()
+    assert (felt_there["voluntary"] < 0.9 * felt_there["involuntary"]).all()
+    assert (felt_there["voluntary"] > 1.5).all()
+
+
 def test_a_lump_that_is_hardly_stiffer_is_not_palpable(tmp_path: Path) -> None:
     _, what = felt(flat(tmp_path, LESION.model_copy(update={"contrast": 1.04})))
     (lump,) = what.lumps

@@ -15,16 +15,18 @@ from palpate.run import composed, processes
 from palpate.run.forks import Forks
 from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
-from palpate.run.roles import OBSERVERS, WORKERS, write_scenario_files
+from palpate.run.roles import OBSERVERS, workers, write_scenario_files
 from palpate_bus.contract import contract
 from palpate_conductor.timing import Timing
 from palpate_models.load import dump_scenario, load_scenario, view_of
 from palpate_models.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
-ROLES = (*WORKERS, *OBSERVERS)
-UNKNOWING = tuple(role for role in WORKERS if view_of(role) == "exam")
 SEEDS = (11, 4711)
+EVERYBODY = ["exam.pattern=search"]
+"""With which every role of the contract takes part."""
+ROLES = (*workers(load_scenario("poor_errors", EVERYBODY)), *OBSERVERS)
+UNKNOWING = tuple(role for role in ROLES if view_of(role) == "exam")
 DRAWING = {"draw_errors", "draw_arm", "true_pose", "plant_input", "PlantInput"}
 
 
@@ -96,7 +98,8 @@ def in_one_process(scenario: Scenario, out: Path) -> Any:
 def told_apart(hand: Hand, tmp_path: Path) -> dict[str, list[str]]:
     """What differs for each role between two patients who differ in seed alone, as do the names of their folders."""
     one, other = (
-        hand(load_scenario("poor_errors", seed=seed), tmp_path / f"patient-{seed}-of-{hand.__name__}") for seed in SEEDS
+        hand(load_scenario("poor_errors", EVERYBODY, seed=seed), tmp_path / f"patient-{seed}-of-{hand.__name__}")
+        for seed in SEEDS
     )
     found = {}
     for role in ROLES:
@@ -109,8 +112,8 @@ def told_apart(hand: Hand, tmp_path: Path) -> dict[str, list[str]]:
 
 
 def leaking_file(scenario: Scenario, out: Path) -> Any:
-    """Planning is given the file of the plant."""
-    return distributed(scenario, out, lambda _, files: files.update(planning=files["robot"]))
+    """All are given the file of the plant."""
+    return distributed(scenario, out, lambda _, files: files.update(dict.fromkeys(UNKNOWING, files["robot"])))
 
 
 def leaking_seed(scenario: Scenario, out: Path) -> Any:
@@ -143,11 +146,13 @@ def test_two_patients_who_differ_in_seed_alone_are_the_same_to_who_may_not_know(
 
 @pytest.mark.parametrize("hand", [leaking_file, leaking_seed, leaking_folder, leaking_environment])
 def test_a_leak_is_noticed(hand: Hand, tmp_path: Path) -> None:
-    assert told_apart(hand, tmp_path)["planning"]
+    found = told_apart(hand, tmp_path)
+    assert all(found[role] for role in UNKNOWING)
 
 
 def test_who_may_not_know_is_everybody_but_tissue_plant_and_observers() -> None:
-    assert set(UNKNOWING) == {"control", "planning", "perception", "assessment", "supervisor"}
+    assert set(ROLES) == set(contract().roles) - {"conductor"}
+    assert set(UNKNOWING) == {"control", "planning", "perception", "assessment", "search", "supervisor"}
 
 
 def test_no_file_of_those_who_may_not_know_mentions_a_secret() -> None:

@@ -56,6 +56,7 @@ class TissueBackend(ABC):
     def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
         """Standard presses with a sphere of `radius` [m], each into the body at rest, as it is afterwards.
 
+        Guarding muscle is contracted at rest and does what it does under any press: involuntarily it stays, voluntarily it fades.
         `places` [m] on the skin at rest and outward unit `normals` there, shape (k, 3). Returns their apparent stiffness [N] and
         whether they ended at their limit, each of shape (k,). Here it is done step by step; faster ways are the subclass's.
         """

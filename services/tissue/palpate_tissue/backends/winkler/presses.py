@@ -5,7 +5,8 @@ between two instants every displacement is nearly a straight line: for such a li
 
     y = e y0 + g (1 - r) u + g (r - e) u0,    e = exp(-h / tau),    r = tau / h (1 - e),
 
-and the step is backward Euler's only in the dashpot, which is at rest long before the reading.
+and the step is backward Euler's only in the dashpot, which is at rest long before the reading. What a press does to guarding
+muscle is the same everywhere: its depth and speed are those of the press.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy.spatial import cKDTree
 from palpate_models import press
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
+from palpate_models.guarding import Activation
 from palpate_models.patient import Stiffness
 from palpate_models.phantom import PhantomModel
 from palpate_models.vectors import add, dot, row, scale, subtract
@@ -49,6 +51,8 @@ class Course(NamedTuple):
     """Lengths of the steps [s], shape (n,)."""
     depths: Array
     """How deep the sphere is then [m], shape (n,)."""
+    contracted: Array
+    """How far guarding muscle is contracted then [1], shape (n,)."""
     prony: Array
     """g and tau [s] of each branch, shape (b, 2)."""
 
@@ -63,12 +67,14 @@ class Skin(NamedTuple):
 
 
 def press_in_turn(
-    model: PhantomModel, stiffness: Stiffness, where: tuple[Array, Array, float], activation: float
+    model: PhantomModel, stiffness: Stiffness, where: tuple[Array, Array, float]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """What `TissueBackend.press` returns. `where`: places [m], normals, each of shape (k, 3), and the sphere's radius [m]."""
     places, normals, radius = where
     ends = np.array(ENDS_S)
-    course = Course(radius, ends, press.depths(ends), np.column_stack((stiffness.prony_g, stiffness.prony_tau_s)))
+    depths = press.depths(ends)
+    prony = np.column_stack((stiffness.prony_g, stiffness.prony_tau_s))
+    course = Course(radius, ends, depths, contracted(model.voluntary, ends, depths), prony)
     reached = cKDTree(model.vertices).query_ball_point(places, radius + REACHED * stiffness.length_m)
     wall = implicit_wall(model, stiffness, 1.0, 1)
     skin = Skin(model.vertices, model.normals)
@@ -77,15 +83,24 @@ def press_in_turn(
         part = np.sort(np.array(vertices, dtype=np.intp))
         part = part[~model.fixed[part]]
         part = np.concatenate([part[first::_APART] for first in range(_APART)])
-        press_once(wall, skin, part, np.stack((place, normal)), course, activation, felt)
+        press_once(wall, skin, part, np.stack((place, normal)), course, felt)
     limited = forces.max(axis=1, initial=0.0) >= press.LIMIT_N
     return np.where(limited, press.LIMIT_N, forces[:, -1]), limited
 
 
+def contracted(voluntary: bool, ends: Array, depths: Array) -> Array:
+    """How far muscle that guards is contracted at the `ends` [s] of a press's steps, where it is `depths` deep [m]; both (n,).
+
+    At rest it is contracted wholly, and the press provokes it or lets it fade (`palpate_models.guarding`).
+    """
+    levels = [1.0]
+    for lasted, depth, deeper in zip(np.diff(ends, prepend=0.0), depths, np.diff(depths, prepend=0.0), strict=True):
+        levels.append(Activation(voluntary, lasted).after(levels[-1], depth, deeper / lasted))
+    return np.array(levels[1:])
+
+
 @compiled
-def press_once(
-    wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array, course: Course, activation: float, forces: Array
-) -> None:
+def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array, course: Course, forces: Array) -> None:
     """One frictionless press into a wall at rest, which is at rest afterwards. Only the vertices of `part` move.
 
     The wall's own step is 1 s. `at` (2, 3) has the place [m] and the outward normal there as rows; `forces` (n,) gets the forces
@@ -97,7 +112,7 @@ def press_once(
     e, r = np.empty(len(prony)), np.empty(len(prony))
     begin = reached = 0.0
     for step in range(len(course.ends)):
-        h, depth = course.ends[step] - begin, course.depths[step]
+        h, depth, activation = course.ends[step] - begin, course.depths[step], course.contracted[step]
         kept = 1.0
         for b in range(len(prony)):
             e[b] = exp(-h / prony[b, 1])

@@ -116,7 +116,7 @@ class WinklerTissue(TissueBackend):
 
     def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
         """See `TissueBackend`. In a few long steps, each press into the part of the wall that it reaches."""
-        return press_in_turn(self.model, self._stiffness, (places, normals, radius), self.activation)
+        return press_in_turn(self.model, self._stiffness, (places, normals, radius))
 
     def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
         self._excursion = excursion

@@ -1,0 +1,172 @@
+"""Guarding: what the standard press feels of it, and what strokes of an examination leave of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from palpate_models import press
+from palpate_models.frames import Array
+from palpate_models.guarding import FADING_S, Guarding
+from palpate_models.patient import Stiffness
+from palpate_models.phantom import flat_phantom
+from palpate_models.phantom.tension import tension_of_ratio
+from palpate_models.wall import MEDIAN
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_validation.check import Check, PageSection
+from palpate_validation.plots import COLOURS, INK, QUIET
+
+WALL = Stiffness(**MEDIAN._asdict(), friction=0.0)
+RATIO: float = Guarding(centre_m=(0.0, 0.0)).ratio
+KINDS = ("relaxed", "voluntary", "involuntary")
+RADIUS_M = 0.015
+STEP_S = 1e-3
+TOUCH_MPS, SLIDE_MPS = 0.014, 0.030
+"""An examination touches and slides so fast."""
+HALF_WAY_M = 0.05
+"""A stroke slides to and fro, so far to either side."""
+STROKES = 4
+APART_S = 1.0
+"""Time between strokes, in which nobody touches. What it is does not matter: guarding then stays as it is."""
+BY_HAND = (0.25 + 0.75 * math.exp(-press.DEPTH_M / press.SPEED_MPS / FADING_S)) * math.exp(
+    -(press.HOLD_S - press.READ_S / 2) / FADING_S
+)
+"""How far voluntary guarding is contracted where the press is read: 20 mm/s provoke a quarter of it, a hold at 10 mm nothing."""
+
+
+@dataclass(frozen=True)
+class Touched:
+    """What was felt of one wall by a way of the sphere; n instants."""
+
+    time: Array
+    """[s], shape (n,)."""
+    force: Array
+    """[N], shape (n,)."""
+    contracted: Array
+    """How far the muscle was contracted [1], shape (n,)."""
+
+
+@dataclass(frozen=True)
+class GuardingFelt:
+    """The standard press and the strokes on the three walls of `KINDS`."""
+
+    presses: dict[str, Touched]
+    strokes: dict[str, Touched]
+    sliding: Array
+    """At which instants of the strokes the sphere slides at depth: the number of the stroke, -1 elsewhere, shape (n,)."""
+
+    def pressed_ratio(self, kind: str) -> float:
+        """What the press reads, over what it reads of the relaxed wall."""
+        read, _ = press.apparent_stiffness(np.stack([self.presses[which].force for which in (kind, "relaxed")]))
+        return float(read[0] / read[1])
+
+    def slid_ratio(self, kind: str, stroke: int) -> float:
+        """The mean force of a stroke, over that of the same stroke on the relaxed wall."""
+        at = self.sliding == stroke
+        return float(self.strokes[kind].force[at].mean() / self.strokes["relaxed"].force[at].mean())
+
+
+def wall(kind: str) -> WinklerTissue:
+    """A flat wall of the median person, all of it muscle that guards in that way."""
+    model = flat_phantom(0.09, 0.005, WALL.k_w_n_per_m3)
+    each = np.ones(len(model.vertices))
+    tension = 0.0 if kind == "relaxed" else tension_of_ratio(RATIO, WALL)
+    return WinklerTissue(
+        replace(model, stiffening=WALL.stiffening_per_m * each, tension=tension * each, voluntary=kind == "voluntary"), WALL
+    )
+
+
+def touched(kind: str, x: Array, depth: Array) -> Touched:
+    """Moves the sphere along the wall, each millisecond to the next `x` [m] and `depth` [m]; above the skin where that is < 0."""
+    tissue = wall(kind)
+    force, contracted = np.zeros(len(x)), np.zeros(len(x))
+    before = np.array((x[0], 0.0, RADIUS_M))
+    for k in range(len(x)):
+        p = np.array((x[k], 0.0, RADIUS_M - depth[k]))
+        force[k] = tissue.step(0.0, p, (p - before) / STEP_S, RADIUS_M)[0][2]
+        contracted[k], before = tissue.activation, p
+    return Touched(STEP_S * np.arange(1, len(x) + 1), force, contracted)
+
+
+def strokes() -> tuple[Array, Array, Array]:
+    """Strokes as an examination makes them: x [m], depth [m], and the number of the stroke while it slides, else -1; (n,)."""
+    down = np.arange(0.0, press.DEPTH_M, TOUCH_MPS * STEP_S)
+    corners = HALF_WAY_M * np.array((-1.0, 1.0, -1.0))
+    ends = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners)))))
+    along = np.interp(np.arange(0.0, ends[-1], SLIDE_MPS * STEP_S), ends, corners)
+    apart = np.full(round(APART_S / STEP_S), -0.01)
+    x = np.concatenate((np.full(len(down), corners[0]), along, np.full(len(apart), corners[-1])))
+    depth = np.concatenate((down, np.full(len(along), press.DEPTH_M), apart))
+    sliding = np.concatenate((np.zeros(len(down)), np.ones(len(along)), np.zeros(len(apart))))
+    number = np.repeat(np.arange(STROKES), len(x))
+    return np.tile(x, STROKES), np.tile(depth, STROKES), np.where(np.tile(sliding, STROKES) > 0, number, -1)
+
+
+def measure() -> GuardingFelt:
+    """Presses and strokes on each kind of wall, step by step."""
+    depth = press.depths(press.times(STEP_S))
+    x, below, sliding = strokes()
+    return GuardingFelt(
+        {kind: touched(kind, np.zeros(len(depth)), depth) for kind in KINDS},
+        {kind: touched(kind, x, below) for kind in KINDS},
+        sliding,
+    )
+
+
+def section(found: GuardingFelt | None = None) -> PageSection:
+    """What the press and the strokes feel of guarding, with bounds."""
+    found = found or measure()
+    read = found.presses["voluntary"].time > press.DURATION_S - press.READ_S
+    level = float(found.presses["voluntary"].contracted[read].mean())
+    voluntary, involuntary = (found.pressed_ratio(kind) for kind in ("voluntary", "involuntary"))
+    first, last = (found.slid_ratio("voluntary", stroke) for stroke in (0, STROKES - 1))
+    staying = found.slid_ratio("involuntary", STROKES - 1)
+    left = float(found.strokes["voluntary"].contracted[found.sliding == STROKES - 1].mean())
+    checks = (
+        Check("press, involuntary: over the relaxed wall", involuntary, "times", 2.0, 3.0, f"{RATIO:g} with the sphere of 10 mm"),
+        Check("press, voluntary: over the relaxed wall", voluntary, "times", 1.5, involuntary, "between relaxed and involuntary"),
+        Check(
+            "how far that is contracted when the press is read",
+            level,
+            "",
+            BY_HAND - 0.01,
+            BY_HAND + 0.01,
+            f"{BY_HAND:.3f}, by hand",
+        ),
+        Check("stroke, involuntary: over the relaxed wall", staying, "times", 0.9 * involuntary, 1.15 * involuntary, "the press"),
+        Check("first stroke, voluntary: over the relaxed wall", first, "times", 1.0, voluntary, "the press"),
+        Check(f"stroke {STROKES}, voluntary: over the relaxed wall", last, "times", 1.0, first, "the first stroke"),
+        Check("how far that is contracted", left, "", None, 0.1, "let go"),
+        Check("press over that stroke", voluntary / last, "times"),
+    )
+    text = (
+        f"A flat wall of the median person, all of it muscle of a ratio of {RATIO:g}, felt by the examination's indenter: by "
+        "the standard press, each into a patient at rest, and by strokes as an examination makes them (touch at "
+        f"{1e3 * TOUCH_MPS:g} mm/s, {1e3 * press.DEPTH_M:g} mm deep, along at {1e3 * SLIDE_MPS:g} mm/s, "
+        f"{np.count_nonzero(found.sliding == 0) * STEP_S:.1f} s each). A muscle that guards voluntarily gives way by a quarter "
+        "under the press, and wholly under slow strokes: who slides feels less there than who presses, and both are right. "
+        "(Involuntary guarding is felt a little more by strokes: the wall relaxes under them, a muscle does not.) "
+        "How fast guarding comes and goes is assumed."
+    )
+    data = {"ratio_pressed": {kind: found.pressed_ratio(kind) for kind in KINDS}}
+    return PageSection("guarding", "Guarding", text, checks, lambda f: draw(f, found), (7.0, 3.0), data)
+
+
+def draw(figure: Figure, found: GuardingFelt) -> None:
+    """The force of the press over time; what strokes feel over the relaxed wall, with what the press reads."""
+    pressing, sliding = figure.subplots(1, 2, width_ratios=(1, 1.4))
+    for kind, colour in zip(KINDS, (QUIET, COLOURS[1], COLOURS[0]), strict=True):
+        pressing.plot(found.presses[kind].time, found.presses[kind].force, color=colour, label=kind)
+        if kind == "relaxed":
+            continue
+        slid = np.where(found.sliding >= 0, found.strokes[kind].force, np.nan) / found.strokes["relaxed"].force.clip(1e-9)
+        sliding.plot(found.strokes[kind].time, slid, color=colour, label=f"{kind}, strokes")
+        sliding.axhline(found.pressed_ratio(kind), color=colour, lw=0.8, ls="--", label=f"{kind}, standard press")
+    pressing.axvspan(press.DURATION_S - press.READ_S, press.DURATION_S, color=INK, alpha=0.08, lw=0)
+    pressing.set(xlabel="time from the touch [s]", ylabel="force of the standard press [N]", ylim=(0, None))
+    pressing.legend(loc="upper left")
+    sliding.set(xlabel="time [s]", ylabel="force over the relaxed wall [1]", ylim=(0.9, None))
+    sliding.legend(loc="center right")
