@@ -44,7 +44,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))
         recording = _recording(folder / RUN_FOLDER)
-        collected = _collect(recording)
+        collected = collect(recording)
         if collected.findings is None or not collected.findings.final:
             _assess(scenario, recording, collected)
     except (RecordingError, ScenarioError) as error:
@@ -82,7 +82,7 @@ def _recording(folder: Path) -> Recording:
         raise RecordingError(str(error)) from error
 
 
-def _collect(recording: Recording) -> Collected:
+def collect(recording: Recording) -> Collected:
     """What the conductor would have collected."""
     collector = Collector()
     for _ in rerun(collector, contract(), _inputs(recording, collector.role), _tick_after(recording.last, collector.role)):

@@ -235,8 +235,9 @@ def in_words(s: scoring.Scores) -> str:
     parts += [f"size off by {100 * s.size_error:.0f} %"] if s.size_error is not None else []
     parts += [f"ratio off by {100 * s.ratio_error:.0f} %"] if s.ratio_error is not None else []
     if s.coverage_90 is not None:
-        inside = "" if s.coverage_90_in_lumps is None else f" ({100 * s.coverage_90_in_lumps:.0f} % in lumps)"
-        parts += [f"90 % band holds on {100 * s.coverage_90:.0f} %{inside}"]
+        places = (("in lumps", s.coverage_90_in_lumps), ("on guarding", s.coverage_90_on_guarding))
+        inside = ", ".join(f"{100 * share:.0f} % {where}" for where, share in places if share is not None)
+        parts += [f"90 % band holds on {100 * s.coverage_90:.0f} %" + (f" ({inside})" if inside else "")]
     return ", ".join(parts)
 
 

@@ -117,6 +117,8 @@ class Scores:
     coverage_90_in_lumps: float | None
     """The same within the areas of lumps."""
     findings: tuple[FindingScore, ...]
+    coverage_90_on_guarding: float | None = None
+    """The coverage where guarding is felt."""
 
 
 def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores:
@@ -139,7 +141,7 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores
     matched = [row for row in rows if row.lump is not None]
     palpable = sum(lump.palpable for lump in felt.lumps)
     held = [row.ratio_held for row in matched]
-    coverage, in_lumps = (None, None) if found_map is None else _coverage(found_map, truth)
+    coverage, in_lumps, on_guarding = (None, None, None) if found_map is None else _coverage(found_map, truth)
     return Scores(
         matched=len(matched),
         missed=palpable - len(matched),
@@ -154,6 +156,7 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores
         ratio_coverage_90=_mean([None if h is None else float(h) for h in held]),
         coverage_90=coverage,
         coverage_90_in_lumps=in_lumps,
+        coverage_90_on_guarding=on_guarding,
         findings=tuple(rows),
     )
 
@@ -224,18 +227,17 @@ def _finding_score(
     )
 
 
-def _coverage(found: Map, truth: Truth) -> tuple[float | None, float | None]:
-    """Part of the scanned area, and of what of it lies in lumps, on which the band holds the true apparent stiffness.
+def _coverage(found: Map, truth: Truth) -> tuple[float | None, ...]:
+    """Part of the scanned area, and of what of it lies in lumps and on guarding, on which the band holds the true stiffness.
 
     Where the press ended at its limit the band holds the truth when it reaches as far.
     """
-    xy = truth.touched.places(found.vertices[found.scanned, :2])
-    true, lower, upper = truth.felt.force(xy), found.lower[found.scanned], found.upper[found.scanned]
-    holds = (upper >= true) & ((lower <= true) | truth.felt.limited(xy))
-    weight = np.where(np.isfinite(true), truth.felt.surface.steepness(xy), 0.0)
-    within = weight * truth.felt.in_lump(xy)
-    whole, part = (float(w[holds].sum() / w.sum()) if w.sum() > 0 else None for w in (weight, within))
-    return whole, part
+    felt, xy = truth.felt, truth.touched.places(found.vertices[found.scanned, :2])
+    true, lower, upper = felt.force(xy), found.lower[found.scanned], found.upper[found.scanned]
+    holds = (upper >= true) & ((lower <= true) | felt.limited(xy))
+    weight = np.where(np.isfinite(true), felt.surface.steepness(xy), 0.0)
+    parts = (weight, weight * felt.in_lump(xy), weight * felt.inside(felt.guarded, xy))
+    return tuple(float(w[holds].sum() / w.sum()) if w.sum() > 0 else None for w in parts)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

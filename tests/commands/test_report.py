@@ -30,7 +30,8 @@ ISSUE_FIELDS = [
 FINDING_FIELDS = ["centroid_m", "quadrant", "area_m2", "ratio", "ratio_90", "confidence"]
 SCORE_FIELDS = [
     *("matched", "missed", "not_palpable", "false_findings", "on_guarding", "place_error_m", "absolute_error_m", "dice"),
-    *("size_error", "ratio_error", "ratio_coverage_90", "coverage_90", "coverage_90_in_lumps", "findings"),
+    *("size_error", "ratio_error", "ratio_coverage_90", "coverage_90", "coverage_90_in_lumps"),
+    *("coverage_90_on_guarding", "findings"),
 ]
 
 

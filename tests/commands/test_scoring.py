@@ -199,6 +199,14 @@ def test_coverage_in_lumps_is_apart() -> None:
     assert s.coverage_90_in_lumps == 0.0
 
 
+def test_coverage_on_guarding_is_apart() -> None:
+    guarded = (np.array((0.05, 0.0)), 0.03)
+    s = scoring.score([], found_map([]), truth([], guarded=guarded))
+    assert s.coverage_90_on_guarding == 0.0
+    assert s.coverage_90 == pytest.approx(1 - np.pi * 0.03**2 / 0.04, abs=0.05)
+    assert scoring.score([], found_map([]), truth([])).coverage_90_on_guarding is None
+
+
 def test_a_band_above_a_press_that_ended_at_its_limit_holds() -> None:
     assert scoring.score([], found_map([], 1.5), truth([], limited=True)).coverage_90 == 1.0
     assert scoring.score([], found_map([], 0.5), truth([], limited=True)).coverage_90 == 0.0
