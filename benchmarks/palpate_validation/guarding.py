@@ -88,7 +88,7 @@ def touched(kind: str, x: Array, depth: Array) -> Touched:
         p = np.array((x[k], 0.0, RADIUS_M - depth[k]))
         force[k] = tissue.step(0.0, p, (p - before) / STEP_S, RADIUS_M)[0][2]
         contracted[k], before = tissue.activation, p
-    return Touched(STEP_S * np.arange(1, len(x) + 1), force, contracted)
+    return Touched(STEP_S * np.arange(1.0, len(x) + 1), force, contracted)
 
 
 def strokes() -> tuple[Array, Array, Array]:

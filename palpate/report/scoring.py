@@ -141,7 +141,7 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores
     matched = [row for row in rows if row.lump is not None]
     palpable = sum(lump.palpable for lump in felt.lumps)
     held = [row.ratio_held for row in matched]
-    coverage, in_lumps, on_guarding = (None, None, None) if found_map is None else _coverage(found_map, truth)
+    coverage, in_lumps, guarding = (None, None, None) if found_map is None else _coverage(found_map, truth)
     return Scores(
         matched=len(matched),
         missed=palpable - len(matched),
@@ -156,7 +156,7 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores
         ratio_coverage_90=_mean([None if h is None else float(h) for h in held]),
         coverage_90=coverage,
         coverage_90_in_lumps=in_lumps,
-        coverage_90_on_guarding=on_guarding,
+        coverage_90_on_guarding=guarding,
         findings=tuple(rows),
     )
 
