@@ -38,7 +38,7 @@ BY_HAND = (0.25 + 0.75 * math.exp(-press.DEPTH_M / press.SPEED_MPS / FADING_S)) 
 
 
 @dataclass(frozen=True)
-class Touched:
+class GuardedTouch:
     """What was felt of one wall by a way of the sphere; n instants."""
 
     time: Array
@@ -53,8 +53,8 @@ class Touched:
 class GuardingFelt:
     """The standard press and the strokes on the three walls of `KINDS`."""
 
-    presses: dict[str, Touched]
-    strokes: dict[str, Touched]
+    presses: dict[str, GuardedTouch]
+    strokes: dict[str, GuardedTouch]
     sliding: Array
     """At which instants of the strokes the sphere slides at depth: the number of the stroke, -1 elsewhere, shape (n,)."""
 
@@ -79,7 +79,7 @@ def wall(kind: str) -> WinklerTissue:
     )
 
 
-def touched(kind: str, x: Array, depth: Array) -> Touched:
+def touched(kind: str, x: Array, depth: Array) -> GuardedTouch:
     """Moves the sphere along the wall, each millisecond to the next `x` [m] and `depth` [m]; above the skin where that is < 0."""
     tissue = wall(kind)
     force, contracted = np.zeros(len(x)), np.zeros(len(x))
@@ -88,7 +88,7 @@ def touched(kind: str, x: Array, depth: Array) -> Touched:
         p = np.array((x[k], 0.0, RADIUS_M - depth[k]))
         force[k] = tissue.step(0.0, p, (p - before) / STEP_S, RADIUS_M)[0][2]
         contracted[k], before = tissue.activation, p
-    return Touched(STEP_S * np.arange(1.0, len(x) + 1), force, contracted)
+    return GuardedTouch(STEP_S * np.arange(1.0, len(x) + 1), force, contracted)
 
 
 def strokes() -> tuple[Array, Array, Array]:

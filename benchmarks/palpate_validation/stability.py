@@ -86,17 +86,18 @@ def section(found: Stability | None = None) -> PageSection:
     checks = []
     for margin in found.margins:
         name = f"x{margin.contrast:g} wall, K_z = {margin.stiffness:g} N/m, {WORDS[margin.path]}: quiet up to"
-        if margin.path == "contact":
-            checks.append(Check(name, margin.measured_ms, "ms a message", low=LARGEST_MS, against=f"theory: {margin.theory_ms}"))
-            continue
-        low, high = margin.theory_ms - AGREE_MS, min(margin.theory_ms, LARGEST_MS) + AGREE_MS
-        checks.append(Check(name, margin.measured_ms, "ms a message", low, high, f"theory: {margin.theory_ms}"))
+        low, high = margin.theory_ms - AGREE_MS, margin.theory_ms + AGREE_MS
+        tried_all = margin.theory_ms >= LARGEST_MS
+        against = f"theory: {margin.theory_ms}" + (" or more" if tried_all else "")
+        checks.append(Check(name, margin.measured_ms, "ms a message", low, None if tried_all else high, against))
+    late = {m.contrast: m.measured_ms for m in found.margins if m.path == "all"}
     for contrast in CONTRASTS:
         quiet = [ms for ms, ringing in zip(DELAYS_MS, found.jitter[contrast], strict=True) if ringing.stable]
         checks.append(
-            Check(f"x{contrast:g} wall: quiet with jitter up to", max(quiet), "ms", low=8, against=f"of {DELAYS_MS[-1]} tried")
+            Check(f"x{contrast:g} wall: quiet with jitter up to", max(quiet), "ms", late[contrast], against="all messages late")
         )
     control = [m.measured_ms for m in found.margins if m.path == "control" and m.stiffness == STIFFNESS_NPM]
+    contact = [m.measured_ms for m in found.margins if m.path == "contact"]
     softest = next(m.measured_ms for m in found.margins if m.stiffness == SOFTER_NPM[-1])
     text = (
         "Robot, tissue and controller as a run has them (K_z = 5000 N/m), pressed 10 mm deep in the posture of an examination; "
@@ -106,8 +107,9 @@ def section(found: Stability | None = None) -> PageSection:
         f"{softest} ms "
         f"with K_z = {SOFTER_NPM[-1]:g} N/m: it is not the contact that turns over but the controller's spring across the tool, "
         f"for with a quarter of its 3000 N/m theory gives {found.soft_across_ms} ms. "
-        f"The path between robot and tissue, which hardware does not have, bears {LARGEST_MS} ms and more (no more was tried). "
-        "Theory: the arm's seven joints, linearised, by Nyquist's criterion. Beyond the margin a ring grows until the driver "
+        f"The path between robot and tissue, which hardware does not have, bears {min(contact)} ms at least ({LARGEST_MS} were "
+        "tried). Jitter makes a message late by half of its most in the mean, so more of it is borne than of delay. Theory: the "
+        "arm's seven joints, linearised, by Nyquist's criterion. Beyond the margin a ring grows until the driver "
         "holds (crosses)."
     )
     data = {
