@@ -25,6 +25,8 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = Path("docs/notebooks")
 PICTURES = {".png", ".gif", ".svg", ".mp4", ".csv", ".css"}
 """And what else a page uses or links to."""
+DIAGRAM = re.compile(r"```mermaid\n.*?```\n", re.DOTALL)
+"""A diagram that a browser would draw with a library from the network."""
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")
 
 
@@ -74,7 +76,8 @@ def within_the_site(page: Path, pages: set[Path]) -> str:
             return f"[{words}]({Path(where).with_suffix('.md')}{anchor})"
         return found[0] if target in pages else words
 
-    return LINK.sub(link, (ROOT / page).read_text(encoding="utf-8"))
+    text = DIAGRAM.sub("*The page in the repository draws this as a diagram.*\n", (ROOT / page).read_text(encoding="utf-8"))
+    return LINK.sub(link, text)
 
 
 if __name__ == "__main__":
