@@ -119,7 +119,7 @@ def _options(
 
 
 def _listed() -> None:
-    """Stands for a command in the list of all."""
+    """Stands for a command in the list of commands."""
 
 
 def _add(app: typer.Typer, word: str) -> None:
@@ -128,7 +128,7 @@ def _add(app: typer.Typer, word: str) -> None:
         command = getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
         _lacking(word, error)
-    except ValueError as error:  # a contract of one's own that cannot be used
+    except ValueError as error:  # a contract of your own that cannot be used
         print(f"palpate: {error}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
     if isinstance(command, typer.Typer):

@@ -1,4 +1,4 @@
-"""`palpate scenarios` and `palpate topics`: what there is."""
+"""`palpate scenarios` and `palpate topics`: lists of scenarios and topics."""
 
 from __future__ import annotations
 

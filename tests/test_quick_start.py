@@ -73,8 +73,8 @@ def test_the_service_that_a_page_shows_is_one(page: str, name: str, tmp_path: Pa
     for k, t in enumerate((0, MS), 1):
         joints = JointState(header(t), [f"A{i}" for i in range(1, 8)], np.zeros(7), np.full(7, 0.1), np.zeros(7))
         stepper.buffers["joint_states"].accept(k, codec.encode(joints, "sensor_msgs/msg/JointState"))
-        ((port, payload, _),) = stepper.step(t)
-        assert violations(port.topic, codec.decode(payload, port.topic.type), t) == []
+        ((port, packet),) = stepper.step(t)
+        assert violations(port.topic, codec.decode(packet.payload, port.topic.type), t) == []
 
 
 @pytest.mark.slow

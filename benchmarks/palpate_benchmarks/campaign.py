@@ -39,7 +39,7 @@ SETTINGS: Final = (
     "camera.frames=2",
     "limits.release_patience_s=0.5",
 )
-"""A small region on the lesion of clean, so that a case takes seconds, and nobody waits long for an operator."""
+"""A small region on the lesion of clean, so that a case takes seconds and does not wait long for an operator."""
 PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
 HANG_S: Final = 90.0
 """A case that takes longer after its fault has hung."""

@@ -34,7 +34,7 @@ def limits(report: Report, deformation_mm: float, peak_ratio: float) -> list[Lim
     return [
         Limit(
             "DART has one stiffness a body: it is switched for the whole body while the tool is in the stiff area",
-            "stiffness is a field over the surface: every vertex has its own, with a smooth edge, whoever touches it",
+            "stiffness is a field over the surface: every vertex has its own, with a smooth edge",
             f"figure 8; one map holds stiffnesses up to {peak_ratio:.1f} times its median",
         ),
         Limit(

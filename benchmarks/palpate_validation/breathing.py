@@ -29,7 +29,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Breaths:
-    """Breaths as somebody measures them who sees the navel move; n of them."""
+    """n breaths, as an observer of the navel measures them."""
 
     inspiration: Array
     """Rise of the wall [s], shape (n,)."""

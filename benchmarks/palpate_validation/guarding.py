@@ -30,7 +30,7 @@ HALF_WAY_M = 0.05
 """A stroke slides to and fro, so far to either side."""
 STROKES = 4
 APART_S = 1.0
-"""Time between strokes, in which nobody touches. What it is does not matter: guarding then stays as it is."""
+"""Time between strokes, without touch. Its length does not matter: guarding does not change meanwhile."""
 BY_HAND = (0.25 + 0.75 * math.exp(-press.DEPTH_M / press.SPEED_MPS / FADING_S)) * math.exp(
     -(press.HOLD_S - press.READ_S / 2) / FADING_S
 )

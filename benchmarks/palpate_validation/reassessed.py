@@ -3,9 +3,10 @@
     palpate run healthy --seed 1000 --composed --record normal -o runs/1000 --set errors=none ...
     OPENBLAS_NUM_THREADS=1 python -m palpate_validation.reassessed runs/* --row "depth off by 1 mm"
 
-What a row adds is told to nobody. Prints a line of a Markdown table a row: healthy patients with a finding and lumps found, with
-Wilson's 95 % intervals; on which part of the area, and of that in lumps, the map's 90 % band holds, with the interval of the mean
-by bootstrap over patients; and how many of the matched findings hold the true ratio in their own band.
+The assessment does not know what a row adds. Prints a line of a Markdown table for each row: healthy patients with a finding and
+lumps found, with Wilson's 95 % intervals; on which part of the area, and of that in lumps, the map's 90 % band holds, with
+the interval of the mean by bootstrap over patients; and how many of the matched findings hold the true ratio in their own
+band.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@
     if __name__ == "__main__":
         main("control", load_scenario)
 
-The word names an implementation or a file of one's own (see `implementations`); without it the scenario's `services.control` says
+The word names an implementation or a file of your own (see `implementations`); without it the scenario's `services.control` says
 which. What the process is told about the run comes from `Settings`, which reads the environment.
 """
 

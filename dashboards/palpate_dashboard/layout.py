@@ -19,7 +19,7 @@ def _whole_past() -> Any:
 
 
 _HIDDEN = rrb.EntityBehavior(visible=False)
-"""Shown when somebody asks for it, by the eye beside its name in the viewer. Nothing of the truth is in the picture before."""
+"""Shown when the user clicks the eye beside its name in the viewer. Until then the picture shows nothing of the truth."""
 
 
 def _scene() -> Any:

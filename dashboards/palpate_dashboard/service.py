@@ -82,7 +82,7 @@ class DashboardService(Service):
     def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True, full: bool = True) -> None:
         """Of the truth in `scenario` it makes a page, no more; `paced`: whether its speed is worth showing.
 
-        Without a `path` nothing is kept in a file. Unless it is `full`, meshes and images come seldom where nobody watches.
+        Without a `path` nothing is written to a file. Unless `full`, meshes and images come seldom while no viewer is connected.
 
         Raises OSError if `path` is not writable.
         """

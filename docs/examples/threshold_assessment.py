@@ -1,4 +1,4 @@
-"""An assessment of one's own: whatever takes more than twice the force of the softest tenth is stiff."""
+"""Your own assessment: whatever takes more than twice the force of the softest tenth is stiff."""
 
 import numpy as np
 

@@ -84,7 +84,7 @@ plt.show()
 # %% [markdown]
 # ## What is true
 #
-# The patient holds the truth, and shows it to whoever holds the patient: his skin at rest, and the stiffness of the wall at each
+# The patient object knows the truth and shows it: the skin at rest, and the stiffness of the wall at each
 # place. No examination is ever given it.
 
 # %%

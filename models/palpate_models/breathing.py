@@ -56,7 +56,7 @@ class Breathing(Section):
     """Correlation of a breath's duration, depth and share of inspiration with those of the breath before (Tobin 1995: 0.26 of
     the expiratory time, 0.30 of the tidal volume, 0.20 of the inspiratory time) [V]."""
     breathes_s: Positive = 40.0
-    """How long somebody who holds the breath breathes before each time (kind: held) [A]."""
+    """How long a patient who holds the breath breathes between holds (kind: held) [A]."""
     held_s: Annotated[float, Field(gt=0, le=120)] = 20.0
     """For how long the breath is held each time (kind: held) [A]."""
     coughs_per_min: Annotated[float, Field(ge=0, le=20)] = 0.0
@@ -96,7 +96,7 @@ class BreathingCurve:
         self.largest_m = float(self.table[:, 4].max(initial=0.0))
         """Largest excursion [m] there will ever be."""
         self.repeats_s = float(self.table[:, 1:4].sum())
-        """Length of the table [s]; 0 for somebody who does not breathe."""
+        """Length of the table [s]; 0 for a patient who does not breathe."""
         moving = self.table[:, 1:3].sum(axis=1)
         self.mean_m = float(self.table[:, 4] @ moving / 2 / self.repeats_s) if self.repeats_s else 0.0
         """Mean excursion [m]: half of its amplitude while a breath moves, none in its pause."""
@@ -124,7 +124,7 @@ STILL = BreathingCurve(Breathing(kind="none"), 0)
 
 
 def _breaths(breathing: Breathing, seed: int) -> Array:
-    """The table of somebody who breathes, shape (n, 5)."""
+    """The table of a patient who breathes, shape (n, 5)."""
     streams = np.random.SeedSequence([seed, crc32(b"breathing")]).spawn(2)
     breaths, coughs = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
     rows: list[tuple[float, float, float, float, float]] = []

@@ -1,7 +1,7 @@
 """Functions of numbers and arrays, compiled by numba: for loops that numpy cannot express without making arrays.
 
 Compiled code is kept beside its source, or in NUMBA_CACHE_DIR, or in the user's cache; where none can be written to it is made
-anew by every process. A function compiles at its first call, so whoever has a deadline calls it once before.
+anew by every process. A function compiles at its first call, so a caller with a deadline calls it once beforehand.
 
 numba compiles a function anew when its own file has changed. What it calls is compiled into it, and may stand in another file of
 the package; so here all that is kept for a folder goes when any file of its package, sub-packages included, has changed. A

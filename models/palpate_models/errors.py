@@ -106,7 +106,7 @@ class PoseErrors(Section):
     rotation_rad: Angle = 0.0
     """Standard deviation about each axis."""
     offset: Pose = Pose()
-    """An error of one's own choice, on top of what is drawn."""
+    """An error of your own choice, on top of what is drawn."""
 
 
 class ArmErrors(Section):

@@ -15,7 +15,7 @@ Made from [`errors.py`](../models/palpate_models/errors.py) and
 [`error_levels.yaml`](../models/palpate_models/error_levels.yaml) by `make docs`.
 
     palpate run --set errors=typical                              a level: none, typical or poor; {LEVEL} is the default
-    palpate run --set errors=poor --set errors.force.tare_n=0.1   a level, and a field of one's own
+    palpate run --set errors=poor --set errors.force.tare_n=0.1   a level, and a field of your own
 
 From the seed of the scenario one set of equipment is drawn for each patient: the errors below are standard deviations or bounds
 of what is drawn, as each field says. Simulated robot, tool, sensor and camera, and the true pose of the patient, have these
@@ -23,7 +23,7 @@ errors. Control, planning, perception, assessment and supervisor have the nomina
 the errors nor the seed. Drivers of real hardware (`lbr`, `ros`) ignore this section; the emulator of the LBR has it.
 
 The level `none` is a clean world for tests: the white noise of good sensors, and the constant bias of a force/torque sensor,
-which every examination tares. A pose's `offset` adds an error of one's own choice to what is drawn.
+which every examination tares. A pose's `offset` adds an error of your choice to what is drawn.
 
 Marks of certainty: V read in the source (mostly abstracts and threads of issues; "name #n" is one of that repository), S
 second-hand, C computed by us, A assumed. A mark in brackets inside a source holds for the words before it.

@@ -43,7 +43,7 @@ class Activation:
         g = max(ramp(depth; GENTLE_DEPTH_M, DEEP_M), ramp(speed; GENTLE_SPEED_MPS, FAST_MPS))
 
     A ramp is 0 below the first of its limits and 1 above the second.
-    Involuntary guarding stays at 1. Voluntary guarding stays as it was while nobody touches. No measurement says how fast
+    Involuntary guarding stays at 1. Voluntary guarding does not change without touch. No measurement says how fast
     guarding comes and goes, so all constants are assumptions.
     """
 

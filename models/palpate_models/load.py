@@ -18,7 +18,7 @@ from palpate_models.scenario import ExamInput, PlantInput, Scenario
 from palpate_models.section import Pose
 
 View = Literal["scenario", "plant", "exam"]
-"""How much of a scenario somebody is given; a run's folder has a file of each."""
+"""How much of a scenario a role is given; a run's folder has a file of each kind."""
 _PATIENT: dict[str, Any] = {"name": True, "description": True, "phantom": True, "tissue": True, "services": {"tissue"}}
 HIDDEN: Mapping[View, dict[str, Any]] = {
     "scenario": {},

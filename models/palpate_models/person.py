@@ -85,7 +85,7 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
 
 
 def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
-    """The wall of somebody whose ln k_w, ln length and stiffening are given; relaxation and friction vary [A]."""
+    """The wall of a person whose ln k_w, ln length and stiffening are given; relaxation and friction vary [A]."""
     usual = Stiffness()
     k_w, length = np.exp(people[:2]).tolist()
     relaxing = np.array(usual.prony_g) * np.exp(0.2 * rng.standard_normal(len(usual.prony_g)))

@@ -15,7 +15,7 @@ LISTEN = "tcp/127.0.0.1:7447"
 
 
 def check_command(  # noqa: PLR0913 - the options of a command
-    role: Annotated[str, typer.Argument(help="A role, such as tissue; of a role that there is not, it says which there are.")],
+    role: Annotated[str, typer.Argument(help="A role, such as tissue. An unknown one gives a list of all.")],
     connect: Connect = None,
     listen: Annotated[str, typer.Option(help="Where the check waits for the implementation, as a router.")] = LISTEN,
     start: Annotated[str | None, typer.Option(metavar="COMMAND", help="Start the implementation with this command.")] = None,
@@ -34,7 +34,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
     """Check an implementation of a role: rates, ranges, signs, frames, limits, expiry and safe hold, garbage and silence.
 
     The check plays the conductor and all other roles. Leaves with status 0 when everything passed, 1 when something failed, 2
-    when nobody came. docs/conformance.md says what an implementation has to do.
+    when no implementation joined. docs/conformance.md says what an implementation has to do.
     """
     from palpate.check.perform import check_here, check_live, print_report
     from palpate.check.rig import RigSettings

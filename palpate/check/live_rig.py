@@ -68,7 +68,7 @@ class LiveRig(Rig):
     # -- the conversation
 
     def await_implementation(self, seconds: float, report: ConformanceReport) -> None:
-        """Waits for the role to appear, greets it and starts it. Raises NoBus when nobody comes within `seconds`."""
+        """Waits for the role to appear, greets it and starts it. Raises NoBus when it does not appear within `seconds`."""
         report.section("protocol")
         gc.freeze()  # a full collection in mid-check would keep commands back longer than they are valid
         end = monotonic() + seconds

@@ -50,7 +50,7 @@ class Rig(ABC):
     """One implementation of a role under test."""
 
     live = False
-    """Whether time is the wall's and the implementation is somebody else's process."""
+    """Whether it runs in real time and the implementation is a separate process."""
 
     def __init__(self, role: str, settings: RigSettings, rules: Contract | None = None) -> None:
         self.rules = rules or contract()

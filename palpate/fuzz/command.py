@@ -16,7 +16,7 @@ def fuzz(
     inputs: Annotated[int, typer.Option(min=1, help="Inputs in all.")] = 100_000,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same inputs.")] = 0,
 ) -> None:
-    """Feed broken bytes to all that reads from the bus, and see that each is refused as it should be."""
+    """Feed invalid bytes to everything that reads from the bus, and check that all are rejected."""
     from palpate.fuzz.fuzz import campaign, choose
 
     console = Console(stderr=True)

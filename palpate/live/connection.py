@@ -1,4 +1,4 @@
-"""How a tool joins the bus of a run that somebody else started; which one, `palpate_bus.runs.joining` finds."""
+"""How a tool joins the bus of a run in another process, which `palpate_bus.runs.joining` finds."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ def joined(connect: Sequence[str] | None, chosen: str | None, domain: int | None
 
 
 def settle(bus: zenoh.Session, options: BusOptions) -> None:
-    """Waits until every endpoint has answered, at most `FIND_S`. Raises NoBus when nobody has."""
+    """Waits until every endpoint has answered, at most `FIND_S`. Raises NoBus when none has."""
     wanted = len(options.connect) + bool(options.router)
     end = monotonic() + FIND_S
     while (links := len(bus.info.peers_zid()) + len(bus.info.routers_zid())) < wanted and monotonic() < end:
         sleep(0.02)
     if wanted and not links:
         tried = ", ".join((*options.connect, *([options.router] if options.router else [])))
-        raise NoBus(f"nobody answers at {tried}")
+        raise NoBus(f"no answer at {tried}")

@@ -35,9 +35,9 @@ def dashboard(  # noqa: PLR0913 - the options of a command
         Path | None, typer.Option("--film", metavar="GIF", help="Write a recorded run as a film, by a headless browser, and end.")
     ] = None,
 ) -> None:
-    """Watch a run: live in the browser, joined late or not, or from its recording. It slows no run down.
+    """Watch a run live in the browser, from its start or later, or from its recording. This does not slow the run down.
 
-    While it shows a live run, keys in its terminal are an operator's hand on it: s soft stop (the arm retreats and waits),
+    While it shows a live run, keys in its terminal are an operator's controls: s soft stop (the arm retreats and waits),
     e emergency stop (the driver holds), r release.
     """
     from palpate.live.viewing import NothingToShow, recording, the_run, view, watch

@@ -150,7 +150,7 @@ def _clock(live: LiveMonitor) -> list[Remark]:
     time, progress = live.monitor.time.now, live.monitor.time.progress
     if time is not None:
         kind = "wall-clock" if live.monitor.wallclock else "simulated"
-        moves = f"at {progress:.2f} x real time" if progress else "stands still (paused, or somebody holds it up)"
+        moves = f"at {progress:.2f} x real time" if progress else "stands still (paused, or a service holds it up)"
         findings.append(Remark("clock", Severity.OK if progress else Severity.WARN, f"{kind} time {time / 1e9:.2f} s, {moves}"))
     else:
         findings.append(Remark("clock", Severity.WARN, "no time: no stamped message came"))
@@ -194,7 +194,7 @@ def _waiting(live: LiveMonitor) -> list[Remark]:
             findings.append(Remark("progress", Severity.WARN, f"{role} has said nothing for {now - report.heard:.0f} s"))
     if live.reports and live.monitor.time.progress == 0:
         for role, report in sorted(live.reports.items()):
-            wait = f"waits for {report.waiting_for}" if report.waiting_for else "waits for nobody"
+            wait = f"waits for {report.waiting_for}" if report.waiting_for else "waits for no service"
             findings.append(Remark("progress", Severity.WARN, f"{role} is at {report.tick / 1e9:.3f} s and {wait}"))
     elif live.reports:
         slowest = min(live.reports, key=lambda role: live.reports[role].tick)

@@ -1,4 +1,4 @@
-"""`palpate doctor`: is this bus well, and if not, who is to blame."""
+"""`palpate doctor`: checks a live bus, and names the cause of what is wrong."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def doctor(
     watch: Annotated[bool, typer.Option("--watch", help="Go on, and print every violation as it comes, until Ctrl-C.")] = False,
     clean: Annotated[bool, typer.Option("--clean", help="Only remove what killed runs left on this machine.")] = False,
 ) -> None:
-    """Examine a live bus: versions, endpoints, shared memory, clocks, who is missing, and every topic against the contract.
+    """Check a live bus: versions, endpoints, shared memory, clocks, missing roles, and every topic against the contract.
 
-    Leaves with status 0 when all is well, 1 when something is in trouble, 2 when there is no bus.
+    The exit status is 0 when all is well, 1 when something is wrong, 2 when there is no bus.
     """
     if clean:
         left = remove_leftovers()
@@ -103,7 +103,7 @@ def _row(health: TopicHealth) -> tuple[str, ...]:
     if health.violations:
         state = "[bold red]violates[/]"
     elif not health.senders:
-        state = "[dim]nobody[/]"
+        state = "[dim]no sender[/]"
     wanted = "latched" if topic.latched else "event" if topic.event else f"{1000 / topic.period_ms:g}"
     periodic = topic.periodic and health.messages
     return (

@@ -28,7 +28,7 @@ class Heard(NamedTuple):
 
 
 class Listener:
-    """Hears every message of a topic, whoever sends it; of a latched one also what was sent before."""
+    """Receives every message of a topic from any sender; of a latched topic also the last one before it began."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()

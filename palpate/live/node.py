@@ -1,4 +1,4 @@
-"""`palpate node list`: who is on the bus."""
+"""`palpate node list`: the nodes on the bus."""
 
 from __future__ import annotations
 

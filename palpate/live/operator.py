@@ -1,4 +1,4 @@
-"""`palpate stop`, `release`, `pause`, `resume`, `step`: an operator's hand on a run in another terminal."""
+"""`palpate stop`, `release`, `pause`, `resume`, `step`: an operator controls a run from another terminal."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def stop(
     ] = False,
     run: Named = None,
 ) -> None:
-    """Stop a run at once: the arm is held safely until `palpate release`. Without --run: every run of this machine."""
+    """Stop a run at once: the arm holds safely until `palpate release`. Without --run, every run on this machine stops."""
     _say("soft-stop" if soft else "stop", reason, run, everyone=True)
 
 
@@ -38,17 +38,17 @@ def release(
     reason: Annotated[str, typer.Option(help="Why, for the record.")] = "palpate release",
     run: Named = None,
 ) -> None:
-    """Lift a stop: the examination goes on where it was, or goes home and ends."""
+    """Release a stop: the examination continues where it was, or with --end the arm goes home and the run ends."""
     _say("end" if end else "release", reason, run)
 
 
 def pause(run: Named = None) -> None:
-    """Let simulated time stand, within half a simulated second. Not with --wallclock, and no stop: nothing retreats."""
+    """Pause simulated time, within half a simulated second. No safety stop: the arm does not retreat. Not with --wallclock."""
     _say("pause", "palpate pause", run)
 
 
 def resume(run: Named = None) -> None:
-    """Let the time of a paused run go on."""
+    """Resume a paused run."""
     _say("resume", "palpate resume", run)
 
 
@@ -56,7 +56,7 @@ def step(
     ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milliseconds.")] = 1,
     run: Named = None,
 ) -> None:
-    """Let a paused run go on for a moment."""
+    """Advance a paused run by some milliseconds."""
     _say("step", "palpate step", run, ms=ms)
 
 

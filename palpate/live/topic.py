@@ -44,7 +44,7 @@ def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain =
             if row is not None and {(row.type, row.type_hash)} != topic.types:
                 known = "[bold red]other type or hash[/]"
             types = ", ".join(sorted(name.replace("/msg/", "/") for name, _ in topic.types))
-            who = ", ".join(sorted(topic.publishers)) or "[yellow]nobody[/]"
+            who = ", ".join(sorted(topic.publishers)) or "[yellow]none[/]"
             out.add_row(topic.name, types, who, ", ".join(sorted(topic.subscribers)), known)
         console().print(out)
 
@@ -96,7 +96,7 @@ def echo(  # noqa: PLR0913 - the options of a command
     domain: Domain = None,
     as_json: AsJson = False,
     field: Annotated[str | None, typer.Option(help="Only this field, e.g. wrench.force.")] = None,
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after N messages.")] = None,
     once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
     full: Annotated[bool, typer.Option("--full", help="Long arrays in full.")] = False,
     seconds: Seconds = None,

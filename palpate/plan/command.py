@@ -17,9 +17,9 @@ def plan(
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     settings: Settings = None,
 ) -> None:
-    """Draw what an examination is going to do: its targets, their order, the time, and what is out of reach.
+    """Draw what an examination will do: its targets, their order, the time, and what is out of reach.
 
-    It is planned as in the examination, on the patient's true surface; a camera sees it to within some millimetres.
+    The plan is that of the examination, but on the patient's true surface, which a camera sees with an error of some millimetres.
 
     [bold]Examples[/]
 

@@ -22,7 +22,7 @@ def report(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
 ) -> None:
-    """Make report.html of a run again: one page for a clinician or an engineer, without references to anything outside."""
+    """Rebuild report.html of a run: one self-contained page for a clinician or an engineer."""
     from palpate.report.archive import EvidenceError
     from palpate.report.page import write_page
     from palpate.report.printing import PrintError, write_pdf

@@ -48,7 +48,7 @@ class TruthRow(_Row):
     """What can truly be felt of the patient, found out by pressing a copy of him."""
 
     felt: bool
-    """Whether a copy could be made: not of somebody else's FMU, nor of what is real. Without it nothing is scored."""
+    """Whether a copy could be made: not of a foreign FMU, nor of real tissue. Without it nothing is scored."""
     lumps: list[LumpRow]
 
 

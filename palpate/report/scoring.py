@@ -100,7 +100,7 @@ class Scores:
     matched: int
     missed: int
     not_palpable: int
-    """Lumps that nobody could feel by the standard press: neither matched nor missed."""
+    """Lumps that the standard press cannot feel: neither matched nor missed."""
     false_findings: int
     on_guarding: int
     """Those of them that overlap guarded muscle."""

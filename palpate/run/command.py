@@ -47,7 +47,7 @@ def run(  # noqa: PLR0913 - the options of a command
     ] = None,
     repeat: Annotated[
         int,
-        typer.Option(metavar="N", min=1, help="So many examinations, each with a folder and a seed of its own; see soak.json."),
+        typer.Option(metavar="N", min=1, help="Run N examinations, each with its own folder and seed; see soak.json."),
     ] = 1,
     settings: Settings = None,
     services: ServiceChoices = None,
@@ -56,7 +56,7 @@ def run(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Run an examination and write report, map and recordings.
 
-    In a terminal, keys are an operator's hand on it: s soft stop (the arm retreats and waits), e emergency stop (the driver
+    In a terminal, keys are an operator's controls: s soft stop (the arm retreats and waits), e emergency stop (the driver
     holds), r release.
 
     [bold]Examples[/]

@@ -35,7 +35,7 @@ def run_distributed(
 ) -> RunResult:
     """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
 
-    The roles of `absent` are left to somebody else to start; `groups` are the roles of each process, by default one each.
+    The user starts the roles of `absent`; `groups` are the roles of each process, by default one each.
 
     Raises ProcessListError when the compose file cannot be used, ChoiceError when a service cannot, PlacementError when it cannot
     share a process, BusConfigError when the certificates cannot; later failures are in the result.

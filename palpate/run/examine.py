@@ -175,7 +175,7 @@ def _rate(scenario: Scenario) -> float:
         if rate < 1.0:
             say(f"this machine keeps {rate:g} of real time now: {kept.words}")
     if rate < 1.0 and scenario.services.tissue == NONE:
-        refuse("services.tissue = 'none' is for hardware, whose clock nobody can slow down")
+        refuse("services.tissue = 'none' is for hardware, which cannot be slowed down")
     return rate
 
 

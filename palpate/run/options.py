@@ -15,7 +15,7 @@ ServiceChoices = Annotated[
     typer.Option(
         "--service",
         metavar="ROLE=NAME_OR_FILE",
-        help="Who plays a role: an installed implementation, or a Python file with create(scenario). Short for "
+        help="The implementation of a role: an installed one, or a Python file with create(scenario). Short for "
         "--set services.ROLE=...; may be repeated.",
     ),
 ]

@@ -40,7 +40,7 @@ class PlaceError(ValueError):
 
 
 class ServicePlace(NamedTuple):
-    """A process that somebody else may start."""
+    """A process that the user may start."""
 
     command: tuple[str, ...]
     environment: Mapping[str, str]
@@ -153,7 +153,7 @@ def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
 
 
 def join(
-    role: Annotated[str, typer.Argument(help="The role that the run was told to do without.")],
+    role: Annotated[str, typer.Argument(help="The role that the run was started without.")],
     service: NameOrFile = None,
     run: RunName = None,
 ) -> NoReturn:

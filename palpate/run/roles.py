@@ -57,7 +57,7 @@ def settings_of(options: Sequence[str]) -> list[str]:
 
 
 def checked(scenario: Scenario) -> Scenario:
-    """The scenario with files of one's own by their absolute path, after all its choices were found to exist.
+    """The scenario with files of your own by their absolute path, after all its choices were found to exist.
 
     Raises ChoiceError that names the scenario, the field, its value and what is allowed.
     """
@@ -89,7 +89,7 @@ def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
     Only scenario.yaml names the run: what the examination is given shall be the same whenever the examination is.
     """
     (out / "logs").mkdir(parents=True, exist_ok=True)
-    for name in RESULTS:  # of an earlier run in the same folder: nobody is to take them for this one's
+    for name in RESULTS:  # of an earlier run in the same folder, which could be taken for results of this one
         (out / name).unlink(missing_ok=True)
     named = f"# run {name_run(out)}\n"
     for view in HIDDEN:

@@ -127,7 +127,7 @@ def _attempt(line: str) -> Attempt:
 
 
 def _listen(lines: queue.Queue[str]) -> None:
-    """Passes on what comes in; at the end of it whoever wanted results is gone."""
+    """Passes on what comes in; at its end the process that wanted results is gone."""
     for line in sys.stdin:
         lines.put(line)
     os._exit(0)

@@ -25,7 +25,7 @@ class _RunByDefault(typer.core.TyperGroup):
         return super().parse_args(ctx, words)
 
 
-app = typer.Typer(cls=_RunByDefault, no_args_is_help=True, help="Examine many drawn patients, and say how well that went.")
+app = typer.Typer(cls=_RunByDefault, no_args_is_help=True, help="Examine many randomly drawn patients and score the results.")
 
 
 @app.command("list")
@@ -57,9 +57,9 @@ def run(  # noqa: PLR0913 - the options of a command
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the result only.")] = False,
 ) -> None:
-    """Run a study, or go on with one that was stopped.
+    """Run a study, or continue one that was stopped.
 
-    `--service ROLE=NAME_OR_FILE` adds a method of one's own to those of the study: all that play a role in it together.
+    `--service ROLE=NAME_OR_FILE` adds your own method to those of the study; several options make one method.
 
     [bold]Examples[/]
 
@@ -103,7 +103,7 @@ def merge_parts(
     parts: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders of all parts of a study.")],
     out: Annotated[Path | None, output_folder("Folder for the whole; by default the first of the parts.", "--out", "-o")] = None,
 ) -> None:
-    """Put the parts of a study together, and make its tables, figures and page."""
+    """Merge the parts of a study and make its tables, figures and page."""
     from palpate.study.perform import merge_study
 
     merge_study(parts, out or parts[0])

@@ -17,7 +17,7 @@ _OWN_FMU: Final = "winkler"
 def true_tissue(scenario: Scenario) -> TissueBackend | None:
     """The tissue of a scenario at rest, on a body that stays where it lies.
 
-    None where there is no copy of it: of somebody else's FMU, of a service of somebody's own, and of what is real.
+    None where it cannot be copied: a foreign FMU, a user's own service, real tissue.
     """
     chosen = scenario.services.tissue
     if chosen == "none" or (chosen == "fmu" and scenario.tissue.fmu is not None):

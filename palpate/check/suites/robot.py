@@ -106,9 +106,7 @@ def _joints(heard: list[HeardMessage], report: ConformanceReport) -> None:
         "joints within their limits", inside, f"+-{np.rad2deg(lbr.POSITION_LIMIT).round()} deg", np.rad2deg(q[-1]).round(1)
     )
     drift = float(np.max(np.abs(q[-1] - q[0])))
-    report.expect(
-        "holds still when nobody commands", drift < DRIFT_RAD, f"drift below {DRIFT_RAD} rad in 0.5 s", f"{drift:.4f} rad"
-    )
+    report.expect("holds still without commands", drift < DRIFT_RAD, f"drift below {DRIFT_RAD} rad in 0.5 s", f"{drift:.4f} rad")
 
 
 def _description(rig: Rig, report: ConformanceReport) -> None:

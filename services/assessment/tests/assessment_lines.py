@@ -1,4 +1,4 @@
-"""Samples along lines over a belly whose log-force is a known function of place, with errors of one's own choice."""
+"""Samples along lines over a belly whose log-force is a known function of place, with errors of your own choice."""
 
 from __future__ import annotations
 
