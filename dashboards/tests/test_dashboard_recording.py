@@ -228,7 +228,7 @@ def _parts(part: Any) -> list[Any]:
 
 
 def test_the_truth_about_the_patient_is_not_shown_at_first() -> None:
-    parts = _parts(blueprint((0.2, 0.2), (0.0, 0.0), 0.01, 15.0, ((0.0, 1.0), (0.0, 1.0))).root_container)
+    parts = _parts(blueprint((0.2, 0.2), (0.0, 0.0), 0.01, ((0.0, 1.0), (0.0, 1.0))).root_container)
     tabs = [part for part in parts if type(part).__name__ == "Tabs"]
     secret = [part for part in parts if getattr(part, "origin", "") in ("/plots/truth", "/text/truth")]
     assert len(secret) == 2

@@ -157,7 +157,7 @@ def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path
     assert (row["status"], row["attempts"], row["completed"]) == ("failed", ATTEMPTS, False)
     assert row["why"] == "RuntimeError: no idea"
     lumps = pd.read_parquet(tmp_path / "lumps.parquet")
-    assert len(lumps) == 1, "the lump of clean, which nobody found"
+    assert len(lumps) == 1, "the lump of clean, which was not found"
     assert not lumps["found"].any()
 
 
