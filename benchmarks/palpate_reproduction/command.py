@@ -3,47 +3,16 @@
 from __future__ import annotations
 
 import json
-from contextlib import nullcontext
+from itertools import count
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from palpate.case_display import CaseDisplay
 from palpate.command_line import fail, output_file, output_folder, refuse
 from palpate.run.options import Settings
-
-
-class _Steps:
-    """A bar over the steps on a terminal, a line a step otherwise, nothing when quiet."""
-
-    def __init__(self, console: Console, quiet: bool, total: int) -> None:
-        self._console, self._quiet = console, quiet
-        self._bar = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=quiet or not console.is_terminal,
-        )
-        self._task = self._bar.add_task("", total=total)
-        self._begun = -1
-
-    @property
-    def bar(self) -> Progress:
-        """To be entered."""
-        return self._bar
-
-    def tell(self, words: str) -> None:
-        """A step begins."""
-        self._begun += 1
-        self._bar.update(self._task, description=words, completed=self._begun)
-        if not self._quiet and not self._console.is_terminal:
-            self._console.print(words, highlight=False)
 
 
 def reproduce(
@@ -68,17 +37,21 @@ def reproduce(
     page = docs or out / "reproduction.md"
     images = page.parent / "images" / "reproduction"
     usable(SCENARIO, chosen)
-    steps = _Steps(console, quiet, len(cases) + 5)
+    begun, steps = count(), len(cases) + 5
     try:
-        with steps.bar if not quiet else nullcontext():
+        with CaseDisplay(console, quiet, "steps") as display:
+
+            def tell(words: str) -> None:
+                display.tell(next(begun), steps, words)
+
             for case in cases:
                 if again or completed(out / case.name) is None:
-                    steps.tell(f"examining: {case.pattern}, {case.mode}")
+                    tell(f"examining: {case.pattern}, {case.mode}")
                     perform(case, out / case.name, chosen)
             if again or not (out / "bus" / GRAPH).is_file():
-                steps.tell("starting a run on the bus, for its graph")
+                tell("starting a run on the bus, for its graph")
                 record_graph(out / "bus")
-            facts = reproduction.write(out, cases, page, images, chosen, steps.tell)
+            facts = reproduction.write(out, cases, page, images, chosen, tell)
     except (RunError, EvidenceError) as error:
         fail(error)
     except OSError as error:

@@ -60,7 +60,9 @@ def page_at(port: int, width: int, height: int) -> Iterator[Page]:
         raise NoPicture("playwright is not installed: pip install playwright") from error
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=list(ARGUMENTS))
-        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="dark")
+        page = browser.new_page(
+            viewport={"width": width, "height": height}, color_scheme="light"
+        )  # the viewer is dark all the same
         page.set_default_timeout(1000 * PATIENCE_S)
         page.goto(f"{address(port)}&renderer=webgl")
         yield page
