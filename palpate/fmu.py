@@ -59,7 +59,7 @@ def build(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
-    """Write the abdomen as an FMU: sources, and binaries cross-compiled on this machine."""
+    """Write the abdomen as an FMU with sources and cross-compiled binaries."""
     from palpate_fmu.compiling import CompileError, platforms
     from palpate_fmu.export import build_scenario_fmu
     from palpate_fmu.phantom_file import ExportError

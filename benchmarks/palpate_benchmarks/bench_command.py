@@ -18,11 +18,11 @@ WIDE = 160
 
 def bench(
     scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "clean",
-    out: Annotated[Path, output_file("File for the figures.", "--out", "-o")] = Path("bench.json"),
+    out: Annotated[Path, output_file("Output file.", "--out", "-o")] = Path("bench.json"),
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only.")] = False,
 ) -> None:
-    """Measure the parts, the bus among them, and whole runs; print tables and write bench.json."""
+    """Measure the speed of the parts, the bus and whole runs; print tables and write bench.json."""
     for group in only or ():
         if group not in GROUPS:
             raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")

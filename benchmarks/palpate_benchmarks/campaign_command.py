@@ -22,23 +22,23 @@ if TYPE_CHECKING:
 
 WIDE = 200
 
-Listed = Annotated[list[str] | None, typer.Option("--only", help="Keep these roles and topics; may be repeated.")]
+Listed = Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")]
 
 
 def faults(  # noqa: PLR0913 - the options of a command
     mode: Annotated[list[str] | None, typer.Option(help="lockstep, wallclock; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"Out of {', '.join(KINDS)}; all by default.")] = None,
     only: Listed = None,
-    out: Annotated[Path, output_file("File for the findings; those that it holds are not run again.", "--out", "-o")] = Path(
+    out: Annotated[Path, output_file("File for the outcomes; cases in it are not run again.", "--out", "-o")] = Path(
         "faults.json"
     ),
     docs: Annotated[Path | None, docs_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
-    limit: Annotated[int | None, typer.Option(min=0, help="Run at most so many cases.")] = None,
-    random: Annotated[int, typer.Option(metavar="N", min=0, help="Beside the list, N cases drawn by the seed.")] = 0,
+    limit: Annotated[int | None, typer.Option(min=0, help="Run at most N cases.")] = None,
+    random: Annotated[int, typer.Option(metavar="N", min=0, help="In addition, N random cases.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
 ) -> None:
-    """Kill, freeze, delay, drop, corrupt...: every service and topic in turn, in contact; print what came of each."""
+    """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the outcomes."""
     from palpate_benchmarks.campaign import as_json, cases, forks, run_case
     from palpate_benchmarks.campaign_tables import csv_text, markdown, table
     from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole

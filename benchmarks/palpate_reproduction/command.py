@@ -18,13 +18,15 @@ from palpate.run.options import Settings
 def reproduce(
     out: Annotated[Path, output_folder("Folder of the runs; finished ones are kept.", "--out", "-o")] = Path("out/reproduction"),
     docs: Annotated[Path | None, output_file("The page; by default reproduction.md in the folder of the runs.")] = None,
-    every: Annotated[bool, typer.Option("--all", help="Also raster continuous and snake point, to see what each gains.")] = False,
-    again: Annotated[bool, typer.Option("--again", help="Run what is finished again.")] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="Also run raster continuous and snake point, to see the gain of each.")
+    ] = False,
+    again: Annotated[bool, typer.Option("--again", help="Run finished ones again.")] = False,
     settings: Settings = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the page's path only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Reproduce the seed paper: figures 3, 5, 6, 7, 8 and what it claims, from our own runs. Takes some ten minutes."""
+    """Reproduce the seed paper: figures 3, 5, 6, 7, 8 and what it claims, from our own runs. This takes about ten minutes."""
     from palpate.report.archive import EvidenceError, completed
     from palpate.run.inputs import usable
     from palpate_reproduction import reproduction

@@ -51,9 +51,9 @@ def validate(
     only: Annotated[
         list[str] | None, typer.Option("--only", metavar="SECTION", help=f"One of: {', '.join(SECTIONS)}. May be repeated.")
     ] = None,
-    docs: Annotated[Path | None, output_file("Also write this Markdown page, PNGs next to it.")] = None,
+    docs: Annotated[Path | None, output_file("Also write this Markdown page, with PNGs next to it.")] = None,
 ) -> None:
-    """Measure the physics against Hertz, DART, MuJoCo and theory. Leaves with status 3 if a bound is missed."""
+    """Measure the physics against Hertz, DART, MuJoCo and theory. The exit status is 3 if a bound is missed."""
     from palpate_validation.report import failures, table, write, write_page
 
     console = Console(stderr=True)

@@ -23,17 +23,17 @@ def check_command(  # noqa: PLR0913 - the options of a command
         str | None,
         typer.Option(metavar="NAME_OR_FILE", help="Check an installed one or a Python file in this process, in simulated time."),
     ] = None,
-    scenario: Annotated[str, typer.Option(help="What it was configured with; its patient holds the breath.")] = "clean",
-    motion: Annotated[bool, typer.Option("--motion", help="It may move: needed for most of the robot's checks.")] = False,
+    scenario: Annotated[str, typer.Option(help="Its scenario; the patient holds the breath.")] = "clean",
+    motion: Annotated[bool, typer.Option("--motion", help="It may move; most checks of the robot need this.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
     slack: Annotated[float, typer.Option(min=0, help="Seconds that transport and scheduler may add to a reaction.")] = 0.15,
     wait: Annotated[float, typer.Option(help="Seconds to wait for it to join.")] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     failures: Annotated[bool, typer.Option("--failures", help="Print only what failed.")] = False,
 ) -> None:
-    """Check an implementation of a role: rates, ranges, signs, frames, limits, expiry and safe hold, garbage and silence.
+    """Test an implementation of a role: rates, ranges, signs, frames, limits, expiry, safe hold, invalid and missing messages.
 
-    The check plays the conductor and all other roles. Leaves with status 0 when everything passed, 1 when something failed, 2
+    The check plays the conductor and all other roles. The exit status is 0 when everything passed, 1 when something failed, 2
     when no implementation joined. docs/conformance.md says what an implementation has to do.
     """
     from palpate.check.perform import check_here, check_live, print_report

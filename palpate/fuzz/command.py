@@ -13,7 +13,7 @@ from palpate.command_line import EXIT_FAILED, refuse
 
 def fuzz(
     names: Annotated[list[str] | None, typer.Argument(help="Targets or patterns, e.g. 'codec:*'; all by default.")] = None,
-    inputs: Annotated[int, typer.Option(min=1, help="Inputs in all.")] = 100_000,
+    inputs: Annotated[int, typer.Option(min=1, help="Total number of inputs.")] = 100_000,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same inputs.")] = 0,
 ) -> None:
     """Feed invalid bytes to everything that reads from the bus, and check that all are rejected."""

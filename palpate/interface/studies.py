@@ -81,7 +81,7 @@ def study(
     workers
         Cases at a time; by default one a core.
     out
-        Folder of the study; by default out/study/NAME-SPLIT. What is done there is not done again.
+        Folder of the study; by default out/study/NAME-SPLIT. Finished cases in it are not run again.
     **settings
         Fields of the scenario of every patient, as for `palpate.scenario`.
 

@@ -22,9 +22,9 @@ FIND_S = 1.0
 
 Connect = Annotated[
     list[str] | None,
-    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Join here, e.g. tcp/10.0.0.5:7447; may be repeated."),
+    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Endpoint to join, e.g. tcp/10.0.0.5:7447; may be repeated."),
 ]
-ChosenRun = Annotated[str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")]
+ChosenRun = Annotated[str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")]
 Domain = Annotated[int | None, typer.Option(help="ROS domain; by default the run's, else ROS_DOMAIN_ID.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 

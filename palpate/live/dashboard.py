@@ -16,23 +16,23 @@ PICTURE_PX = (1500, 940)
 
 def dashboard(  # noqa: PLR0913 - the options of a command
     source: Annotated[
-        str | None, typer.Argument(metavar="[DIR|FILE]", help="Results folder, .rrd or .mcap; none: the run that is on.")
+        str | None, typer.Argument(metavar="[DIR|FILE]", help="Results folder, .rrd or .mcap; by default the current run.")
     ] = None,
     port: Annotated[
-        int, typer.Option(min=1024, max=65534, help="For viewers; the browser's page is at the next.")
+        int, typer.Option(min=1024, max=65534, help="Port for viewers; the browser's page is at the next port.")
     ] = DEFAULT_PORT,
-    native: Annotated[bool, typer.Option("--native", help="In rerun's own window, not in the browser.")] = False,
+    native: Annotated[bool, typer.Option("--native", help="Use rerun's own window, not the browser.")] = False,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open the browser.")] = False,
     chosen: Annotated[
-        str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")
+        str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")
     ] = None,
-    leave: Annotated[bool, typer.Option("--leave", help="End with the run; else its picture stays until Ctrl+C.")] = False,
+    leave: Annotated[bool, typer.Option("--leave", help="End with the run; by default the picture stays until Ctrl+C.")] = False,
     picture: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Write how a recorded run looks at --at, by a headless browser, and end.")
+        Path | None, typer.Option(metavar="PNG", help="Write a picture of a recorded run at the time --at; needs Chromium.")
     ] = None,
     at: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="With --picture: the simulated time.")] = 60.0,
     film_file: Annotated[
-        Path | None, typer.Option("--film", metavar="GIF", help="Write a recorded run as a film, by a headless browser, and end.")
+        Path | None, typer.Option("--film", metavar="GIF", help="Write a film of a recorded run; needs Chromium.")
     ] = None,
 ) -> None:
     """Watch a run live in the browser, from its start or later, or from its recording. This does not slow the run down.

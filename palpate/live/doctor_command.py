@@ -26,8 +26,8 @@ def doctor(
     domain: Domain = None,
     as_json: AsJson = False,
     seconds: Annotated[float, typer.Option(help="How long to listen.")] = 3.0,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on, and print every violation as it comes, until Ctrl-C.")] = False,
-    clean: Annotated[bool, typer.Option("--clean", help="Only remove what killed runs left on this machine.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Print every violation when it occurs, until Ctrl-C.")] = False,
+    clean: Annotated[bool, typer.Option("--clean", help="Only remove leftovers of killed runs on this machine.")] = False,
 ) -> None:
     """Check a live bus: versions, endpoints, shared memory, clocks, missing roles, and every topic against the contract.
 

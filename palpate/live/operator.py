@@ -19,7 +19,7 @@ from palpate_bus.wire.zenoh_config import session
 MEET_S = 1.0
 """How long a run may take to be met on the bus."""
 
-Named = Annotated[str | None, typer.Option("--run", metavar="NAME", help="Which run: its process id, or part of its name.")]
+Named = Annotated[str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")]
 
 
 def stop(
@@ -34,7 +34,7 @@ def stop(
 
 
 def release(
-    end: Annotated[bool, typer.Option("--end", help="Do not go on: go home and end the examination.")] = False,
+    end: Annotated[bool, typer.Option("--end", help="End the examination: the arm goes home.")] = False,
     reason: Annotated[str, typer.Option(help="Why, for the record.")] = "palpate release",
     run: Named = None,
 ) -> None:

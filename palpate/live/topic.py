@@ -98,7 +98,7 @@ def echo(  # noqa: PLR0913 - the options of a command
     field: Annotated[str | None, typer.Option(help="Only this field, e.g. wrench.force.")] = None,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after N messages.")] = None,
     once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
-    full: Annotated[bool, typer.Option("--full", help="Long arrays in full.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Print long arrays in full.")] = False,
     seconds: Seconds = None,
 ) -> None:
     """Print the messages of a topic as they come."""
@@ -125,7 +125,7 @@ def hz(
     as_json: AsJson = False,
     seconds: Seconds = None,
 ) -> None:
-    """Measure a topic's rate, once a second: messages a wall second and a second of simulated time, and their spacing."""
+    """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
     with command(), _listening(name, connect, run, domain) as (_, topic, listener):
         spacing = Spacing()
         report = monotonic() + EVERY_S
@@ -148,7 +148,7 @@ def bw(
     as_json: AsJson = False,
     seconds: Seconds = None,
 ) -> None:
-    """Measure a topic's bandwidth, once a second: bytes a wall second and bytes a message, payload only."""
+    """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
     with command(), _listening(name, connect, run, domain) as (_, topic, listener):
         window: deque[tuple[float, int]] = deque()
         report = monotonic() + EVERY_S

@@ -13,22 +13,22 @@ def replay(  # noqa: PLR0913 - the options of a command
     service: Annotated[
         str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Run this service again: tissue, tissue=fmu, ...")
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.01, help="Simulated seconds a second.")] = 1.0,
-    begin: Annotated[float, typer.Option("--from", min=0.0, help="Simulated time to begin at, s.")] = 0.0,
-    length: Annotated[float | None, typer.Option("--for", min=0.0, help="How much of it, s.")] = None,
+    rate: Annotated[float, typer.Option(min=0.01, help="Simulated seconds per second.")] = 1.0,
+    begin: Annotated[float, typer.Option("--from", min=0.0, help="Simulated time to begin at [s].")] = 0.0,
+    length: Annotated[float | None, typer.Option("--for", min=0.0, help="How long to play [s].")] = None,
     topics: Annotated[list[str] | None, typer.Option("--topic", help="Play these topics only; may be repeated.")] = None,
     listen: Annotated[
         str | None, typer.Option(help="Endpoint to play at; by default what PALPATE_LISTEN and PALPATE_ROUTER say.")
     ] = None,
-    hold: Annotated[bool, typer.Option("--hold", help="Stay on the bus at the end, until Ctrl-C.")] = False,
-    drive: Annotated[bool, typer.Option("--drive", help="Play even where a living service would act on it.")] = False,
+    hold: Annotated[bool, typer.Option("--hold", help="Stay on the bus at the end until Ctrl-C.")] = False,
+    drive: Annotated[bool, typer.Option("--drive", help="Play even if a running service would act on it.")] = False,
     tolerance: Annotated[
         list[str] | None,
         typer.Option(metavar="X|TOPIC:FIELD=X", help="As a part of each field's range (1e-06), or in a field's unit."),
     ] = None,
     scenario: Annotated[Path | None, typer.Option(help="Scenario of the service; by default the run's own.")] = None,
     update_refs: Annotated[Path | None, typer.Option(help="With --service: write its reference to this file.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The comparison as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON.")] = False,
 ) -> None:
     """Play a recording on the bus, or re-run one service against it and compare.
 
@@ -36,7 +36,7 @@ def replay(  # noqa: PLR0913 - the options of a command
 
       palpate replay out/lump-20260101-120000           plays the run on the bus, in real time
 
-      palpate replay recording.mcap --rate 4 --hold             four times as fast, then stays for late joiners
+      palpate replay recording.mcap --rate 4 --hold             four times as fast, then stays on the bus
 
       palpate replay RUN --service control                      runs the controller on the recorded inputs and compares
 

@@ -15,11 +15,11 @@ from palpate.command_line import refuse
 
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of a run.")],
-    pdf: Annotated[bool, typer.Option("--pdf", help="Also report.pdf, printed by a Chromium browser.")] = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Also write report.pdf; needs Chromium.")] = False,
     recover: Annotated[
-        bool, typer.Option("--recover", help="Of a run that lost its conductor: results of what its recorder wrote.")
+        bool, typer.Option("--recover", help="Make the results of a run that lost its conductor from its recording.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
 ) -> None:
     """Rebuild report.html of a run: one self-contained page for a clinician or an engineer."""

@@ -18,7 +18,7 @@ def docs_option(name: str) -> Any:
             _around(path, name)
         return path
 
-    return typer.Option(help="A page whose marked part is replaced; every row goes to a CSV file beside it.", callback=check)
+    return typer.Option(help="Page in which the marked part is replaced; all rows go to a CSV file beside it.", callback=check)
 
 
 def write_part(path: Path, name: str, text: str) -> None:

@@ -20,28 +20,33 @@ def run(  # noqa: PLR0913 - the options of a command
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Remove the results of an earlier run from the folder.")] = False,
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
-    composed: Annotated[bool, typer.Option("--composed", help="All services in this process.")] = False,
+    composed: Annotated[bool, typer.Option("--composed", help="Run all services in this process.")] = False,
     group: Annotated[
         list[str] | None,
-        typer.Option(metavar="ROLE,ROLE", help="These services in one process, all others in one each; may be repeated."),
+        typer.Option(metavar="ROLE,ROLE", help="Put these services in one process, each other one in its own; may be repeated."),
     ] = None,
     processes: Annotated[
-        int | None, typer.Option(metavar="N", help="The services in N processes, the 1 kHz loop together.")
+        int | None, typer.Option(metavar="N", help="Put the services in N processes, the 1 kHz loop together.")
     ] = None,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
-    wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer, as with hardware.")] = False,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Run lockstep no faster than real time.")] = False,
+    wallclock: Annotated[
+        bool, typer.Option("--wallclock", help="Run every service in real time, on its own timer, as with hardware.")
+    ] = False,
     handover: Annotated[
-        float, typer.Option(min=0, help="With --wallclock: seconds for which a stopped service's place is kept; see takeover.")
+        float, typer.Option(min=0, help="With --wallclock: seconds that a stopped service may take to be replaced; see takeover.")
     ] = 0.0,
     without: Annotated[
-        list[str] | None, typer.Option(metavar="ROLE", help="Leave a role to be started by you (palpate join); may be repeated.")
+        list[str] | None,
+        typer.Option(metavar="ROLE", help="Do not start this role: you start it with palpate join; may be repeated."),
     ] = None,
     wait: Annotated[float, typer.Option(min=1, help="With --without: seconds to wait for it.")] = 300.0,
     record: Annotated[
         Record,
         typer.Option(help="full: every message, for replay --service; normal: a fifth of that; none: no recording at all."),
     ] = "normal",
-    secure: Annotated[bool, typer.Option("--secure", help="Mutual TLS, and each role may do what its row allows.")] = False,
+    secure: Annotated[
+        bool, typer.Option("--secure", help="Use mutual TLS; each role may do only what its contract allows.")
+    ] = False,
     keys: Annotated[
         Path | None, typer.Option(help="With --secure: folder of `palpate keys init`; else keys of this run.")
     ] = None,
@@ -52,7 +57,7 @@ def run(  # noqa: PLR0913 - the options of a command
     settings: Settings = None,
     services: ServiceChoices = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON, and nothing else.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print only the report, as JSON.")] = False,
 ) -> None:
     """Run an examination and write report, map and recordings.
 
@@ -73,7 +78,7 @@ def run(  # noqa: PLR0913 - the options of a command
 
       palpate run --without control                 waits until you start it: palpate join control
 
-      palpate run --secure                          encrypted, and each role may do only what it has to
+      palpate run --secure                          encrypted; each role may do only what its contract allows
 
       palpate run my.yaml --composed                all services in one process, for sweeps and debugging
 
@@ -114,7 +119,7 @@ def prepare(
 ) -> None:
     """Write the scenario files of a run in containers, its first step.
 
-    scenario.yaml is for tissue, observers and scoring, plant.yaml for robot and camera, exam.yaml for everybody else.
+    scenario.yaml is for tissue, observers and scoring, plant.yaml for robot and camera, exam.yaml for all others.
     """
     from palpate.run.inputs import usable
     from palpate.run.roles import write_scenario_files
@@ -125,7 +130,7 @@ def prepare(
 def conduct(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder with scenario.yaml, for the results.")] = Path("out"),
     observers: Annotated[str, typer.Option(help="Observers of this run, comma-separated.")] = "dashboard,recorder",
-    realtime: Annotated[bool, typer.Option("--realtime", help="Pace simulated time by the wall clock.")] = False,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Run lockstep no faster than real time.")] = False,
     wallclock: Annotated[bool, typer.Option("--wallclock", help="Every service on its own timer.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
 ) -> None:

@@ -32,7 +32,7 @@ NameOrFile = Annotated[
     str | None,
     typer.Option("--service", metavar="NAME_OR_FILE", help="An installed implementation or a Python file; else the run's own."),
 ]
-RunName = Annotated[str | None, typer.Option(help="Which run: its process id, or part of its name; by default the newest.")]
+RunName = Annotated[str | None, typer.Option(help="The run: its process id, or part of its name; by default the newest.")]
 
 
 class PlaceError(ValueError):

@@ -22,10 +22,10 @@ DEFAULT = Path("keys")
 def make(
     folder: Folder = DEFAULT,
     host: Annotated[list[str] | None, typer.Option(help="Name or address of the router; may be repeated.")] = None,
-    name: Annotated[list[str] | None, typer.Option(help="For whom; by default all roles, router, viewer and operator.")] = None,
-    days: Annotated[int, typer.Option(min=1, help="How long certificates hold.")] = DAYS,
+    name: Annotated[list[str] | None, typer.Option(help="Members; by default all roles, router, viewer and operator.")] = None,
+    days: Annotated[int, typer.Option(min=1, help="Validity of the certificates [days].")] = DAYS,
 ) -> None:
-    """Make an authority and a certificate a role; what is there and still holds is kept."""
+    """Make a certificate authority and a certificate for each role; valid ones are kept."""
     console = Console(stderr=True)
     for known in name or ():
         if known not in members():
@@ -50,7 +50,7 @@ def make(
 
 @app.command()
 def show(folder: Folder = DEFAULT) -> None:
-    """List the certificates of a folder, until when they hold, and their fingerprints."""
+    """List the certificates of a folder, their expiry and fingerprints."""
     try:
         found = certificates(folder)
     except KeysError as error:

@@ -23,7 +23,7 @@ def router(
         Path | None, typer.Option(help="The router's folder of certificates: a secure router, at tls/ endpoints.")
     ] = None,
 ) -> None:
-    """Run a zenoh router for services in containers or on several machines, until a signal."""
+    """Run a zenoh router for services in containers or on several machines, until it is stopped."""
     console = Console(stderr=True)
     try:
         if keys is not None:

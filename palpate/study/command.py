@@ -43,16 +43,20 @@ def run(  # noqa: PLR0913 - the options of a command
     number: Annotated[int | None, typer.Option(min=1, help="Patients of each population, instead of the study's own.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Cases at a time on this machine; by default one a core.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")] = None,
-    shard: Annotated[str | None, typer.Option(metavar="i/n", help="Only every n-th case, from the i-th, without Dask.")] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="i/n", help="Run only every n-th case from the i-th, without Dask.")
+    ] = None,
     method: Annotated[list[str] | None, typer.Option(help="Only this method; may be repeated.")] = None,
     services: ServiceChoices = None,
     settings: Settings = None,
     seeds_file: Annotated[Path | None, typer.Option(help="File of secret seeds for the split test.")] = None,
-    keep: Annotated[bool, typer.Option("--keep", help="Keep cases that other code has made, instead of refusing.")] = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Keep cases from another version of the code instead of refusing.")
+    ] = False,
     out: Annotated[
         Path | None,
         output_folder(
-            "Folder of the study; by default out/study/NAME-SPLIT. What is done there is not done again.", "--out", "-o"
+            "Folder of the study; by default out/study/NAME-SPLIT. Finished cases in it are not run again.", "--out", "-o"
         ),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the result only.")] = False,
@@ -63,11 +67,11 @@ def run(  # noqa: PLR0913 - the options of a command
 
     [bold]Examples[/]
 
-      palpate study smoke                                     eight short examinations, to see that it works
+      palpate study smoke                                     eight short examinations, as a test
 
-      palpate study release --workers 8 -o results            goes on in `results` whenever it is called again
+      palpate study release --workers 8 -o results            continues in `results` when called again
 
-      palpate study release --service assessment=mine.py      a method of your own beside those of the study
+      palpate study release --service assessment=mine.py      your own method in addition to those of the study
 
       palpate study release --scheduler tcp://head:8786       on a cluster
 
