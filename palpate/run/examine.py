@@ -74,9 +74,8 @@ def _observers(scenario: Scenario, how: How, console: Console) -> tuple[str, ...
     try:
         check_libraries("dashboard", choice(scenario, "dashboard"))
     except ChoiceError as error:
-        console.print(
-            f"[dim]without a drawing of the run, recording.rrd: {escape(str(error))}[/]", highlight=False, soft_wrap=True
-        )
+        why = str(error).partition(": ")[2]
+        console.print(f"[dim]no recording for the dashboard (recording.rrd): {escape(why)}[/]", highlight=False, soft_wrap=True)
         return tuple(role for role in OBSERVERS if role != "dashboard")
     return OBSERVERS
 
@@ -97,7 +96,7 @@ def examine(scenario: Scenario, how: How) -> None:
         console.print(f"[bold]{scenario.name}[/] seed {scenario.seed}, results in {folder}", highlight=False)
         console.print(f"[dim]{what_it_takes(scenario.exam, how.record)}[/]", highlight=False, soft_wrap=True)
         if not how.composed:
-            console.print("[dim]look at it from another terminal: palpate doctor, palpate topic list[/]", highlight=False)
+            console.print("[dim]to look at it from another terminal: palpate doctor, palpate topic list[/]", highlight=False)
     try:
         with results_folder(folder, overwrite=how.overwrite):
             check_room(folder, scenario.exam, how.record)
