@@ -1,4 +1,4 @@
-"""What a user sees while many runs are on: how many are done."""
+"""The progress display of many runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SPEED_OVER_S = 3600.0
 
 
 class CaseDisplay:
-    """A bar over many runs on a terminal; a line a run otherwise; nothing when quiet."""
+    """A bar over many runs on a terminal; one line per run otherwise; nothing when quiet."""
 
     def __init__(self, console: Console, quiet: bool, word: str = "examinations") -> None:
         self._console = console

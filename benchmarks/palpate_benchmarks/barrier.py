@@ -1,4 +1,4 @@
-"""Ticks a second of the lockstep barrier alone: trivial services, each in a process of its own, through the distributed runtime.
+"""Ticks a second of the lockstep barrier alone: trivial services, each in its own process, through the distributed runtime.
 
 One service is what the robot is in a run: the others read its message of the same tick, and it reads theirs of the tick before.
 """

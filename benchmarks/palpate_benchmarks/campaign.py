@@ -1,4 +1,4 @@
-"""The fault campaign: one short examination a fault, with the fault in contact, and what came of it.
+"""The fault campaign: one short examination a fault, with the fault in contact, and the outcome.
 
 A case starts the local processes of the compose file, waits until the indenter slides at depth (or, for what is sent only before,
 until the camera looks), does the damage, and watches: who noticed it first, how long after, the highest true force since, how

@@ -1,7 +1,7 @@
 """What a quick examination costs against the composed run of the same patient: `python -m palpate_benchmarks.quick`.
 
 Processor time: of quick cases in this process with one thread, after one that warms it, each patient pressed anew; of the
-composed run by the command line in a process of its own, start and report included.
+composed run by the command line in its own process, start and report included.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS [secure]
 
 is the conductor of such a run: it forks the services and a recorder, says where they are, and when the indenter has slid at depth
-for SECONDS of simulated time. `strike` starts it, does the damage, and gathers what came of it. What the arm did is read from
+for SECONDS of simulated time. `strike` starts it, does the damage, and gathers the outcome. What the arm did is read from
 what the recorder wrote, or where that was struck too, from what the conductor had heard.
 """
 

@@ -1,4 +1,4 @@
-"""`python -m palpate_dashboard [NAME_OR_FILE]`: the dashboard as a process of its own."""
+"""`python -m palpate_dashboard [NAME_OR_FILE]`: the dashboard as a separate process."""
 
 from palpate_bus.run import main
 from palpate_models.load import load_scenario

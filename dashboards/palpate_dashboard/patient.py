@@ -1,4 +1,4 @@
-"""The patient about the abdomen, for the eye alone: head, pillow, and a drape over chest, arms and legs with a window.
+"""The patient about the abdomen, for display only: head, pillow, and a drape over chest, arms and legs with a window.
 
 Nothing of it is simulated: neither the camera nor the arm meets it. Frame A; sizes follow the abdomen that lies there. The
 drape is a height field: what a cloth does that is pulled over round bodies, smoothed, and hangs over the table's edges.

@@ -71,7 +71,7 @@ class SceneView:
         self._recording.log(path, shape, static=True)
 
     def patient(self, X_WA: Array, shapes: Iterable[Part]) -> None:
-        """The patient about the abdomen, in A at `X_WA`, shape (4, 4). For the eye alone."""
+        """The patient about the abdomen, in A at `X_WA`, shape (4, 4). For display only."""
         path = "world/patient"
         self._recording.log(path, rr.Transform3D(translation=X_WA[:3, 3], mat3x3=X_WA[:3, :3]), static=True)
         for part in shapes:

@@ -1,4 +1,4 @@
-"""What no sensor tells of a run, in markdown: how the patient breathes and moves, and what was drawn of the errors."""
+"""What no sensor measures in a run, in Markdown: how the patient breathes and moves, and the errors that were drawn."""
 
 from __future__ import annotations
 

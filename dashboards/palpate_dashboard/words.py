@@ -32,7 +32,7 @@ LEGEND = """
 | violet outline | true lesion at half contrast, on the patient's true pose: hidden until the eye of `world/truth` is clicked |
 | white points | palpation targets; light blue: perceived points |
 | pyramid | view of the depth camera, on its tripod |
-| head, pillow, drape | for the eye alone: neither arm nor camera meets them; switch them off under `world/patient` |
+| head, pillow, drape | for display only: neither arm nor camera meets them; switch them off under `world/patient` |
 
 | elsewhere | |
 |---|---|

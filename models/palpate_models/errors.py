@@ -1,4 +1,4 @@
-"""What is wrong with a patient's equipment: sensors, calibrations and arm, and what is drawn of it from the seed.
+"""Errors of the equipment: sensors, calibrations and arm, drawn from the seed.
 
 `errors: none | typical | poor` in a scenario, or a mapping with `level` and any field of its own. The fields' defaults are the
 level `none`: white noise of good sensors and the constant bias of an F/T sensor, which every examination tares, and nothing

@@ -1,4 +1,4 @@
-"""What `palpate check` does: runs the suite of a role, here or on the bus, and prints what came of it."""
+"""What `palpate check` does: runs the suite of a role, here or on the bus, and prints the outcome."""
 
 from __future__ import annotations
 

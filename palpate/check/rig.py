@@ -1,4 +1,4 @@
-"""What a conformance suite drives: one implementation of a role, with the suite in the place of everybody else.
+"""What a conformance suite drives: one implementation of a role, with the suite in place of all other roles.
 
 `ServiceRig` holds a service of ours in this process, in simulated time. `LiveRig` in `live_rig` talks to an unknown
 implementation on a bus, by the wall clock. The same suites run on both.

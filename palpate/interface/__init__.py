@@ -1,1 +1,1 @@
-"""What `import palpate` offers: patients under the hand, examinations, assessments and studies, from a notebook or a program."""
+"""What `import palpate` offers: patients without an arm, examinations, assessments and studies, from a notebook or a program."""

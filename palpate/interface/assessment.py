@@ -1,4 +1,4 @@
-"""What touches of a patient say of him: the assessment's own service, without a bus."""
+"""The assessment of touches of a patient: the assessment service, without a bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole examinations for the library: `palpate run` in a process of its own, and what it left as arrays, tables and pictures."""
+"""Whole examinations for the library: `palpate run` in its own process, and what it left as arrays, tables and pictures."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def run(
 ) -> Examination:
     """Runs a whole examination: arm, camera, perception, planning, control and assessment, as `palpate run --composed` does.
 
-    It has a process of its own, in an environment that makes results repeatable: the run hash is that of the command line.
+    It has its own process, in an environment that makes results repeatable: the run hash is that of the command line.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Studies for the library: many drawn patients by any method, and their tables."""
+"""Studies for the library: many randomly drawn patients by any method, and their tables."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def plan(
 
     chosen = usable(scenario, settings, seed)
     try:
-        with Console(stderr=True).status("planning: some ten seconds"):
+        with Console(stderr=True).status("planning: about ten seconds"):
             phantom = build_phantom(chosen.phantom, chosen.seed)
             planned = prospect(chosen, phantom)
             draw(out, chosen, phantom, planned)

@@ -1,4 +1,4 @@
-"""What the planner makes of an examination on the true surface: strokes, what is out of reach, how long it takes."""
+"""What the planner plans for an examination on the true surface: strokes, what is out of reach, how long it takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What arm, eye and force sensor get wrong in an examination, as distributions that whole examinations have.
+"""Errors of arm, camera and force sensor in an examination, with the distributions of whole examinations.
 
 `loop.yaml` holds them, a row for each setting of the errors and kind of breathing. A row that was fitted to fewer than
 LEAST_EXAMINATIONS is assumed: studies on it say so. With d the depth that the examination measures and d' the true one, against

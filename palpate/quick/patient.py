@@ -1,4 +1,4 @@
-"""A patient under the hand: the true tissue of a scenario, and an indenter that is moved through it without an arm.
+"""A patient without an arm: the true tissue of a scenario, and an indenter that is moved through it without an arm.
 
     >>> patient = Patient("person", seed=7)
     >>> touch = patient.press((0.03, -0.02), depth=0.010, speed=0.02, hold=0.5)

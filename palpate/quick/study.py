@@ -1,4 +1,4 @@
-"""What whole examinations get wrong, fitted: `python -m palpate.quick.study RUN...` writes loop.yaml from the folders of runs.
+"""The errors of whole examinations, fitted: `python -m palpate.quick.study RUN...` writes loop.yaml from the folders of runs.
 
 `python -m palpate.quick.study --examine 12 --set 'exam.region_m=[0.1, 0.1]' -o DIR` makes such runs first: persons, every second
 one with a lump, seeds from 0 on, with typical errors and quiet breathing. What is there already is not made again. Rows of

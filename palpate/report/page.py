@@ -1,4 +1,4 @@
-"""report.html: one page without references to anything outside, for a clinician or an engineer. Made from a run's folder.
+"""report.html: one self-contained page for a clinician or an engineer. Made from a run's folder.
 
 What the examination found stands first; what the simulation knows of the truth stands apart, at the end.
 """

@@ -1,6 +1,6 @@
 """Service processes forked from one that has imported everything: a campaign of many short runs pays for the imports once.
 
-They are processes of their own like any other, with their own session, log and signals; only who did the imports differs from a
+They are separate processes like any other, with their own session, log and signals; only who did the imports differs from a
 fresh start. A single run starts fresh ones: there it would save nothing.
 """
 

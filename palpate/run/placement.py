@@ -15,7 +15,7 @@ class PlacementError(ValueError):
 
 
 def apart(roles: Sequence[str]) -> Groups:
-    """Each role in a process of its own."""
+    """Each role in its own process."""
     return tuple((role,) for role in roles)
 
 
@@ -39,7 +39,7 @@ def _in_groups(workers: Sequence[str], groups: Sequence[str]) -> Groups:
     for group, text in zip(together, groups, strict=True):
         for role in group:
             if role not in workers:
-                why = "an observer has a process of its own" if role in contract().roles else f"there is no role {role!r}"
+                why = "an observer has its own process" if role in contract().roles else f"there is no role {role!r}"
                 raise PlacementError(f"--group {text}: {why}; allowed are {', '.join(workers)}")
             if role in placed:
                 raise PlacementError(f"--group {text}: {role} is placed already")

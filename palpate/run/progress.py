@@ -1,4 +1,4 @@
-"""What a user sees while a run is on: phase, progress, simulated time, real-time factor and force; and the keys that stop it."""
+"""The progress display of a run: phase, progress, simulated time, real-time factor and force; and the keys that stop it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Room on the disk: asked for before a run, watched during it, and done without at its end."""
+"""Disk space: checked before a run and watched during it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A case is examined in a process of its own: `python -m palpate.study.case`, a JSON line in for each case, a line out.
+"""A case is examined in its own process: `python -m palpate.study.case`, a JSON line in for each case, a line out.
 
-A whole examination has a process of its own; quick ones share one that stays warm. It has one thread of BLAS and OpenMP, and ends
+A whole examination has its own process; quick ones share one that stays warm. It has one thread of BLAS and OpenMP, and ends
 at once when the process that started it does, however that ended.
 """
 

@@ -105,7 +105,7 @@ def kill_all() -> None:
 
 
 def run_batch(batch: Sequence[str]) -> list[str]:
-    """Examines cases, given as JSON, one after another; what came of each, as JSON in the same order."""
+    """Examines cases, given as JSON, one after another; the outcome of each, as JSON in the same order."""
     cases = [Case.model_validate_json(text) for text in batch]
     return [(_in_warm(case) if case.tier == "quick" else _in_own(case)).model_dump_json() for case in cases]
 

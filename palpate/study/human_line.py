@@ -1,4 +1,4 @@
-"""How well people do it, for every plot of detection: published figures with their sources, and what they are not."""
+"""How well human examiners find lumps, for every plot of detection: published figures with sources and limits."""
 
 from __future__ import annotations
 

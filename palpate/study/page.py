@@ -1,4 +1,4 @@
-"""study.html: a study's figures and plots on one page without references to anything outside, in the look of report.html."""
+"""study.html: a study's figures and plots on one self-contained page, in the look of report.html."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tables of a study: a row a case, a row a finding, a row a lump, as Parquet. Statistics read nothing else."""
+"""The tables of a study: one row per case, one row per finding, one row per lump, as Parquet. Statistics read nothing else."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def cores() -> int:
 
 @contextmanager
 def threads(count: int) -> Iterator[Workers]:
-    """Threads of this process, each with a process of its own for its case; no scheduler."""
+    """Threads of this process, each with its own process for its case; no scheduler."""
     executor = ThreadPoolExecutor(count)
     try:
         yield Workers(executor, count, None)
