@@ -65,14 +65,43 @@ def _interval(values: Array, statistic: float, rng: np.random.Generator) -> tupl
     return float(np.quantile(values, statistic)), float(low), float(high)
 
 
+def _mean(values: Array, rng: np.random.Generator) -> tuple[float, float, float]:
+    """The mean of values, and its 95 % interval."""
+    means = values[rng.integers(0, len(values), (_BOOTSTRAPS, len(values)))].mean(axis=1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(values.mean()), float(low), float(high)
+
+
+def against_raster(found: pd.DataFrame) -> str:
+    """Seconds that ours takes to the sensitivity of the whole raster, over those that the raster takes."""
+    ill = found[found.lump]
+    of = {name: ill[ill.policy == name].set_index("seed").sort_index() for name in (OURS, "raster")}
+    right = of["raster"].right.to_numpy()
+    whole = float(of["raster"].seconds[~right].median())
+    ours = np.where(of[OURS].right, of[OURS].seconds, np.inf)
+    rng = np.random.Generator(np.random.PCG64(0))
+    drawn = rng.integers(0, len(ours), (_BOOTSTRAPS, len(ours)))
+    ratios = [_reached(ours[k], right[k].mean()) / whole for k in drawn]
+    low, high = np.quantile(ratios, (0.025, 0.975), method="nearest")
+    return (
+        f"the raster finds {_share(int(right.sum()), len(right))} in {whole:.0f} s; ours has found as many after "
+        f"{_words((_reached(ours, right.mean()) / whole, float(low), float(high)), '{:.2f}')} of that time"
+    )
+
+
+def _reached(seconds: Array, share: float) -> float:
+    """When a share of all is found [s]; infinite where it never is."""
+    return float(np.sort(seconds)[max(int(np.ceil(share * len(seconds))) - 1, 0)])
+
+
 def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
     """The comparison, as Markdown."""
     there = trials[(trials.seed >= TUNING) & trials.apart_m.notna()]
     rng = np.random.Generator(np.random.PCG64(0))
     lines = [
-        "| policy | most probable place right after 10 presses | after 30 | threshold | found | healthy without a finding "
-        "| presses, median | presses, 90 % | seconds, median | presses against ours |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| policy | place right after 10 presses | after 30 | threshold | found | healthy without a finding "
+        "| presses, median | presses, 90 % | seconds, median | area under the curve | presses against ours |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     ours = found[(found.policy == OURS) & found.lump].set_index("seed").presses
     order = found[found.lump].groupby("policy").presses.mean().sort_values().index
@@ -89,12 +118,11 @@ def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
         values = ill.presses.to_numpy(dtype=float)
         cells += [_words(_interval(values, q, rng), "{:.0f}") for q in (0.5, 0.9)]
         cells.append(_words(_interval(ill.seconds.to_numpy(), 0.5, rng), "{:.0f}"))
+        cells.append(_words(_mean(1.0 - values / values.max(), rng), "{:.2f}"))
         both = ill.set_index("seed").presses
         pairs = np.log(both / ours.reindex(both.index)).dropna().to_numpy()
-        means = np.exp(pairs[rng.integers(0, len(pairs), (_BOOTSTRAPS, len(pairs)))].mean(axis=1))
-        low, high = np.quantile(means, (0.025, 0.975))
-        ratio = float(np.exp(pairs.mean())), float(low), float(high)
-        cells.append("" if name == OURS else _words(ratio, "{:.2f}"))
+        middle, low, high = np.exp(_mean(pairs, rng))
+        cells.append("" if name == OURS else _words((middle, low, high), "{:.2f}"))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -138,6 +166,7 @@ def main(
     folder: Annotated[Path, typer.Argument(help="Folder of trials.")] = Path("out/search-study"),
     hand: Annotated[str, typer.Option(help="Trials of which hand.")] = "surrogate",
     picture: Annotated[Path | None, typer.Option(help="Where to draw the curves.")] = None,
+    outcome: Annotated[Path | None, typer.Option(help="Where to write what came of each search, as a CSV file.")] = None,
 ) -> None:
     """Compare the policies of the trials in a folder."""
     files = sorted(folder.glob(f"{hand}-*.csv"))
@@ -149,6 +178,9 @@ def main(
     tuned = trials[trials.seed < TUNING].seed.nunique()
     print(f"{found.seed.nunique()} patients, {found[found.lump].seed.nunique()} with a lump; {tuned} healthy tuning patients\n")
     print(table(found, limits, trials))
+    print(f"\n{against_raster(found)}")
+    if outcome is not None:
+        found.round(4).to_csv(outcome, index=False)
     if picture is not None:
         drawn(found, trials).savefig(picture)
 

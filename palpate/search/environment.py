@@ -14,6 +14,7 @@ logarithm of the probability of what is true: no lump, or one near where it is; 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final, Literal
 
@@ -25,8 +26,9 @@ from numpy.typing import NDArray
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.population import SearchCase, case
 from palpate_models.frames import Array
+from palpate_search.maps import LAYERS, maps, shape
 from palpate_search.posterior import Posterior
-from palpate_search.presses import seconds
+from palpate_search.presses import Budget, seconds
 
 ID: Final = "Palpate/Search-v0"
 TIME_COST: Final = 0.01
@@ -51,8 +53,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         An action is place and depth, each from -1 to 1 over what is allowed. The observation has `history`, a row for each press,
         zeros for those to come: x, y and depth as of an action, the logarithm of the force over 5 N, and 1; and `left`, the share
-        of presses that is left. With maps it has `maps`, shape (3, nx, ny) over the places: probability of a lump there, mean and
-        standard deviation of the field.
+        of presses that is left. With maps it has `maps`: what is known of every place (`palpate_search.maps`).
         """
         if hand not in ("surrogate", "patient"):
             raise ValueError(f"hand = {hand!r}: want surrogate or patient")
@@ -66,7 +67,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "left": spaces.Box(0.0, 1.0, (1,), np.float32),
         }
         if maps:
-            parts["maps"] = spaces.Box(-20.0, 20.0, (3, *self._shape), np.float32)
+            parts["maps"] = spaces.Box(-20.0, 20.0, self.maps_shape, np.float32)
         self.observation_space: spaces.Space[Any] = spaces.Dict(parts)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
@@ -97,14 +98,20 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _begin(self, patient: SearchCase) -> None:
         hands = SurrogateHand(patient.scenario, felt=patient.felt) if self._kind == "surrogate" else PatientHand(patient.scenario)
         self._case, self._hand, self._count = patient, hands, 0
-        self._posterior = Posterior(hands.task, models=ONE_MODEL)
+        budget = Budget(self._presses, hands.task.budget.seconds)
+        self._posterior = Posterior(replace(hands.task, budget=budget), models=ONE_MODEL)
         self._history = np.zeros((self._presses, 5), dtype=np.float32)
 
     @property
-    def _shape(self) -> tuple[int, int]:
-        places = self._hand.task.places
-        rows = len(np.unique(places[:, 0]))
-        return rows, len(places) // rows
+    def maps_shape(self) -> tuple[int, int, int]:
+        """Layers, places along x and along y."""
+        return LAYERS, *shape(self._posterior)
+
+    @property
+    def usual_depth(self) -> float:
+        """The usual depth of a press, as of an action."""
+        task = self._hand.task
+        return 2 * (task.depth - task.shallowest) / (task.deepest - task.shallowest) - 1
 
     def _entropy(self) -> float:
         """Of the posterior over no lump, or one at each place [nat]."""
@@ -123,9 +130,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         left = np.array([1 - self._count / self._presses], dtype=np.float32)
         seen: Observation = {"history": self._history.clip(-10, 10), "left": left}
         if self._maps:
-            mean, variance = self._posterior.field()
-            layers = np.stack((self._posterior.by_place, mean, np.sqrt(variance)))
-            seen["maps"] = layers.reshape(3, *self._shape).clip(-20, 20).astype(np.float32)
+            seen["maps"] = maps(self._posterior).clip(-20, 20).astype(np.float32)
         return seen
 
 

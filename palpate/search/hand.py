@@ -48,7 +48,8 @@ class _Timed:
 
     def __init__(self, scenario: Scenario, errors: LoopErrors | None) -> None:
         self._errors = errors or loop_errors(scenario)
-        self.task = replace(Task.of(exam_input(scenario)), depth_uncertainty=self._errors.uncertainty_m)
+        self._told_m = self._errors.uncertainty_m
+        self.task = replace(Task.of(exam_input(scenario)), depth_uncertainty=self._told_m)
         self._loop = Loop(scenario, self._errors)
         self.spent = 0.0
         self._here: Array | None = None
@@ -110,7 +111,9 @@ class PatientHand(_Timed):
                 forces.append(force)
         patient.rest(PERIOD_S)
         noise = float(np.std(forces) / np.sqrt(len(forces)))
-        return Press(float(xy[0]), float(xy[1]), float(np.mean(depths)), float(np.mean(forces)), patient.time, noise, limited)
+        return Press(
+            float(xy[0]), float(xy[1]), float(np.mean(depths)), float(np.mean(forces)), patient.time, noise, limited, self._told_m
+        )
 
     @property
     def _period(self) -> int:
@@ -147,4 +150,4 @@ class SurrogateHand(_Timed):
             depths = np.linspace(0.0, depth, 50)
             depth = float(np.interp(self.task.force, [felt(d) for d in depths.tolist()], depths))
         force = max(felt(depth) + float(rng.normal(0.0, _TARE_N) + rng.normal(0.0, _NOISE_N)), 0.02)
-        return Press(float(xy[0]), float(xy[1]), max(depth, _SHALLOWEST_M), force, time, _NOISE_N, limited)
+        return Press(float(xy[0]), float(xy[1]), max(depth, _SHALLOWEST_M), force, time, _NOISE_N, limited, self._told_m)

@@ -14,6 +14,7 @@ from palpate_bus.messages.stamps import header
 
 REQUEST: Final = "exam/request"
 STIFF_M: Final = 0.020
+EDGE_M: Final = 0.007
 FORCE_N: Final = 4.0
 CONTRAST: Final = 3.0
 PRESS_S: Final = 0.3
@@ -50,7 +51,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
         asked = rig.last(REQUEST)
         if asked.number <= play.over:
             break
-        rig.send("assessment/samples", _sample(rig.t, asked, stiff_at))
+        rig.send("assessment/samples", pressed(rig.t, asked, stiff_at))
         early += len(rig.run(PRESS_S / 2, {"exam/state": play.state})[REQUEST])
         play.over = int(asked.number)
         rig.run(PRESS_S / 2, {"exam/state": play.state})
@@ -77,10 +78,10 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
         report.skip("an end", f"it went on beyond {len(presses)} presses")
 
 
-def _sample(t: int, asked: Any, stiff_at: Any) -> Message:
+def pressed(t: int, asked: Any, stiff_at: Any) -> Message:
     """What a press of the belly is felt like."""
     xy = np.array((asked.place.x, asked.place.y))
-    bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - STIFF_M) / 0.004)))
+    bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - STIFF_M) / EDGE_M)))
     force = FORCE_N * CONTRAST**bump * (asked.depth / 0.010) ** 1.3
     place = Point(float(xy[0]), float(xy[1]), 0.0)
     up = Vector3(0.0, 0.0, 1.0)

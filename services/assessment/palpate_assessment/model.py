@@ -74,15 +74,17 @@ class Bump:
     """Centre [m]."""
     radius: float
     """[m]"""
+    edge: float = EDGE_M
+    """Standard deviation of its edge [m]."""
 
     def __call__(self, xy: Array, beyond: float = 0.0) -> Array:
         """The shape at places [m], shape (k, 2) -> (k,), its radius greater by `beyond`."""
         r = np.hypot(xy[:, 0] - self.x, xy[:, 1] - self.y)
-        return np.asarray(0.5 * erfc((r - self.radius - beyond) / (np.sqrt(2) * EDGE_M)))
+        return np.asarray(0.5 * erfc((r - self.radius - beyond) / (np.sqrt(2) * self.edge)))
 
     def covariance(self, a: Array, b: Array) -> Array:
         """Prior covariance of the lump's log-contrast between places a (k, 2) and b (l, 2), shape (k, l)."""
-        near = 2 * EDGE_M
+        near = 2 * self.edge
         free = LUMP_FREE_SD**2 * np.outer(self(a, near), self(b, near)) * _smooth(a, b, LUMP_FREE_M)
         return np.asarray(LUMP_SD**2 * np.outer(self(a), self(b)) + free)
 

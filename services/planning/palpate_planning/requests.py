@@ -15,7 +15,7 @@ from palpate_planning.segments import Segment, SegmentPlanner
 PLANNING_TIME: Final = 200 * MS
 """Simulated time that laying a press takes [ns]."""
 _NEAREST: Final = 4
-"""So many targets are tried."""
+"""Where a place itself cannot be pressed, so many targets are tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class PressRequest:
 
 
 class PressPlanner:
-    """Lays presses at the reachable targets. It is used by the worker alone once the examination has begun."""
+    """Lays presses where they are asked for. It is used by the worker alone once the examination has begun."""
 
     def __init__(self, segments: SegmentPlanner, targets: Array, reachable: Array, last: Stroke) -> None:
         """`targets` in the abdomen frame [m], shape (n, 2), and which of them can be `reachable`, shape (n,); the arm is above
@@ -41,16 +41,17 @@ class PressPlanner:
         self._free = np.array(reachable, dtype=bool)
 
     def press(self, request: PressRequest) -> tuple[Segment, ...]:
-        """The way to the target nearest to the request, and a press there; empty where there is no way to any near one."""
+        """The way to the place asked for, and a press there. Where the arm cannot do it, to the nearest target; empty where there
+        is no way to any near one.
+        """
         assert request.xy is not None
-        apart = np.linalg.norm(self._targets - request.xy, axis=1)
-        for target in np.argsort(apart)[:_NEAREST].tolist():
-            if not self._free[target]:
-                continue
-            stroke = Stroke(self._targets[[target]], np.array([target]), np.zeros(1, dtype=np.int64))
+        apart = np.where(self._free, np.linalg.norm(self._targets - request.xy, axis=1), np.inf)
+        nearest = np.argsort(apart)[:_NEAREST]
+        places = [(request.xy, int(nearest[0])), *((self._targets[target], int(target)) for target in nearest)]
+        for place, target in places:
+            stroke = Stroke(place[None], np.array([target]), np.zeros(1, dtype=np.int64))
             laid = self._segments.after(self._last, stroke, request.depth_m)
             if laid:
                 self._last = stroke
                 return laid
-            self._free[target] = False
         return ()

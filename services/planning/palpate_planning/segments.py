@@ -25,6 +25,7 @@ POSTURE_EVERY = 4
 """Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
 REACH = "out of the arm's reach"
 
+Place = tuple[float, float]
 Troubles = list[tuple[int, str]]
 """Samples of a path that the arm cannot take, and why."""
 
@@ -78,8 +79,8 @@ class SegmentPlanner:
         self._kinematics, self._scene, self._surface = kinematics, scene, surface
         self._postures, self._radius, self._depth, self._free_motion = postures, radius, depth, free_motion
         self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Troubles]] = {}
-        self._hovers: dict[int, Array | None] = {}
-        self._ways: dict[tuple[int, int], tuple[Segment | None, str]] = {}
+        self._hovers: dict[Place, Array | None] = {}
+        self._ways: dict[tuple[Place, Place], tuple[Segment | None, str]] = {}
         self._R_ref = np.eye(3)
 
     def lay(self, pieces: list[Stroke]) -> Layout:
@@ -118,15 +119,15 @@ class SegmentPlanner:
 
     def hover(self, piece: Stroke, end: int) -> Array | None:
         """Posture above the stroke's first (0) or last (-1) target [rad], shape (7,); None out of reach or in collision."""
-        target = int(piece.targets[end])
-        if target not in self._hovers:
+        place = _place(piece, end)
+        if place not in self._hovers:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
             goal = pose(least_twist(-n, self._R_ref), centre(p, n, self._radius, -HOVER_M))
-            near = self._postures[target]
+            near = self._postures[piece.targets[end]]
             solution = self._kinematics.solve(goal, near, near)
             good = solution.ok and self._scene.free(solution.q)
-            self._hovers[target] = solution.q if good else None
-        return self._hovers[target]
+            self._hovers[place] = solution.q if good else None
+        return self._hovers[place]
 
     def _stroke(self, piece: Stroke) -> tuple[SurfacePath, Troubles]:
         key = tuple(int(i) for i in piece.targets)
@@ -136,10 +137,10 @@ class SegmentPlanner:
 
     def _way(self, before: Stroke, after: Stroke) -> tuple[Segment | None, str]:
         """From above the end of one stroke to above the start of the next: straight, else by a free motion."""
-        key = (int(before.targets[-1]), int(after.targets[0]))
+        key = (_place(before, -1), _place(after, 0))
         if key not in self._ways:
-            xy = transfer(before.xy[-1], after.xy[0])
-            path, troubles = self._path(Stroke(xy, np.array(key), np.array([0, len(xy) - 1])), -HOVER_M)
+            xy, targets = transfer(before.xy[-1], after.xy[0]), np.array((before.targets[-1], after.targets[0]))
+            path, troubles = self._path(Stroke(xy, targets, np.array([0, len(xy) - 1])), -HOVER_M)
             start, goal = self.hover(before, -1), self.hover(after, 0)
             if not troubles:
                 self._ways[key] = (Segment(path, contact=False), "")
@@ -170,3 +171,9 @@ class SegmentPlanner:
                 troubles.append((int(i), f"the arm would collide: {', '.join(self._scene.collisions(solution.q))}"))
         between = np.asarray(CubicSpline(s[solved], q, bc_type="natural")(s)) if len(solved) > 1 else q
         return SurfacePath(s, p, n, R, between, stroke.targets, stroke.visits), troubles
+
+
+def _place(piece: Stroke, end: int) -> Place:
+    """Where a stroke begins (0) or ends (-1), in the abdomen frame [m]."""
+    x, y = piece.xy[end]
+    return float(x), float(y)

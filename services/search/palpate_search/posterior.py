@@ -17,42 +17,47 @@ from itertools import product
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import erfc, logsumexp
 
 from palpate_assessment.calibration import learned
-from palpate_assessment.model import (
-    BONE_SD,
-    EDGE_M,
-    LENGTHS_M,
-    LEVEL_SD,
-    NATURAL_SD,
-    SURFACE_M,
-    SURFACE_SHARE,
-    TARE_N,
-    WHITE_SD,
-    Bump,
-    bone,
-    natural,
-)
+from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, bone, natural
 from palpate_models import press
 from palpate_models.frames import Array
 from palpate_search.presses import Budget, Press, Task
 
-RADII_M: Final = (0.012, 0.018, 0.026)
-"""Radii of the lumps that are looked for."""
+RADII_M: Final = (0.014, 0.022, 0.030)
+"""Radii of the lumps that are looked for, as they are felt."""
+EDGE_M: Final = 0.013
+"""Standard deviation of the edge with which a press feels a lump: it presses a dent some centimetres wide."""
+OUTSIDE: Final = 0.2
+"""How much less probable a lump is that reaches out of the region: the region is chosen to hold what is sought."""
 LUMP_PROBABILITY: Final = 0.5
-"""That there is one, before anything is felt."""
-CONTRAST: Final = (float(np.log(2.0)), 0.35)
+"""That there is one, before anything is felt, ..."""
+ANOTHER: Final = 0.2
+"""... and that there is another beside those found."""
+CONTRAST: Final = (float(np.log(2.0)), 0.25)
 """Prior mean and standard deviation of a lump's log-contrast."""
-ROUGH: Final = (0.6, 1.5)
+NATURAL_SD: Final = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)
+"""Amplitudes of the fields of natural variation, the strips last (`palpate_assessment.model.natural`), ..."""
+BONE_SD: Final = 0.27
+"""... of bone, ..."""
+SURFACE_SHARE, STROKE_SHARE = 0.45, 0.75
+"""... of what neighbouring presses' depths get wrong alike, and each by itself, of the uncertainty that is told; by maximum
+likelihood over healthy tuning patients: `python -m palpate.search.prior`."""
+ROUGH: Final = (0.75, 1.3)
 """Natural variation, of its usual amplitude."""
-WRONG: Final = (0.6, 1.5)
-"""Errors of depth, of what the examination states."""
-USUAL_N: Final = 5.0
-"""About this force the level is sought."""
+WRONG: Final = (0.75, 1.3)
+"""Errors of depth, of what is usual."""
+USUAL_N, LEVEL_SD = 2.2, 1.0
+"""Force of the standard press on a belly, and how belly and equipment differ, in the logarithm: far more than people do."""
 NEAR_M: Final = 0.020
 """Hypotheses within this distance speak of one lump."""
+FOUND: Final = 0.95
+"""A lump that is so probable is there; ..."""
+PLACED_M: Final = 0.006
+"""... its place is known with this root mean square."""
 
 
 class Posterior:
@@ -73,14 +78,17 @@ class Posterior:
         places = task.places
         self.centres: Array = np.tile(places, (len(RADII_M), 1))
         """Centres of the hypotheses' lumps [m], shape (h, 2)."""
+        self.open: NDArray[np.bool_] = np.ones(len(places), dtype=bool)
+        """Which places may be pressed, shape (p,): all but those that the arm could not take."""
         self.radii: Array = np.repeat(RADII_M, len(places))
         """Their radii [m], shape (h,)."""
         self.shapes: Array = self._shapes(places)
         """Each bump at each place, shape (p, h)."""
-        free = self._free().astype(float)
-        self._log_prior = np.log(np.append(LUMP_PROBABILITY * free / max(free.sum(), 1.0), 1 - LUMP_PROBABILITY) + 1e-300)
+        likely = self._likely()
+        there = ANOTHER if self.accepted else LUMP_PROBABILITY
+        self._log_prior = np.log(np.append(there * likely / max(likely.sum(), 1e-9), 1 - there) + 1e-300)
         self._models = tuple(models)
-        self._parts = np.array([[(NATURAL_SD * rough) ** 2] * (len(LENGTHS_M) + 1) + [BONE_SD**2] for rough, _ in self._models])
+        self._parts = np.array([[*(np.array(NATURAL_SD) * rough) ** 2, BONE_SD**2] for rough, _ in self._models])
         count, most = len(self._models), 16
         self._factor = np.zeros((count, most, most))
         self._whitened = np.zeros((count, most))
@@ -89,7 +97,7 @@ class Posterior:
         self._power = np.zeros((count, len(self.radii)))
         self._match = np.zeros((count, len(self.radii)))
         self._evidence = np.zeros(count)
-        self._lever: list[float] = []
+        self._error: list[float] = []
         self._log_depth: list[float] = []
         self._weigh()
 
@@ -122,10 +130,14 @@ class Posterior:
         return self.presses[-1].xy if self.presses else None
 
     @property
-    def best(self) -> Bump:
-        """The most probable lump."""
-        k = int(np.argmax(self.probability))
-        return Bump(float(self.centres[k, 0]), float(self.centres[k, 1]), float(self.radii[k]))
+    def found(self) -> Bump | None:
+        """A lump that is there (FOUND) and whose place is known (PLACED_M); None while there is none."""
+        (x, y), probability = self.at
+        apart = np.hypot(self.centres[:, 0] - x, self.centres[:, 1] - y)
+        weight = np.where(apart <= NEAR_M, self.probability, 0.0)
+        if probability < FOUND or weight @ apart**2 > PLACED_M**2 * weight.sum():
+            return None
+        return Bump(float(x), float(y), float(weight @ self.radii / weight.sum()), EDGE_M)
 
     @property
     def likeliest(self) -> int:
@@ -134,8 +146,9 @@ class Posterior:
 
     @property
     def noise_m(self) -> float:
-        """Error of a press's depth under it, standard deviation [m]."""
-        return float(self._models[self.likeliest][1] * self.task.depth_uncertainty)
+        """Error of the next press's depth under it, standard deviation [m]: that of the latest one."""
+        told = self.presses[-1].depth_uncertainty if self.presses else self.task.depth_uncertainty
+        return float(self._models[self.likeliest][1] * told)
 
     def contrast(self) -> tuple[Array, Array]:
         """Posterior mean and variance of the log-contrast under each hypothesis, shape (h,) each, by the likeliest model."""
@@ -164,20 +177,20 @@ class Posterior:
         """Takes one more press into account."""
         calibration = learned()
         depth, force = max(felt.depth, 0.002), max(felt.force, 0.1)
-        log_depth, lever = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth
+        log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty
         y = float(np.log(force)) - calibration.exponent * log_depth - np.log(USUAL_N)
         xy, n = felt.xy[None], len(self.presses)
         old = np.array([one.xy for one in self.presses]).reshape(-1, 2)
         self._grow(n + 1)
         with_old, with_places, with_itself = (self._natural(xy, other)[:, 0] for other in (old, self.task.places, xy))
-        u = np.array([wrong * self.task.depth_uncertainty for _, wrong in self._models])
+        wrong = np.array([wrong for _, wrong in self._models])
         if n:
             apart = ((old - xy) ** 2).sum(axis=1)
-            shared = SURFACE_SHARE**2 * lever * np.array(self._lever) * np.exp(-0.5 * apart / SURFACE_M**2)
-            with_old = with_old + u[:, None] ** 2 * shared
+            shared = SURFACE_SHARE**2 * error * np.array(self._error) * np.exp(-0.5 * apart / SURFACE_M**2)
+            with_old = with_old + wrong[:, None] ** 2 * shared
             with_old += calibration.exponent_sd**2 * log_depth * np.array(self._log_depth)
         white = WHITE_SD**2 + (felt.noise_n**2 + TARE_N**2) / force**2 + (calibration.exponent_sd * log_depth) ** 2
-        itself = with_itself[:, 0] + white + (1 + SURFACE_SHARE**2) * (u * lever) ** 2
+        itself = with_itself[:, 0] + white + (STROKE_SHARE**2 + SURFACE_SHARE**2) * (wrong * error) ** 2
         new_bump = self._shapes(xy)[0]
         for k in range(len(self._models)):
             row = solve_triangular(self._factor[k, :n, :n], with_old[k], lower=True) if n else np.zeros(0)
@@ -191,15 +204,20 @@ class Posterior:
             self._match[k] += bumps * residual
             self._evidence[k] -= np.log(sd) + 0.5 * residual**2
         self.presses.append(felt)
-        self._lever.append(lever)
+        self._error.append(error)
         self._log_depth.append(log_depth)
         self._weigh()
+
+    def refuse(self, xy: Array) -> None:
+        """The place nearest to xy [m], shape (2,), cannot be pressed."""
+        self.open[np.argmin(np.linalg.norm(self.task.places - xy, axis=1))] = False
 
     def accept(self, bump: Bump) -> Posterior:
         """The posterior of what else there is, given that this lump is there."""
         other = Posterior(self.task, (*self.accepted, bump), self._models)
         for felt in self.presses:
             other.add(felt)
+        other.open = self.open
         return other
 
     def left(self, spent_s: float) -> Budget:
@@ -232,12 +250,13 @@ class Posterior:
         r = np.linalg.norm(xy[:, None] - self.centres, axis=2)
         return np.asarray(0.5 * erfc((r - self.radii) / (np.sqrt(2) * EDGE_M)))
 
-    def _free(self) -> Array:
-        """Which hypotheses lie beside the accepted lumps."""
-        free = np.ones(len(self.radii), dtype=bool)
+    def _likely(self) -> Array:
+        """How probable each hypothesis is beside the accepted lumps, before anything is felt, shape (h,), not normalised."""
+        out = np.abs(self.centres - self.task.centre) + self.radii[:, None] > 0.5 * np.array(self.task.size) + 1e-9
+        likely = np.where(out.any(axis=1), OUTSIDE, 1.0)
         for bump in self.accepted:
-            free &= np.hypot(self.centres[:, 0] - bump.x, self.centres[:, 1] - bump.y) > self.radii + bump.radius
-        return free
+            likely *= np.hypot(self.centres[:, 0] - bump.x, self.centres[:, 1] - bump.y) > self.radii + bump.radius
+        return likely
 
     def _grow(self, n: int) -> None:
         most = self._whitened.shape[1]

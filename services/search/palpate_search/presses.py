@@ -42,6 +42,8 @@ class Press:
     """Standard error of the force [N]."""
     limited: bool = False
     """Whether depth yielded to the force limit."""
+    depth_uncertainty: float = 0.001
+    """Standard deviation of the depth, as the examination tells it [m]."""
 
     @property
     def xy(self) -> Array:
@@ -72,7 +74,7 @@ class Task:
     force: float = 15.0
     """At this force depth yields [N]."""
     depth_uncertainty: float = 0.001
-    """Standard deviation of the depth of one press [m]."""
+    """Standard deviation of a press's depth that is expected before the first one [m]."""
     budget: Budget = Budget(100, 600.0)
     """At the beginning."""
     seed: int = 0

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
 
+from palpate_assessment.model import Bump
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import Scenario
 from palpate_search.choice import policy
@@ -21,8 +22,12 @@ from palpate_search.presses import Press, Task
 
 FRAME: Final = contract().topics["assessment/map"].frame or ""
 PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
-FOUND: Final = 0.95
-"""A lump that is so probable counts as found; others are sought beside it."""
+LEAST_UNCERTAINTY_M: Final = 0.0002
+"""No depth is believed to be surer than this."""
+ELSEWHERE_M: Final = 0.005
+"""A place is out of the arm's reach if no press came nearer to it than this."""
+AROUND: Final = 6
+"""So many presses outline a lump that was found."""
 FEWEST: Final = 12
 """So many presses at least: with fewer the assessment says nothing."""
 
@@ -41,6 +46,10 @@ class SearchService(Service):
         """When the first press was asked for [ns]."""
         self._number = 0
         """Number of the latest request."""
+        self._asked: Array | None = None
+        """Where it asked for a press [m], shape (2,)."""
+        self._outline: list[Array] = []
+        """Places about the lump found last that are still to be pressed."""
         self._felt: list[Press] = []
         """Samples since that."""
         self._spent_s = 0.0
@@ -55,12 +64,14 @@ class SearchService(Service):
             return {}
         if self._begin is None:
             self._begin = t
-            self._posterior = Posterior(replace(self._posterior.task, depth_uncertainty=max(state.depth_uncertainty, 0.0002)))
         for press in self._felt:
             self._posterior.add(press)
+        if self._asked is not None and not any(np.linalg.norm(press.xy - self._asked) < ELSEWHERE_M for press in self._felt):
+            self._posterior.refuse(self._asked)
         self._felt.clear()
-        while self._posterior.at[1] >= FOUND:
-            self._posterior = self._posterior.accept(self._posterior.best)
+        while (lump := self._posterior.found) is not None:
+            self._posterior = self._posterior.accept(lump)
+            self._outline = outline(lump, self._posterior)
         self._number += 1
         self._spent_s = (t - self._begin) / NS
         return {"exam/request": self._request(t)}
@@ -79,7 +90,13 @@ class SearchService(Service):
     def _request(self, t: int) -> Message:
         posterior = self._posterior
         self._ended = self._over()
-        place, depth = (np.zeros(2), 0.0) if self._ended else self._policy(posterior, posterior.left(self._spent_s))
+        if self._ended:
+            place, depth = np.zeros(2), 0.0
+        elif self._outline:
+            place, depth = self._outline.pop(0), posterior.task.depth
+        else:
+            place, depth = self._policy(posterior, posterior.left(self._spent_s))
+        self._asked = np.asarray(place, dtype=float)
         return SearchRequest(
             header(t, FRAME),
             self._number,
@@ -93,13 +110,27 @@ class SearchService(Service):
     def _over(self) -> str:
         """Why the search is over; empty while it is not."""
         posterior, left = self._posterior, self._posterior.left(self._spent_s)
-        if posterior.lump < self._missed and len(posterior.presses) >= FEWEST:
+        if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= FEWEST:
             return f"a lump that was not found has a probability of {100 * posterior.lump:.1f} %"
         if self._number > self._posterior.task.budget.presses:
             return f"{posterior.task.budget.presses} presses are made"
         if left.seconds <= 0:
             return f"{posterior.task.budget.seconds:g} s are over"
         return ""
+
+
+def outline(lump: Bump, posterior: Posterior) -> list[Array]:
+    """Presses that tell the assessment how far a lump reaches: its middle and places about it, [m], shape (2,) each.
+
+    Those out of the region, or where it was pressed already, are left out.
+    """
+    angles = 2 * np.pi * np.arange(AROUND) / AROUND
+    about = np.array((lump.x, lump.y)) + lump.radius * np.column_stack((np.cos(angles), np.sin(angles)))
+    places = np.vstack(((lump.x, lump.y), about))
+    task, pressed = posterior.task, np.array([press.xy for press in posterior.presses])
+    inside = np.all((places >= task.low) & (places <= task.high), axis=1)
+    apart = np.linalg.norm(places[:, None] - pressed, axis=2).min(axis=1)
+    return list(places[inside & (apart > ELSEWHERE_M)])
 
 
 def _press(sample: Message) -> Press:
@@ -110,6 +141,7 @@ def _press(sample: Message) -> Press:
         sample.normal_force,
         nanoseconds(sample.header.stamp) / NS,
         limited=sample.force_limited,
+        depth_uncertainty=max(sample.depth_uncertainty, LEAST_UNCERTAINTY_M),
     )
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import correlate
 
 from palpate_search.choice import PolicyError, policies, policy
 from palpate_search.policies.fixed import latin_hypercube, raster
+from palpate_search.policies.learned import convolved
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, Press, Task, seconds
 
@@ -49,6 +51,13 @@ def test_raster_and_latin_hypercube_cover_the_region() -> None:
     lattice = pressed(raster, TASK.budget.presses)
     assert len(np.unique(lattice.round(6), axis=0)) == TASK.budget.presses
     assert np.abs(np.diff(lattice, axis=0)).max() < 0.3  # to and fro, no long ways back
+
+
+def test_the_learned_policy_is_a_convolution_with_zeros_beyond_the_edge() -> None:
+    rng = np.random.default_rng(3)
+    layers, kernel, bias = rng.normal(size=(2, 6, 5)), rng.normal(size=(3, 2, 3, 3)), rng.normal(size=3)
+    expected = [sum(correlate(a, k, mode="constant") for a, k in zip(layers, one, strict=True)) for one in kernel]
+    np.testing.assert_allclose(convolved(layers, kernel, bias), np.array(expected) + bias[:, None, None])
 
 
 def test_ours_counts_the_way() -> None:

@@ -7,25 +7,28 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from palpate_assessment.calibration import learned
-from palpate_assessment.model import (
-    BONE_SD,
-    LENGTHS_M,
-    LEVEL_SD,
-    NATURAL_SD,
-    SURFACE_M,
-    SURFACE_SHARE,
-    TARE_N,
-    WHITE_SD,
-    Bump,
-    natural,
-)
+from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, natural
 from palpate_models.press import DEPTH_M
 from palpate_search.information import information
-from palpate_search.posterior import CONTRAST, LUMP_PROBABILITY, ROUGH, USUAL_N, WRONG, Posterior
+from palpate_search.posterior import (
+    BONE_SD,
+    CONTRAST,
+    EDGE_M,
+    LEVEL_SD,
+    LUMP_PROBABILITY,
+    NATURAL_SD,
+    OUTSIDE,
+    ROUGH,
+    STROKE_SHARE,
+    SURFACE_SHARE,
+    USUAL_N,
+    WRONG,
+    Posterior,
+)
 from palpate_search.presses import Press, Task
 
 TASK = Task(centre=(0.0, 0.0), size=(0.1, 0.08))
-LUMP = Bump(0.02, -0.01, 0.018)
+LUMP = Bump(0.02, -0.01, 0.018, EDGE_M)
 
 
 def felt(xy: np.ndarray, bump: Bump | None, contrast: float = 2.5, depth: float = 0.010) -> list[Press]:
@@ -54,19 +57,22 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
     lever, away = calibration.exponent / depth, np.log(depth / DEPTH_M)
     parts = natural(xy, xy)
     log_joint = []
+    out = np.any(np.abs(posterior.centres) + posterior.radii[:, None] > 0.5 * np.array(TASK.size) + 1e-9, axis=1)
+    prior = np.where(out, OUTSIDE, 1.0)
+    prior *= LUMP_PROBABILITY / prior.sum()
     for rough in ROUGH:
         for wrong in WRONG:
-            u = wrong * TASK.depth_uncertainty
-            S = LEVEL_SD**2 + sum((NATURAL_SD * rough) ** 2 * part for part in parts[: len(LENGTHS_M) + 1])
+            u = wrong * presses[0].depth_uncertainty
+            S = LEVEL_SD**2 + sum((sd * rough) ** 2 * part for sd, part in zip(NATURAL_SD, parts, strict=False))
             S = S + BONE_SD**2 * parts[-1] + calibration.exponent_sd**2 * np.outer(away, away)
             apart = ((xy[:, None] - xy) ** 2).sum(axis=2)
             S += (SURFACE_SHARE * u) ** 2 * np.outer(lever, lever) * np.exp(-0.5 * apart / SURFACE_M**2)
-            S += np.diag((u * lever) ** 2 + WHITE_SD**2 + (0.02**2 + TARE_N**2) / force**2)
+            S += np.diag((STROKE_SHARE * u * lever) ** 2 + WHITE_SD**2 + (0.02**2 + TARE_N**2) / force**2)
             row = [np.log(1 - LUMP_PROBABILITY) + multivariate_normal(np.zeros(len(y)), S).logpdf(y)]
-            for x, y0, radius in zip(*posterior.centres.T, posterior.radii, strict=True):
-                b = Bump(x, y0, radius)(xy)
+            for x, y0, radius, p in zip(*posterior.centres.T, posterior.radii, prior, strict=True):
+                b = Bump(x, y0, radius, EDGE_M)(xy)
                 lumpy = multivariate_normal(CONTRAST[0] * b, S + CONTRAST[1] ** 2 * np.outer(b, b))
-                row.append(np.log(LUMP_PROBABILITY / len(posterior.radii)) + lumpy.logpdf(y))
+                row.append(np.log(p) + lumpy.logpdf(y))
             log_joint.append(row)
     joint = np.exp(np.array(log_joint) - np.max(log_joint))
     joint /= joint.sum()
@@ -85,7 +91,7 @@ def test_a_lump_is_located_and_its_absence_becomes_sure() -> None:
 
 
 def test_beside_an_accepted_lump_others_are_sought() -> None:
-    other = Bump(-0.03, 0.02, 0.014)
+    other = Bump(-0.03, 0.02, 0.014, EDGE_M)
     places = TASK.places
     both = [
         Press(a.x, a.y, a.depth, a.force * b.force / 4.0, a.time)

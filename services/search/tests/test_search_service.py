@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites.search import PRESS_S, REQUEST, Play, suite
-from palpate_bus.messages import ExamState, SearchRequest
-from palpate_models.scenario import Budget, Exam, Scenario, Search
+from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
+from palpate_bus.messages import ExamState, Point, SearchRequest
+from palpate_models.scenario import Exam, Scenario, Search, SearchBudget
 from palpate_search.service import FEWEST, create
 
 
@@ -35,14 +36,14 @@ def test_it_finds_the_stiff_area_and_ends() -> None:
 
 
 def test_it_keeps_to_the_budget_of_presses() -> None:
-    rig, report = played(budget=Budget(presses=5))
+    rig, report = played(budget=SearchBudget(presses=5))
     assert report.passed
     assert [item.message.request for item in rig.log[REQUEST]] == [SearchRequest.PRESS] * 5 + [SearchRequest.DONE]
     assert "5 presses are made" in rig.last(REQUEST).reason
 
 
 def test_it_keeps_to_the_budget_of_time() -> None:
-    rig, _ = played(budget=Budget(seconds=2.0))
+    rig, _ = played(budget=SearchBudget(seconds=2.0))
     assert rig.last(REQUEST).request == SearchRequest.DONE
     assert rig.last(REQUEST).reason == "2 s are over"
 
@@ -56,8 +57,23 @@ def test_it_asks_for_nothing_while_nobody_palpates(phase: int) -> None:
     assert not rig.log[REQUEST]
 
 
+def test_a_place_that_the_arm_cannot_take_is_not_asked_for_again() -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=SearchBudget(presses=12)))
+    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
+    play.phase = ExamState.PHASE_RETRACT
+    rig.run(0.3, {"exam/state": play.state})
+    for _ in range(12):
+        asked = rig.last(REQUEST)
+        elsewhere = SimpleNamespace(place=Point(0.04, 0.04, 0.0), depth=asked.depth)
+        rig.send("assessment/samples", pressed(rig.t, elsewhere, np.zeros(2)))
+        play.over = int(asked.number)
+        rig.run(0.3, {"exam/state": play.state})
+    places = [(m.place.x, m.place.y) for m in (item.message for item in rig.log[REQUEST]) if m.request == SearchRequest.PRESS]
+    assert len(set(places)) == len(places) == 12
+
+
 def test_the_report_says_what_it_took() -> None:
-    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=Budget(presses=5)))
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=SearchBudget(presses=5)))
     service = create(scenario)
     suite(ServiceRig(service, RigSettings(scenario)), ConformanceReport("search"))
     facts = service.finish()

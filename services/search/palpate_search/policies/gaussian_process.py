@@ -56,7 +56,7 @@ def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
 def _greatest(posterior: Posterior, budget: Budget, acquisition: Acquisition) -> tuple[Array, float]:
     if len(posterior.presses) < FIRST:
         return first(posterior.task, len(posterior.presses)), posterior.task.depth
-    score = acquisition(*_fit(posterior))
+    score = np.where(posterior.open, acquisition(*_fit(posterior)), -np.inf)
     return posterior.task.places[int(np.argmax(score))], posterior.task.depth
 
 

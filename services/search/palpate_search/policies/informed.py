@@ -38,7 +38,7 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
         told = information(unexplained[some], contrast, contrast_variance, probability, variance[some] + noise)
         return np.asarray(told / duration[some])
 
-    rates = rate(np.arange(len(task.places)), task.depth)
+    rates = np.where(posterior.open, rate(np.arange(len(task.places)), task.depth), 0.0)
     best, depth = int(np.argmax(rates)), task.depth
     if rates[best] <= 0:  # nothing tells more than anything else: the level is not known before the first press
         best = int(np.argmin(np.linalg.norm(task.places - np.array(task.centre), axis=1)))

@@ -1,0 +1,166 @@
+"""Trains the policy `ppo`: `python -m palpate.search.learn`, for which `pip install 'palpate[learn]'`.
+
+Stable-Baselines3's proximal policy optimisation on `Palpate/Search-v0`. Actor and critic share the convolutions over the maps
+of what is known; the actor's last one gives each place and depth a logit: few weights are learned, and none belongs to a place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import gymnasium
+import numpy as np
+import torch
+import typer
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from torch import nn
+
+from palpate.search.environment import SearchEnv
+from palpate_search.maps import LAYERS
+
+WIDTH: Final = 16
+"""Channels of the hidden layers."""
+PRESSES: Final = 30
+"""Of an episode."""
+PATIENTS: Final = 128
+"""Tuning patients that are met."""
+ENVIRONMENTS: Final = 8
+SETTINGS: Final[dict[str, Any]] = {
+    "n_steps": 4 * PRESSES,
+    "batch_size": 240,
+    "n_epochs": 4,
+    "learning_rate": 1e-3,
+    "gamma": 0.98,
+    "ent_coef": 0.002,
+}
+
+
+class Presses(gymnasium.Env[NDArray[np.float32], int]):
+    """The environment with the maps alone to see, and one action for each place and depth."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(self, env: SearchEnv) -> None:
+        self._env, self._shape = env, env.maps_shape
+        self.observation_space = spaces.Box(-20.0, 20.0, self._shape, np.float32)
+        self.action_space: spaces.Space[Any] = spaces.Discrete(2 * self._shape[1] * self._shape[2])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """The first maps."""
+        observed, told = self._env.reset(seed=seed, options=options)
+        return observed["maps"], told
+
+    def step(self, action: int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """A press of the usual depth at a place, or of the greatest."""
+        depth, row, column = np.unravel_index(int(action), (2, *self._shape[1:]))
+        share = 2.0 * np.array((row / (self._shape[1] - 1), column / (self._shape[2] - 1))) - 1.0
+        press = np.array((*share, self._env.usual_depth if depth == 0 else 1.0), dtype=np.float32)
+        observed, reward, over, cut, told = self._env.step(press)
+        return observed["maps"], reward, over, cut, told
+
+
+class Network(nn.Module):
+    """Maps to the actor's logits and to what the critic sees."""
+
+    def __init__(self, space: spaces.Box) -> None:
+        super().__init__()
+        layers, nx, ny = space.shape
+        self.hidden = nn.Sequential(
+            nn.Conv2d(layers, WIDTH, 3, padding=1),
+            nn.Tanh(),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
+            nn.Tanh(),
+        )
+        self.last = nn.Conv2d(WIDTH, 2, 1)
+        nn.init.normal_(self.last.weight, std=0.05)
+        self.latent_dim_pi, self.latent_dim_vf = 2 * nx * ny, 2 * WIDTH
+
+    def forward(self, maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Both."""
+        return self.forward_actor(maps), self.forward_critic(maps)
+
+    def forward_actor(self, maps: torch.Tensor) -> torch.Tensor:
+        """Logits, shape (n, 2 nx ny)."""
+        scores: torch.Tensor = self.last(self.hidden(maps)).flatten(1)
+        return scores
+
+    def forward_critic(self, maps: torch.Tensor) -> torch.Tensor:
+        """Mean and greatest value of each channel, shape (n, 2 WIDTH)."""
+        seen = self.hidden(maps).flatten(2)
+        return torch.cat((seen.mean(dim=2), seen.amax(dim=2)), dim=1)
+
+
+class Whole(nn.Module):
+    """Leaves the maps as they are: Stable-Baselines3 would flatten them."""
+
+    def __init__(self, space: spaces.Box, features_dim: int = 0) -> None:
+        super().__init__()
+        self.features_dim = int(np.prod(space.shape))
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """The maps."""
+        return maps
+
+
+class PlacePolicy(ActorCriticPolicy):
+    """Actor and critic on one Network; the actor's logits are the network's own."""
+
+    def _build_mlp_extractor(self) -> None:
+        assert isinstance(self.observation_space, spaces.Box)
+        self.mlp_extractor: Any = Network(self.observation_space)
+
+    def _build(self, lr_schedule: Callable[[float], float]) -> None:
+        super()._build(lr_schedule)
+        self.action_net = nn.Identity()
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+
+class Curve(BaseCallback):
+    """Keeps the mean reward of the latest episodes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[tuple[int, float]] = []
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        latest = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        self.rows.append((self.num_timesteps, float(np.mean(latest))))
+        print(f"{self.num_timesteps:8d} presses, reward {self.rows[-1][1]:.2f}", flush=True)
+
+
+def main(
+    presses: Annotated[int, typer.Option(min=1000, help="Presses to learn from.")] = 200_000,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where the weights go.")] = Path("ppo.npz"),
+    curve: Annotated[Path, typer.Option(help="Where the training curve goes.")] = Path("ppo.csv"),
+) -> None:
+    """Train the policy on tuning patients."""
+    torch.set_num_threads(1)
+    many = VecMonitor(DummyVecEnv([lambda: Presses(SearchEnv(presses=PRESSES, patients=PATIENTS, maps=True))] * ENVIRONMENTS))
+    model = PPO(PlacePolicy, many, seed=seed, device="cpu", policy_kwargs={"features_extractor_class": Whole}, **SETTINGS)
+    learning = Curve()
+    model.learn(presses, callback=learning)
+    network: Any = model.policy.mlp_extractor
+    layers = [layer for layer in (*network.hidden, network.last) if isinstance(layer, nn.Conv2d)]
+    arrays = {f"kernel{k}": layer.weight.detach().numpy() for k, layer in enumerate(layers)}
+    arrays |= {f"bias{k}": layer.bias.detach().numpy() for k, layer in enumerate(layers) if layer.bias is not None}
+    np.savez(out, **arrays)
+    np.savetxt(curve, learning.rows, fmt=("%d", "%.3f"), delimiter=",", header="presses,reward", comments="")
+    assert layers[0].in_channels == LAYERS
+    print(f"{out}: {sum(array.size for array in arrays.values())} weights")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,51 @@
+"""A policy that was learned by reinforcement: a small convolutional network weighs every place alike.
+
+`python -m palpate.search.learn` trains it by proximal policy optimisation (Schulman et al. 2017) and writes `ppo.npz`. Here it is
+three convolutions in numpy: what it presses for is in the weights, and its region may have any size.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import as_file, files
+from typing import Final
+
+import numpy as np
+
+from palpate_models.frames import Array
+from palpate_search.maps import maps
+from palpate_search.posterior import Posterior
+from palpate_search.presses import Budget
+
+WEIGHTS: Final = "ppo.npz"
+
+
+@cache
+def _weights() -> tuple[tuple[Array, Array], ...]:
+    """Kernel (out, in, 3, 3) or (out, in, 1, 1) and bias (out,) of each layer."""
+    with as_file(files(__package__) / WEIGHTS) as file, np.load(file) as saved:
+        return tuple((saved[f"kernel{k}"], saved[f"bias{k}"]) for k in range(len(saved.files) // 2))
+
+
+def convolved(layers: Array, kernel: Array, bias: Array) -> Array:
+    """A convolution with zeros beyond the edge: (in, nx, ny) to (out, nx, ny)."""
+    width = kernel.shape[-1] // 2
+    padded = np.pad(layers, ((0, 0), (width, width), (width, width)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, kernel.shape[2:], axis=(1, 2))
+    return np.asarray(np.tensordot(kernel, windows, axes=((1, 2, 3), (0, 3, 4))) + bias[:, None, None])
+
+
+def scores(posterior: Posterior) -> Array:
+    """How good a press of the usual, and of the greatest depth is at each place, shape (2, p): logits."""
+    layers = maps(posterior)
+    *hidden, last = _weights()
+    for kernel, bias in hidden:
+        layers = np.tanh(convolved(layers, kernel, bias))
+    return convolved(layers, *last).reshape(2, -1)
+
+
+def ppo(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
+    """The press with the greatest score."""
+    task = posterior.task
+    depth, place = np.divmod(int(np.argmax(np.where(posterior.open, scores(posterior), -np.inf))), len(task.places))
+    return task.places[place], (task.depth, task.deepest)[depth]
