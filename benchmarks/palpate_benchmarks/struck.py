@@ -125,7 +125,10 @@ def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S, n
     hung = [role for role, process in services.items() if process in staying and process.status() != psutil.STATUS_STOPPED]
     for process in staying:
         process.kill()
-    return Struck(folder, own, status, said, struck_s, left, hung) if at else None
+    if not at:
+        print(f"never at depth: {said.get('failure')}", file=sys.stderr)
+        return None
+    return Struck(folder, own, status, said, struck_s, left, hung)
 
 
 def _conduct(folder: Path, runtime: str, seconds: float, secure: SecureBus | None) -> None:
@@ -143,7 +146,7 @@ def _conduct(folder: Path, runtime: str, seconds: float, secure: SecureBus | Non
     scenario = load_scenario("clean", SETTINGS)
     files = write_scenario_files(scenario, folder)
     wallclock = runtime == "wallclock"
-    timing = Timing(wallclock, rate=measure().rate or RATES[-1] if wallclock else 1.0)
+    timing = Timing(wallclock, rate=_calm_rate() if wallclock else 1.0)
     local = LocalProcesses(apart(ROLES), folder, files, timing, record="full", secure=secure, forks=forks())
     session = open_session(local.bus[CONDUCTOR])
     for process in read_processes(compose_file(), ROLES).values():
@@ -156,6 +159,12 @@ def _conduct(folder: Path, runtime: str, seconds: float, secure: SecureBus | Non
     print(f"{RESULT}{json.dumps({'failure': result.failure, 'lost': list(result.lost), 'forces': forces})}", flush=True)
     close_session(session)
     local.stop(patience_s=3.0)
+
+
+def _calm_rate() -> float:
+    """A rate below what the machine keeps for a second: whoever is busy beside it shall not stop the arm before it is struck."""
+    kept = measure().rate or RATES[-1]
+    return next((rate for rate in RATES if rate < kept), kept)
 
 
 if __name__ == "__main__":

@@ -105,6 +105,10 @@ class Settings(BaseSettings):
         description="By the wall clock: simulated seconds a second, alike for all; `palpate run` measures what it can keep.",
     )
     scenario: Path | None = Field(default=None, description="The scenario file of a service, as `palpate prepare` writes it.")
+    checkpoint: Path | None = Field(
+        default=None,
+        description="Where an earlier examination stood that this one goes on with; `palpate run --resume` makes it.",
+    )
     out: Path | None = Field(default=None, description="The run's results folder, for services that write files.")
     record: Literal["none", "normal", "full"] = Field(
         default="none",

@@ -10,8 +10,12 @@ from palpate_bus.runtime.lockstep import Packet, Stepper
 from palpate_bus.service import Service
 
 
-def rerun(service: Service, rules: Contract, inputs: Iterable[RecordedMessage], end: int) -> Iterator[RecordedMessage]:
+def rerun(
+    service: Service, rules: Contract, inputs: Iterable[RecordedMessage], end: int, begin: int = 0
+) -> Iterator[RecordedMessage]:
     """What `service` sends when it gets `inputs` (in order of their stamps), from its start to the tick `end` [ns].
+
+    Its first step is at the tick `begin` [ns], where it gets all that came until then at once.
 
     At tick T it sees what it saw in the run: `same_tick` messages up to T, `previous` ones up to T less their topic's period. An
     observed topic is outside the barrier, so when a message of one was seen in a distributed run is not known; here it is seen
@@ -24,7 +28,7 @@ def rerun(service: Service, rules: Contract, inputs: Iterable[RecordedMessage], 
     source = iter(inputs)
     following = next(source, None)
     held: list[RecordedMessage] = []
-    for t in range(0, end + 1, stepper.role.period):
+    for t in range(begin, end + 1, stepper.role.period):
         for message in held:
             stepper.buffers[message.topic].deliver(Packet(message.payload, message.stamp, message.sequence))
         held.clear()

@@ -24,7 +24,6 @@ def report(
 ) -> None:
     """Rebuild report.html of a run: one self-contained page for a clinician or an engineer."""
     from palpate.report.archive import EvidenceError
-    from palpate.report.page import write_page
     from palpate.report.printing import PrintError, write_pdf
     from palpate.report.recover import recovered
     from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
@@ -37,6 +36,8 @@ def report(
                 shown = Console(stderr=as_json)
                 print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # at once: the truth takes longer
                 print_scores(shown, write_results(folder, scenario, result))
+            from palpate.report.page import write_page
+
             page = write_page(folder)
             paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
     except (EvidenceError, PrintError, OSError) as error:

@@ -63,6 +63,15 @@ class ContactRecord:
     limited: Mask
     """Depth yields to the force limit."""
 
+    def then(self, later: ContactRecord) -> ContactRecord:
+        """The record, and after it that of an examination that went on with this one."""
+        both = {
+            name: np.concatenate((getattr(self, name), getattr(later, name)))
+            for name in ("measured", "true", "wanted", "force", "limited")
+        }
+        places = (np.concatenate((getattr(self.touched, k), getattr(later.touched, k))) for k in ("believed", "true"))
+        return ContactRecord(**both, touched=Touched(*places))
+
 
 def points(message: Any, field: str = "vertices") -> Array:
     """A flat array of a message as points, shape (n, 3)."""

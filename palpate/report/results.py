@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,6 @@ from palpate.report.evidence import (
     steady_contact,
     unassessed_of,
 )
-from palpate.report.figures import draw_map
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
 from palpate.report.rows import DepthRow, FindingRow, LumpRow, Report, TruthRow
@@ -50,14 +51,15 @@ class Known:
     felt: scoring.Truth | None
 
 
-def truth_of_run(scenario: Scenario, c: Collected) -> Known:
-    """The truth of a run. It takes seconds to press a patient for the first time."""
+def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] = ()) -> Known:
+    """The truth of a run, and of those `earlier` that it went on with. It takes seconds to press a patient for the first time."""
     if c.phantom is None:
         return Known(None, None, None)
     body = body_of(c.phantom)
     motion = BodyMotion(scenario.phantom.motion, scenario.seed)
     registered = np.array(exam_input(scenario).X_WA)
-    contact = steady_contact(c.exam_states, c.indentation, body.X_WA, motion, registered)
+    runs = [steady_contact(run.exam_states, run.indentation, body.X_WA, motion, registered) for run in (*earlier, c)]
+    contact = reduce(ContactRecord.then, runs)
     pressed = press_patient(scenario)
     return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
 
@@ -79,7 +81,9 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     if known.felt is not None and final is not None:
         scores = scoring.score(found_of(final), found, known.felt)
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
-    forces = [peak_force(m) for m in c.indentation] or [s.normal_force for s in c.exam_states if s.in_contact]
+    runs = (*result.earlier, c)
+    forces = [peak_force(m) for run in runs for m in run.indentation]
+    forces = forces or [s.normal_force for run in runs for s in run.exam_states if s.in_contact]
     return Report(
         scenario=scenario.name,
         seed=scenario.seed,
@@ -92,6 +96,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         start_time_s=result.start_time_s,
         run_hash=result.run_hash,
         digests=result.digests,
+        resumed=len(result.earlier),
         failure=result.failure,
         lost={role: t / 1e9 for role, t in result.lost.items()},
         samples=len(c.samples),
@@ -116,7 +121,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
 def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:
     """Writes report.json, samples.csv, evidence.npz and, when there is a map, map.png into a run's folder; returns the report."""
     c = result.collected
-    known = truth_of_run(scenario, c)
+    known = truth_of_run(scenario, c, result.earlier)
     run = run_of(folder)
     report = assemble(scenario, result, known).model_copy(update={"run": run})
     samples = samples_of(c.samples)
@@ -126,6 +131,8 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report
     archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed, run)
     if c.stiffness_map is not None:
         title = f"{scenario.name}, seed {scenario.seed}"
+        from palpate.report.figures import draw_map  # noqa: PLC0415 - findings are printed before anything is drawn
+
         draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, known.felt, title, run)
     return report
 

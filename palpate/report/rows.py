@@ -91,6 +91,8 @@ class Report(_Row):
     run_hash: str | None
     digests: dict[str, str]
     """Of each hashed topic: where two runs differ, they say in which."""
+    resumed: int = 0
+    """How many examinations that broke off this one went on with; their samples and forces count here, times are of the last."""
     failure: str | None
     """Service and cause; null when the run completed."""
     lost: dict[str, float]

@@ -50,6 +50,10 @@ def run(  # noqa: PLR0913 - the options of a command
     keys: Annotated[
         Path | None, typer.Option(help="With --secure: folder of `palpate keys init`; else keys of this run.")
     ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", metavar="DIR", help="Go on with the run in DIR that broke off; the results go to DIR/resumed."),
+    ] = None,
     repeat: Annotated[
         int,
         typer.Option(metavar="N", min=1, help="Run N examinations, each with its own folder and seed; see soak.json."),
@@ -82,9 +86,13 @@ def run(  # noqa: PLR0913 - the options of a command
 
       palpate run my.yaml --composed                all services in one process, for sweeps and debugging
 
+      palpate run --resume out/clean-20260101-120000  goes on with a run that was killed or stopped
+
       palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
     """
+    from palpate.command_line import refuse
     from palpate.run.examine import How, examine, examine_again
+    from palpate.run.examine import resume as go_on
     from palpate.run.inputs import usable
 
     how = How(
@@ -103,7 +111,13 @@ def run(  # noqa: PLR0913 - the options of a command
         keys=keys,
         quiet=quiet,
         as_json=as_json,
+        resume=resume,
     )
+    if resume is not None:
+        if (scenario, out, seed, settings, services, repeat, overwrite) != ("clean", None, None, None, None, 1, False):
+            refuse("--resume DIR goes on with the examination of DIR: it takes neither a scenario nor what changes or places one")
+        go_on(how)
+        return
     chosen = usable(scenario, settings, seed, services)
     if repeat > 1:
         examine_again(chosen, how, repeat)

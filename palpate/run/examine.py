@@ -15,8 +15,10 @@ from rich.markup import escape
 
 from palpate.command_line import EXIT_FAILED, fail, refuse, say
 from palpate.environment import given
+from palpate.report.archive import EvidenceError
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
+from palpate.report.resumption import Resumption, going_on, resumption
 from palpate.report.rows import Report
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
@@ -65,6 +67,7 @@ class How:
     keys: Path | None
     quiet: bool
     as_json: bool
+    resume: Path | None
 
 
 def _observers(scenario: Scenario, how: How, console: Console) -> tuple[str, ...]:
@@ -80,8 +83,20 @@ def _observers(scenario: Scenario, how: How, console: Console) -> tuple[str, ...
     return OBSERVERS
 
 
-def examine(scenario: Scenario, how: How) -> None:
-    """Runs the examination and writes its results; ends the command when it cannot start or has failed."""
+def resume(how: How) -> None:
+    """Goes on with an examination that broke off; ends the command when it cannot, or has failed."""
+    assert how.resume is not None
+    try:
+        before = resumption(how.resume)
+    except EvidenceError as error:
+        refuse(f"--resume {error}")
+    if not (how.quiet or how.as_json):
+        say(before.words)
+    examine(before.scenario, replace(how, out=before.folder), before)
+
+
+def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> None:
+    """Runs the examination, or goes on with one, and writes its results; ends the command when it cannot start or has failed."""
     console = Console(stderr=True)
     quiet = how.quiet or how.as_json
     _refuse_contradictions(scenario, how)
@@ -102,7 +117,10 @@ def examine(scenario: Scenario, how: How) -> None:
             check_room(folder, scenario.exam, how.record)
             with RunDisplay(console, quiet, expected_duration(scenario.exam)) as display, given({"PALPATE_RECORD": how.record}):
                 tell = WatchedRoom(folder, display.tell, say).tell
-                result = _run(scenario, folder.resolve(), tell, how, observers, absent, groups)
+                with going_on(None if before is None else before.checkpoint):
+                    result = _run(scenario, folder.resolve(), tell, how, observers, absent, groups)
+                if before is not None:
+                    result = replace(result, run_hash=None, earlier=before.earlier)
             conclude(console, folder, scenario, result, quiet, how.as_json)
     except (ProcessListError, ChoiceError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
@@ -214,7 +232,7 @@ def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Repor
         report = write_results(other, scenario, result)
         return report, write_page(other), f"{trouble}; they are in {other}"
     except OSError as error:
-        report = assemble(scenario, result, truth_of_run(scenario, result.collected))
+        report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
         return (
             report,
             None,

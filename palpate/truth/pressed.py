@@ -9,22 +9,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 import palpate_models
-import palpate_tissue
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate.truth.tissue import true_tissue
 from palpate_models.breathing import Breathing
 from palpate_models.cache import content_key, remembered
 from palpate_models.frames import Array
 from palpate_models.patient import Lesion, Phantom
 from palpate_models.phantom.field import edge_distance
 from palpate_models.scenario import Exam, Scenario
-from palpate_tissue.backend import TissueBackend
+
+if TYPE_CHECKING:
+    from palpate_tissue.backend import TissueBackend
 
 PITCH_M: Final = 0.010
 """Distance of the places that are pressed, over the examined region and a border of as much ..."""
@@ -72,6 +72,8 @@ class Copies:
         return self._copy(self.phantom.model_copy(update={"guarding": ()}))
 
     def _copy(self, phantom: Phantom) -> TissueBackend | None:
+        from palpate.truth.tissue import true_tissue  # noqa: PLC0415 - it imports a service, and who reads results needs none
+
         return true_tissue(self._scenario.model_copy(update={"phantom": phantom}))
 
 
@@ -120,6 +122,8 @@ def press_patient(scenario: Scenario) -> Pressed | None:
 
 def _code(scenario: Scenario) -> list[Path]:
     """The source files that decide what is felt."""
+    import palpate_tissue  # noqa: PLC0415 - as above
+
     files = [path for package in (palpate_models, palpate_tissue) for path in Path(package.__path__[0]).rglob("*.py")]
     chosen = Path(scenario.services.tissue)
     return sorted([*files, Path(__file__), *([chosen.resolve()] if chosen.suffix == ".py" else [])])

@@ -78,7 +78,7 @@ def test_a_run_does_without_the_dashboard_where_its_libraries_are_not(
     def lacking(role: str, choice: str) -> None:
         raise ChoiceError(f"services.{role} = {choice!r}: the module rerun is not installed; pip install 'palpate[dashboard]'")
 
-    how = examine.How(None, False, True, (), None, False, False, 0.0, (), 1.0, "normal", False, None, False, False)
+    how = examine.How(None, False, True, (), None, False, False, 0.0, (), 1.0, "normal", False, None, False, False, None)
     console = Console(stderr=True)
     assert examine._observers(load_scenario("clean"), how, console) == ("dashboard", "recorder")
     monkeypatch.setattr(examine, "check_libraries", lacking)

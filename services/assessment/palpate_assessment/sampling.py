@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from math import sqrt
 
 import numpy as np
 
+from palpate_models.checkpoint import Felt
 from palpate_models.frames import Array
 
 TRAVEL = 0.005
@@ -122,3 +124,17 @@ class Sampler:
             stroke=block[0].stroke,
             depth_uncertainty=max(s.depth_uncertainty for s in block),
         )
+
+
+def columns(samples: Sequence[ForceSample], before: float) -> Felt:
+    """Samples as a checkpoint keeps them, with times before `before` [s], at which their examination ended."""
+    names = [field.name for field in fields(ForceSample)]
+    felt = {name: np.array([getattr(sample, name) for sample in samples]) for name in names}
+    return Felt(**(felt | {"time": felt["time"] - before}))
+
+
+def samples_of(felt: Felt) -> list[ForceSample]:
+    """The samples of a checkpoint."""
+    names = [field.name for field in fields(ForceSample)]
+    plain = ((values if values.ndim > 1 else values.tolist()) for values in (getattr(felt, name) for name in names))
+    return [ForceSample(**dict(zip(names, row, strict=True))) for row in zip(*plain, strict=True)]

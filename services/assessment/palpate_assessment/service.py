@@ -11,13 +11,15 @@ from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.calibration import learned
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
-from palpate_assessment.sampling import ContactState, ForceSample, Sampler
+from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_models import press
+from palpate_models.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.phantom import quadrant
@@ -34,6 +36,8 @@ GROWING_SAMPLES = 200
 GROWING_EVERY = 6 * NS
 GROWING_FIRST = 40
 """Samples before the first growing map."""
+TOLD_AT_ONCE = 50
+"""Samples of an earlier examination that are told in a step."""
 NOTICED_S = 1.0
 """A patient who moves is noticed within this time."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
@@ -45,13 +49,17 @@ class AssessmentService(Service):
 
     role: ClassVar[str] = "assessment"
 
-    def __init__(self, exam: ExamInput) -> None:
+    def __init__(self, exam: ExamInput, before: Checkpoint | None = None) -> None:
+        """`before`: where the examination stood that this one goes on with."""
         self._exam = exam.exam
         self._X_AW = inverse(np.array(exam.X_WA))
         self._R_AW, self._p_AW = self._X_AW[:3, :3], self._X_AW[:3, 3]
         self._reach = float(np.clip(0.8 * exam.exam.spacing_m, 0.006, 0.020))
         self._sampler = Sampler()
-        self._samples: list[ForceSample] = []
+        self.samples: list[ForceSample] = [] if before is None else samples_of(before.felt)
+        """What was felt so far."""
+        self._untold = list(self.samples)
+        """Samples of the examination before, which this one's listeners have not heard of."""
         self._moved_at: float | None = None
         """When the patient was seen to have moved [s]."""
         self._surface: Array | None = None
@@ -65,18 +73,12 @@ class AssessmentService(Service):
         """Samples as they come, a map every few seconds, and once the scan is over the final map and the findings."""
         for surface in inbox.new("perception/surface"):
             self._perceive(surface)
-        new: list[ForceSample] = []
         phase = None
+        new, self._untold = self._untold[:TOLD_AT_ONCE], self._untold[TOLD_AT_ONCE:]
         for state in inbox.new("exam/state"):
             phase = int(state.phase)
-            if state.patient_moved:
-                self._forget_motion(nanoseconds(state.header.stamp) / NS)
-                continue
-            self._moved_at = None
-            sample = self._sampler.add(self._state(state))
-            if sample is not None:
+            if (sample := self.take(state)) is not None:
                 new.append(sample)
-        self._samples += new
         outbox: dict[str, Message | list[Message]] = {}
         if new:
             outbox["assessment/samples"] = [sample_message(s) for s in new]
@@ -87,11 +89,22 @@ class AssessmentService(Service):
             outbox |= self._grow(t)
         return outbox
 
+    def take(self, state: Message) -> ForceSample | None:
+        """Takes the next `exam/state`; returns the sample that it completes, if any."""
+        if state.patient_moved:
+            self._forget_motion(nanoseconds(state.header.stamp) / NS)
+            return None
+        self._moved_at = None
+        sample = self._sampler.add(self._state(state))
+        if sample is not None:
+            self.samples.append(sample)
+        return sample
+
     def finish(self) -> Mapping[str, Any]:
         """How much was assessed."""
         final = self._final
         return {
-            "samples": len(self._samples),
+            "samples": len(self.samples),
             "samples_used": 0 if final is None else final.samples,
             "findings": 0 if final is None else len(final.findings),
         }
@@ -100,7 +113,7 @@ class AssessmentService(Service):
         wanted = contract().topics["perception/surface"].frame
         if message.header.frame_id != wanted:
             raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
-        if self._samples:
+        if self._surface is not None and self.samples:
             return  # a look at a patient who has moved: all is told where the first look saw it
         p_W = np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3)
         self._surface = apply(self._X_AW, p_W)
@@ -129,23 +142,23 @@ class AssessmentService(Service):
         """The patient was seen to have moved at `t` [s]: what was felt just before, and is felt from now on, lies elsewhere."""
         if self._moved_at is None:
             self._moved_at = t
-            self._samples = [sample for sample in self._samples if sample.time < t - NOTICED_S]
+            self.samples = [sample for sample in self.samples if sample.time < t - NOTICED_S]
 
     def _due(self, t: int) -> bool:
-        grown = len(self._samples) >= max(GROWING_FIRST, self._mapped + 10)
+        grown = len(self.samples) >= max(GROWING_FIRST, self._mapped + 10)
         return grown and self._coarse is not None and t - self._last_map >= GROWING_EVERY
 
     def _grow(self, t: int) -> Outbox:
         assert self._coarse is not None
-        self._last_map, self._mapped = t, len(self._samples)
-        every = -(-len(self._samples) // GROWING_SAMPLES)
-        chosen = self._samples[::every]
+        self._last_map, self._mapped = t, len(self.samples)
+        every = -(-len(self.samples) // GROWING_SAMPLES)
+        chosen = self.samples[::every]
         result = growing(chosen, self._coarse, self._reach)
         return {} if result is None else {"assessment/map": map_message(t, result, self._exam.depth_m)}
 
     def _finish(self, t: int) -> Outbox:
         if self._surface is not None:
-            self._final = assess(self._samples, self._grid(PITCH), self._reach, self._exam.false_findings)
+            self._final = assess(self.samples, self._grid(PITCH), self._reach, self._exam.false_findings)
         if self._final is None:
             return {"assessment/findings": findings_message(t, [], [])}
         return {
@@ -156,7 +169,7 @@ class AssessmentService(Service):
 
 def create(scenario: Scenario) -> Service:
     """The assessment of a scenario; it knows nothing of the phantom but where the patient is registered."""
-    return AssessmentService(exam_input(scenario))
+    return AssessmentService(exam_input(scenario), read_checkpoint(Settings.read().checkpoint))
 
 
 def sample_message(sample: ForceSample) -> Message:

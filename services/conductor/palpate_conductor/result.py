@@ -28,6 +28,8 @@ class RunResult:
     failure: str | None
     """Service and cause, or why planning gave the examination up; None when it completed."""
     lost: dict[str, int]
+    earlier: tuple[Collected, ...] = ()
+    """What the examinations collected that this one went on with, oldest first; their samples are among this one's."""
     interrupted: bool = False
     """Whether it was ended by Ctrl-C or SIGTERM; what it had measured until then is here all the same."""
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models import lbr
-from palpate_models.frames import Array
+from palpate_models.checkpoint import Checkpoint
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.scenario import ExamInput
 from palpate_planning.background import WORKER, BackgroundTask
 from palpate_planning.contact import ContactSensing
@@ -33,6 +34,8 @@ from palpate_planning.wall import TouchedSkin, Wall, plane
 LOOKS_MAX = 3
 MOVES_MAX = 2
 """A patient who moves more often is not looked at again."""
+ELSEWHERE_M = 0.015
+"""A wall that lies further from where an examination before saw it is another patient's, or he has moved since."""
 REST = 200 * MS
 """Time at rest before looking [ns]: the arm's oscillations fade."""
 LOOK_PATIENCE = 12 * SECOND
@@ -46,9 +49,12 @@ ASSESS_PATIENCE = 30 * SECOND
 class ExamSequence:
     """Runs one examination. `step` each planning period; `status` says where it stands."""
 
-    def __init__(self, known: ExamInput, periods: Periods, *, lockstep: bool = True) -> None:
-        """`lockstep`: heavy planning takes exactly its simulated time; else at least that, and as long as it takes."""
+    def __init__(self, known: ExamInput, periods: Periods, before: Checkpoint | None = None, *, lockstep: bool = True) -> None:
+        """`before`: where the examination stood that this one goes on with; `lockstep`: heavy planning takes exactly its
+        simulated time; else at least that, and as long as it takes.
+        """
         self._known, self._periods, self._lockstep = known, periods, lockstep
+        self._before = before
         self._kinematics = ArmKinematics(known.robot, known.limits)
         compile_ahead()
         self._sense = ContactSensing(
@@ -63,6 +69,7 @@ class ExamSequence:
         self._looks = look_postures(known)
         follower = TrajectoryFollower(self._kinematics, np.array(lbr.HOME))
         self._course = ExamCourse(FreeMotion(follower, self._planner, lockstep=lockstep))
+        self._course.status.stroke = 0 if before is None else before.strokes
         self._stops = Stops(self._course, known.limits.release_patience_s)
         self._restart = RestartRamp()
         self._phases: dict[Phase, Callable[[Observation], Setpoint | None]] = {
@@ -158,12 +165,26 @@ class ExamSequence:
             wall, surface = self._sense.wall, now.perceived.surface
             self._sense.wall = wall.seen_again(surface) if self._moves else Wall(surface, wall.breath)
             self.status.target_count, self.status.view_blocked = len(now.perceived.positions), False
-            course.enter(Phase.PLAN, now.t, f"planning over {self.status.target_count} targets")
+            self._go_on(now, now.perceived)
         elif isinstance(now.perceived, PerceptionFailure):
             self._look_again(now, now.perceived.message)
         elif now.t - self._asked > frames * self._periods.frame + LOOK_PATIENCE:
             self._look_again(now, f"no answer from perception {LOOK_PATIENCE / SECOND:.0f} s after the burst")
         return None
+
+    def _go_on(self, now: Observation, perceived: PerceivedAbdomen) -> None:
+        """Plans over all targets, or over those that an examination before has left, of a patient who lies where he lay."""
+        course, before, words = self._course, self._before, f"planning over {self.status.target_count} targets"
+        if before is not None and not self._moves:
+            X_WA = np.array(self._known.X_WA)
+            if (away := perceived.surface.away_from(apply(X_WA, before.surface))) > ELSEWHERE_M:
+                course.abort(now, f"the wall lies {away * 1e3:.0f} mm from where it lay before: examine anew")
+                return
+            if not self._known.exam.searched:
+                targets = apply(inverse(X_WA), perceived.positions)[:, :2]
+                self._wanted = before.wanted(targets, self._known.exam.spacing_m)
+                words = f"planning over the {len(self._wanted)} of {self.status.target_count} targets that are left"
+        course.enter(Phase.PLAN, now.t, words)
 
     def _look_again(self, now: Observation, why: str) -> None:
         self._asked = None

@@ -16,6 +16,7 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
+from palpate_models.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Following, Scenario
 from palpate_planning.background import WORKER
@@ -42,13 +43,13 @@ class PlanningService(Service):
 
     role: ClassVar[str] = "planning"
 
-    def __init__(self, known: ExamInput, *, lockstep: bool = True) -> None:
-        """`lockstep` as in `ExamSequence`."""
+    def __init__(self, known: ExamInput, before: Checkpoint | None = None, *, lockstep: bool = True) -> None:
+        """`before` and `lockstep` as in `ExamSequence`."""
         roles = contract().roles
         self._known = known
         self._X_WA = np.array(known.X_WA)
         _let_the_worker_give_way()
-        self._exam = ExamSequence(known, Periods(roles["planning"].period, roles["camera"].period), lockstep=lockstep)
+        self._exam = ExamSequence(known, Periods(roles["planning"].period, roles["camera"].period), before, lockstep=lockstep)
         self._supervisor_silence = contract().topics["planning/setpoint"].expiry
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
@@ -197,4 +198,5 @@ def _let_the_worker_give_way() -> None:
 
 def create(scenario: Scenario) -> PlanningService:
     """The service for a scenario; it is given the exam input only."""
-    return PlanningService(exam_input(scenario), lockstep=Settings.read().runtime == "lockstep")
+    settings = Settings.read()
+    return PlanningService(exam_input(scenario), read_checkpoint(settings.checkpoint), lockstep=settings.runtime == "lockstep")

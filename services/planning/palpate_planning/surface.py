@@ -111,6 +111,11 @@ class PerceivedSurface:
         line = np.linspace(-1.0, 1.0, 9)
         return PerceivedSurface(X_WA, BicubicField(line, line, np.zeros((9, 9, 3))))
 
+    def away_from(self, p_W: Array) -> float:
+        """Median height of this surface above or below points of another one [m], shape (n, 3)."""
+        p_A = apply(inverse(self._X_WA), p_W)
+        return float(np.median(np.abs(self._field(p_A[:, :2])[:, 0] - p_A[:, 2])))
+
     def at(self, xy_A: Array) -> tuple[Array, Array]:
         """Surface points and outward unit normals over xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""
         p_A, n_A = self.in_A(xy_A)

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from itertools import count, takewhile
+from operator import attrgetter
 from pathlib import Path
 
 import yaml
@@ -19,7 +22,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Message, Schema
 from mcap.stream_reader import StreamReader
 
-from palpate_bus.recordings import KEPT_EVERY
+from palpate_bus.recordings import KEPT_EVERY, RecordedMessage, Recording
 from palpate_recorder.bag import BagWriter, Channel
 
 _BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
@@ -44,10 +47,7 @@ def recover(folder: Path) -> Path:
 
     Raises FileNotFoundError if `folder` holds no recording, ValueError if not even its first chunk is complete.
     """
-    numbered = (folder / f"{folder.name}_{number}.mcap" for number in count())
-    paths = list(takewhile(Path.is_file, numbered))
-    if not paths:
-        raise FileNotFoundError(f"{folder / folder.name}_0.mcap: no recording there; give the folder that holds the .mcap file")
+    paths = _parts(folder)
     names = _channels(paths[0])
     if not names:
         raise ValueError(f"{paths[0]}: broken before the end of its first chunk, nothing to recover")
@@ -60,8 +60,56 @@ def recover(folder: Path) -> Path:
     return bag.folder
 
 
+@dataclass(frozen=True)
+class Salvaged(Recording):
+    """What is complete in a recording that was cut off, in memory."""
+
+    held: tuple[RecordedMessage, ...] = ()
+    """In order of their stamps."""
+
+    def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[RecordedMessage]:
+        """As of any recording."""
+        wanted, first, last = frozenset(topics), begin or self.first, self.last if end is None else end
+        return (message for message in self.held if message.topic in wanted and first <= message.stamp <= last)
+
+
+def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
+    """Reads what is complete of some topics in the recording `folder`, and writes nothing. Raises as `recover`."""
+    paths = _parts(folder)
+    names = _channels(paths[0])
+    if not names:
+        raise ValueError(f"{paths[0]}: broken before the end of its first chunk, nothing to recover")
+    wanted = {number: channel.topic[1:] for number, channel in names.items() if channel.topic[1:] in frozenset(topics)}
+    records = (record for path in paths for record in complete_records(path) if isinstance(record, Message))
+    held = [RecordedMessage(r.log_time, wanted[r.channel_id], r.data, r.sequence) for r in records if r.channel_id in wanted]
+    if not held:
+        raise ValueError(f"{folder}: holds none of {', '.join(topics)}")
+    held.sort(key=attrgetter("stamp"))
+    channels = {channel.topic[1:]: channel for channel in names.values()}
+    return Salvaged(
+        path=folder,
+        files=tuple(paths),
+        types={name: (channel.type, channel.type_hash) for name, channel in channels.items()},
+        counts=dict(Counter(message.topic for message in held)),
+        thinned={name: channel.kept_every_ms for name, channel in channels.items() if channel.kept_every_ms},
+        first=held[0].stamp,
+        last=held[-1].stamp,
+        scenario=None,
+        held=tuple(held),
+    )
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The files of a recording. Raises FileNotFoundError if there are none."""
+    numbered = (folder / f"{folder.name}_{number}.mcap" for number in count())
+    paths = list(takewhile(Path.is_file, numbered))
+    if not paths:
+        raise FileNotFoundError(f"{folder / folder.name}_0.mcap: no recording there; give the folder that holds the .mcap file")
+    return paths
+
+
 def _channels(path: Path) -> dict[int, Channel]:
-    """The channels of a file by their numbers."""
+    """The channels of a file by their numbers: they stand before its messages."""
     schemas: dict[int, Schema] = {}
     names: dict[int, Channel] = {}
     for record in complete_records(path):
@@ -69,6 +117,8 @@ def _channels(path: Path) -> dict[int, Channel]:
             schemas[record.id] = record
         elif isinstance(record, ChannelRecord) and record.id not in names:
             names[record.id] = _channel(record, schemas[record.schema_id])
+        elif isinstance(record, Message):
+            break
     return names
 
 

@@ -22,7 +22,7 @@ from palpate_bus.messages import JointState, SurfaceMesh, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_models.scenario import Scenario
-from palpate_recorder.recover import recover
+from palpate_recorder.recover import recover, salvage
 from palpate_recorder.service import FOLDER, RecorderService, create
 
 MS = 1_000_000
@@ -134,6 +134,22 @@ def test_a_file_cut_anywhere_is_recovered_up_to_there(tmp_path: Path) -> None:
             counts.append(len([None for _ in reader.messages()]))
             assert counts[-1] == reader.message_count
     assert 0 < counts[0] < counts[1] < counts[2] < counts[3] == 3978
+
+
+def test_what_is_salvaged_is_what_is_recovered_and_nothing_is_written(tmp_path: Path) -> None:
+    service = RecorderService(tmp_path / FOLDER)
+    record(service, 3900)
+    crashed = kill(tmp_path / FOLDER, tmp_path / "crashed", 0.7)
+    before = sorted(tmp_path.rglob("*"))
+    salvaged = salvage(crashed, ["joint_states", "sim/surface"])
+    assert sorted(tmp_path.rglob("*")) == before
+    recovered = open_recording(recover(crashed))
+    topics = ["joint_states", "sim/surface"]
+    assert list(salvaged.messages(topics)) == list(recovered.messages(topics))
+    assert salvaged.types == recovered.types
+    assert list(salvaged.messages(["joint_states"], 5 * MS, 7 * MS)) == list(recovered.messages(["joint_states"], 5 * MS, 7 * MS))
+    with pytest.raises(ValueError, match="holds none of exam/state"):
+        salvage(crashed, ["exam/state"])
 
 
 def test_recover_says_what_is_wrong(tmp_path: Path) -> None:
