@@ -29,7 +29,7 @@ def _scene() -> Any:
         contents=["+ $origin/**", "- /world/camera/depth"],
         background=(24, 27, 33),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, color=(255, 255, 255, 18)),
-        eye_controls=_eye((1.20, -1.63, 2.41), (0.41, 0.03, 1.32), (0.0, 0.0, 1.0)),
+        eye_controls=_eye((1.10, -1.46, 2.24), (0.41, 0.03, 1.30), (0.0, 0.0, 1.0)),
         overrides={
             "/world/tool/travelled": rrb.VisibleTimeRanges([_whole_past()]),
             "/world/perception/normals": _HIDDEN,
