@@ -37,7 +37,7 @@ DRAWN = 3_000
 COLOURS = 256
 BAR_PX = 36
 """Height of the viewer's own top bar, which is left out: it says what machine the picture was made on."""
-FRAMES, FRAME_S, LAST_S, FILM_PX = 28, 0.4, 3.0, (960, 578)
+FRAMES, FRAME_S, LAST_S, FILM_PX = 20, 0.5, 3.0, (960, 578)
 """Frames of a film, how long each of them and the last are shown [s], and their size."""
 
 Page = Any
