@@ -20,10 +20,8 @@ from palpate_bus.runtime.blame import Blame
 from palpate_bus.service import Outbox, Service
 
 _CHAIN = struct.Struct("<qqq")
-_SMALL = 4096
-"""A payload up to this size [bytes] is cheaper copied behind its head than hashed in a call of its own."""
 _CHAIN_NS = 64_000_000
-"""Simulated time [ns] over which what was sent is gathered for the digests: hashing each by itself would meet cold code."""
+"""Simulated time [ns] over which what was sent is gathered for the digests."""
 NEVER = -1
 """The tick of something that has not happened."""
 
@@ -193,7 +191,7 @@ class TickInbox:
 class OutputPort:
     """One topic that a service writes: its sequence and the digest over all that it sent."""
 
-    __slots__ = ("_digest", "_exact", "encode", "event", "latched", "period", "sequence", "topic")
+    __slots__ = ("_digest", "_exact", "_unchained", "encode", "event", "latched", "period", "sequence", "topic")
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
@@ -204,26 +202,28 @@ class OutputPort:
         self._exact = codec.decodes_to_itself(topic.type)
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
+        self._unchained: list[Packet] = []
+        """What is not in the digest yet: hashing each message by itself would cost more, and meet cold code."""
 
     def pack(self, message: Message, t: int) -> Sent:
         """Encodes and numbers a message that is sent at `t` [ns]."""
         sequence = self.sequence = self.sequence + 1
-        return self, Packet(self.encode(message), t, sequence, message if self._exact else None)
+        packet = Packet(self.encode(message), t, sequence, message if self._exact else None)
+        if self._digest is not None:
+            self._unchained.append(packet)
+        return self, packet
 
-    def chain(self, packet: Packet) -> None:
-        """Takes a sent message into the digest."""
-        digest = self._digest
-        if digest is None:
-            return
-        size = len(packet.payload)
-        if size <= _SMALL:
-            digest.update(_CHAIN.pack(packet.stamp, packet.sequence, size) + packet.payload)
-        else:
-            digest.update(_CHAIN.pack(packet.stamp, packet.sequence, size))
-            digest.update(packet.payload)
+    def chain(self) -> None:
+        """Takes what was packed since the last call into the digest, all in one go."""
+        if self._unchained and self._digest is not None:
+            heads = (_CHAIN.pack(packet.stamp, packet.sequence, len(packet.payload)) for packet in self._unchained)
+            parts = (part for head, packet in zip(heads, self._unchained, strict=True) for part in (head, packet.payload))
+            self._digest.update(b"".join(parts))
+            self._unchained.clear()
 
     def digest(self) -> str | None:
         """Hexadecimal digest, None for a topic that is not hashed."""
+        self.chain()
         return None if self._digest is None else self._digest.hexdigest()
 
 
@@ -252,8 +252,6 @@ class Stepper:
             periodic = ()
         self._steady = tuple(port for port in periodic if port.period == self.role.period)
         self._rarer = tuple(port for port in periodic if port.period != self.role.period)
-        self._unchained: list[list[Sent]] = []
-        """What each part of a step has sent and is not in the digests yet: many small messages are hashed in one go."""
         self._chain_every = max(_CHAIN_NS // self.role.period, 1)
 
     def start(self) -> list[Sent]:
@@ -263,9 +261,7 @@ class Stepper:
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
-            packed = port.pack(message, 0)
-            port.chain(packed[1])
-            sent.append(packed)
+            sent.append(port.pack(message, 0))
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
             raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
@@ -283,7 +279,6 @@ class Stepper:
             stepped = perf_counter_ns()
             sent += self._pack(outbox, t)
             blame.encode += perf_counter_ns() - stepped
-        self._unchained.append(sent)
         self._close(t)
         blame.compute += perf_counter_ns() - begin - (blame.decode - decoded) - (blame.encode - encoded)
         return sent
@@ -296,7 +291,6 @@ class Stepper:
             stepped = perf_counter_ns()
             blame.compute += stepped - begin - (blame.decode - decoded)
             sent = self._pack(outbox, t)
-            self._unchained.append(sent)
             blame.encode += perf_counter_ns() - stepped
             yield sent
             begin, decoded = perf_counter_ns(), blame.decode
@@ -318,21 +312,15 @@ class Stepper:
         for port in self._rarer:
             if not t % port.period and port.sequence != t // port.period + 1:
                 raise self._missing(port, t)
-        if len(self._unchained) >= self._chain_every:
-            begin = perf_counter_ns()
-            self._chain()
-            self.blame.encode += perf_counter_ns() - begin
         self.blame.steps += 1
+        if not self.blame.steps % self._chain_every:
+            begin = perf_counter_ns()
+            for port in self.ports.values():
+                port.chain()
+            self.blame.encode += perf_counter_ns() - begin
 
     def _missing(self, port: OutputPort, t: int) -> LockstepError:
         return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
-
-    def _chain(self) -> None:
-        """Brings the digests up to date."""
-        for sent in self._unchained:
-            for port, packet in sent:
-                port.chain(packet)
-        self._unchained.clear()
 
     def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
         sent: list[Sent] = []
@@ -357,7 +345,6 @@ class Stepper:
 
     def digests(self) -> dict[str, str]:
         """Digest by topic, of the hashed ones."""
-        self._chain()
         return {name: digest for name, port in self.ports.items() if (digest := port.digest()) is not None}
 
 
