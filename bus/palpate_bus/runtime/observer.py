@@ -6,6 +6,7 @@ It sees the latest of the periodic topics, and every message of the others. A re
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from time import sleep
 from typing import Any
 
@@ -127,60 +128,96 @@ class ObservedService:
         }
 
 
-class Producers:
-    """The services that an observer observes: without a conductor it stays as long as one of them, and no longer."""
-
-    def __init__(self, member: Member) -> None:
-        self._member = member
-        self._roles = frozenset(role.name for role in member.rules.roles.values() if not role.observer)
-
-    def leave_with_them(self, lost: str) -> None:
-        """Raises RunAborted when the conductor is lost, as `lost` says, and all of them have left."""
-        if lost and not self._member.alive(self._roles):
-            raise RunAborted(lost)
-
-
-class ObserverNode:
-    """One observing service in a process of its own."""
+class ObservingNode(ABC):
+    """A process outside the barrier: it takes in what comes until the conductor ends the run."""
 
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
+        self._member = member
         self._link = ConductorLink(member, OBSERVERS_STAY_S)
-        self._producers = Producers(member)
         self._reports = Reports(member)
-        self._observed = ObservedService(service, member)
+        self._observed = frozenset(role.name for role in member.rules.roles.values() if not role.observer)
+
+    @abstractmethod
+    def _drain(self) -> bool:
+        """Takes in what has come; whether anything has."""
+
+    @abstractmethod
+    def _reached(self) -> int:
+        """The tick [ns] up to which everything was taken in."""
+
+    @abstractmethod
+    def _missing(self) -> list[str]:
+        """What has not been heard of before the run begins."""
+
+    @abstractmethod
+    def _details(self) -> dict[str, Any]:
+        """Counts for the last report."""
+
+    def _report(self) -> None:
+        self._reports.progress(self._reached())
+
+    @abstractmethod
+    def _obey(self, message: Any) -> None:
+        """Does what the conductor says, other than to begin and to end."""
 
     def run(self) -> None:
-        """Observes until the conductor ends the run."""
-        observed = self._observed
+        """Observes until the conductor ends the run. Raises RunAborted when it is lost, and all who are observed have left."""
         try:
             while True:
-                busy = observed.drain_and_step()
+                busy = self._drain()
                 message = self._link.poll()
                 if message is None:
-                    self._producers.leave_with_them(self._link.lost)
                     if not busy:
+                        if self._link.lost and not self._member.alive(self._observed):
+                            raise RunAborted(self._link.lost)
                         sleep(IDLE_S)
-                    self._reports.progress(observed.now)
+                    self._report()
                 elif message.command == RunControl.HELLO:
                     self._hello()
-                elif message.command == RunControl.LOST:
-                    observed.stepper.inbox.lost_roles.add(message.role)
                 elif message.command == RunControl.END:
                     break
-            while observed.drain_and_step():
+                else:
+                    self._obey(message)
+            while self._drain():
                 pass
         except RunAborted as aborted:
             log.warning("run aborted: %s", aborted)
-            observed.drain_and_step()
+            self._drain()
             self._service.finish()
             raise
         facts = dict(self._service.finish())
-        detail = {"blame": observed.stepper.blame.per_step_us(), "facts": facts, **observed.counters()}
-        self._reports.say(ServiceReport.FINISHED, observed.now, detail=detail)
+        self._reports.say(ServiceReport.FINISHED, self._reached(), detail={"facts": facts, **self._details()})
 
     def _hello(self) -> None:
-        for publisher in self._observed.publishers.values():
+        self._drain()
+        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": self._missing(), **whereabouts()})
+
+
+class ObserverNode(ObservingNode):
+    """One observing service in a process of its own."""
+
+    def __init__(self, service: Service, member: Member) -> None:
+        super().__init__(service, member)
+        self._feeds = ObservedService(service, member)
+
+    def _drain(self) -> bool:
+        return self._feeds.drain_and_step()
+
+    def _reached(self) -> int:
+        return self._feeds.now
+
+    def _missing(self) -> list[str]:
+        return []
+
+    def _details(self) -> dict[str, Any]:
+        return {"blame": self._feeds.stepper.blame.per_step_us(), **self._feeds.counters()}
+
+    def _obey(self, message: Any) -> None:
+        if message.command == RunControl.LOST:
+            self._feeds.stepper.inbox.lost_roles.add(message.role)
+
+    def _hello(self) -> None:
+        for publisher in self._feeds.publishers.values():
             publisher.hello()
-        self._observed.drain_and_step()
-        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": [], **whereabouts()})
+        super()._hello()
