@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from math import inf
 from time import monotonic
 from typing import Annotated, Any
 
@@ -26,6 +27,8 @@ app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
 Seconds = Annotated[float | None, typer.Option("--seconds", help="Stop after this long; by default Ctrl-C ends it.")]
 EVERY_S = 1.0
+BANDWIDTH_OVER = 5
+"""Bandwidth is the mean over so many seconds."""
 
 
 @app.command("list")
@@ -128,13 +131,10 @@ def hz(
     """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
     with command(), _listening(name, connect, run, domain) as (_, topic, listener):
         spacing = Spacing()
-        report = monotonic() + EVERY_S
-        for heard in _until(listener, seconds, tick=0.1):
-            if heard is not None:
-                spacing.add(heard.sent, _stamp(heard, topic))
-            if monotonic() >= report:
-                report += EVERY_S
-                _say_rate(spacing, topic, as_json)
+        for heard in _each_second(listener, seconds):
+            for one in heard:
+                spacing.add(one.sent, _stamp(one, topic))
+            _say_rate(spacing, topic, as_json)
         if spacing.messages > 1:
             _say_rate(spacing, topic, as_json, whole=True)
 
@@ -150,17 +150,10 @@ def bw(
 ) -> None:
     """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
     with command(), _listening(name, connect, run, domain) as (_, topic, listener):
-        window: deque[tuple[float, int]] = deque()
-        report = monotonic() + EVERY_S
-        for heard in _until(listener, seconds, tick=0.1):
-            now = monotonic()
-            if heard is not None:
-                window.append((now, len(heard.payload)))
-            if now >= report:
-                report += EVERY_S
-                while window and window[0][0] < now - 5 * EVERY_S:
-                    window.popleft()
-                _say_bandwidth(window, topic, as_json)
+        window: deque[list[int]] = deque(maxlen=BANDWIDTH_OVER)
+        for heard in _each_second(listener, seconds):
+            window.append([len(one.payload) for one in heard])
+            _say_bandwidth(window, topic, as_json)
 
 
 @contextmanager
@@ -188,13 +181,20 @@ def _listening(
             listener.close()
 
 
-def _until(listener: Listener, seconds: float | None, tick: float | None = None) -> Iterator[Any]:
-    """Messages until the time is over; with `tick` also None, at least that often [s]."""
+def _until(listener: Listener, seconds: float | None) -> Iterator[Heard]:
+    """Messages as they come, until the time is over."""
     end = None if seconds is None else monotonic() + seconds
     while end is None or monotonic() < end:
-        heard = listener.get(0.1 if tick is None else tick)
-        if heard is not None or tick is not None:
+        if (heard := listener.get(0.1)) is not None:
             yield heard
+
+
+def _each_second(listener: Listener, seconds: float | None) -> Iterator[list[Heard]]:
+    """The messages of each second, until the time is over."""
+    left = inf if seconds is None else seconds
+    while left > 0:
+        yield list(_until(listener, min(left, EVERY_S)))
+        left -= EVERY_S
 
 
 def _message(heard: Heard, topic: Topic) -> Any:
@@ -227,10 +227,10 @@ def _say_rate(spacing: Spacing, topic: Topic, as_json: bool, whole: bool = False
     print(("in all: " if whole else "") + text + f"; {facts['messages']} messages", flush=True)
 
 
-def _say_bandwidth(window: deque[tuple[float, int]], topic: Topic, as_json: bool) -> None:
-    sizes = [size for _, size in window]
-    seconds = window[-1][0] - window[0][0] if len(window) > 1 else 0.0
-    rate = sum(sizes[1:]) / seconds if seconds else 0.0
+def _say_bandwidth(window: Collection[list[int]], topic: Topic, as_json: bool) -> None:
+    """`window` has the sizes of the messages of the last seconds."""
+    sizes = [size for second in window for size in second]
+    rate = sum(sizes) / (len(window) * EVERY_S)
     if as_json:
         print_line(
             {"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": sum(sizes) / max(len(sizes), 1)}

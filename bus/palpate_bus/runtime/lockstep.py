@@ -202,23 +202,21 @@ class OutputPort:
         self._exact = codec.decodes_to_itself(topic.type)
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
-        self._unchained: list[Packet] = []
+        self._unchained: list[bytes] = []
         """What is not in the digest yet: hashing each message by itself would cost more, and meet cold code."""
 
     def pack(self, message: Message, t: int) -> Sent:
         """Encodes and numbers a message that is sent at `t` [ns]."""
         sequence = self.sequence = self.sequence + 1
-        packet = Packet(self.encode(message), t, sequence, message if self._exact else None)
+        payload = self.encode(message)
         if self._digest is not None:
-            self._unchained.append(packet)
-        return self, packet
+            self._unchained += (_CHAIN.pack(t, sequence, len(payload)), payload)
+        return self, Packet(payload, t, sequence, message if self._exact else None)
 
     def chain(self) -> None:
         """Takes what was packed since the last call into the digest, all in one go."""
-        if self._unchained and self._digest is not None:
-            heads = (_CHAIN.pack(packet.stamp, packet.sequence, len(packet.payload)) for packet in self._unchained)
-            parts = (part for head, packet in zip(heads, self._unchained, strict=True) for part in (head, packet.payload))
-            self._digest.update(b"".join(parts))
+        if self._digest is not None:
+            self._digest.update(b"".join(self._unchained))
             self._unchained.clear()
 
     def digest(self) -> str | None:
