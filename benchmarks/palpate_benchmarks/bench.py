@@ -43,10 +43,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
 PARTS = {
     "barrier": "palpate_benchmarks.barrier",
     "codec": "palpate_benchmarks.codec",
-    "control": "palpate_benchmarks.control",
     "fmu": "palpate_benchmarks.fmu",
-    "monitor": "palpate_benchmarks.monitor",
-    "robot": "palpate_benchmarks.robot",
     "tissue": "palpate_benchmarks.tissue",
     "tissue, elastic": "palpate_benchmarks.elastic",
     "wire": "palpate_benchmarks.wire",
