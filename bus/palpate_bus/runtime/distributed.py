@@ -85,7 +85,7 @@ class LockstepNode(Node):
         blame = seat.stepper.blame
         for sent in seat.stepper.parts(t):
             start = perf_counter_ns()
-            self._send(seat, sent, t)
+            self._send(seat, sent)
             blame.send += perf_counter_ns() - start
             everything += sent
         start = perf_counter_ns()
@@ -95,7 +95,7 @@ class LockstepNode(Node):
         blame.send += perf_counter_ns() - start
         seat.tick = t
 
-    def _send(self, seat: Seat, sent: Sequence[Sent], t: int) -> None:
+    def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
         self._group.deliver(sent)
         seat.output.send(sent)
 

@@ -64,7 +64,7 @@ class Node(ABC):
             for seat in self._seats:
                 self._acting = seat
                 latched = seat.stepper.start()
-                self._send(seat, latched, 0)
+                self._send(seat, latched)
                 seat.output.record(latched, 0)
             self._loop()
             for seat in self._seats:
@@ -97,8 +97,8 @@ class Node(ABC):
         """Steps the services until the run ends."""
 
     @abstractmethod
-    def _send(self, seat: Seat, sent: Sequence[Sent], t: int) -> None:
-        """Sends what a service gave out at `t` [ns]."""
+    def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
+        """Sends what a service gave out."""
 
     @abstractmethod
     def _counts(self, seat: Seat) -> dict[str, Any]:

@@ -136,7 +136,7 @@ class WallClockNode(Node):
             everything: list[Sent] = []
             for sent in self._stepper.parts(t):
                 start = perf_counter_ns()
-                self._send(self._seat, sent, t)
+                self._send(self._seat, sent)
                 self._stepper.blame.send += perf_counter_ns() - start
                 everything += sent
             self._seat.output.record(everything, t)
@@ -197,7 +197,7 @@ class WallClockNode(Node):
                     continue
                 buffer.deliver(Packet(sample.payload, t - buffer.delay, sample.sequence, message))
 
-    def _send(self, seat: Seat, sent: Sequence[Sent], t: int) -> None:
+    def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
         seat.output.send(sent)
 
     def _counts(self, seat: Seat) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from rosbags.typesys import get_types_from_msg
 
 from palpate_bus.messages import codec
 
-JOINTS = 7
 _STATE = """\
 float64 sample_time
 int8 session_state
