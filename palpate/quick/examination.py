@@ -42,7 +42,7 @@ from palpate_planning.segments import Segment
 from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
 from palpate_planning.surface import Foot, PerceivedSurface
 from palpate_planning.touch import FELT_N
-from palpate_planning.wall import Wall
+from palpate_planning.wall import Wall, WallPlace
 from palpate_planning.wall_watch import GATE_M
 
 _DENSE_M: Final = 0.0003
@@ -246,7 +246,7 @@ class QuickExamination:
         motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
         self._count += 1
         measured = (self._depth, self._force, (_NOWHERE, _NOWHERE), self._touching)
-        contact = ContactMeasurement(_NOWHERE, _NOWHERE, _FOOT, 0.0, 0.0, loop.uncertainty_m, *measured)
+        contact = ContactMeasurement(_NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, loop.uncertainty_m), *measured)
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT)
         at = int(motion.along.position * way.per_m + 0.5)
         self._depth = motion.regulation.reference + loop.regulation(k)

@@ -10,7 +10,7 @@ from palpate_models.frames import Array
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.surface import Foot
 from palpate_planning.tool_weight import ToolWeight
-from palpate_planning.wall import Wall
+from palpate_planning.wall import Wall, WallPlace
 
 CONTACT_ON_N = 0.3
 """Normal force that counts as contact: more than noise and the drift since the last tare."""
@@ -38,12 +38,8 @@ class ContactMeasurement(NamedTuple):
     """Orientation of the force/torque sensor, shape (3, 3)."""
     foot: Foot
     """The point of the perceived surface under the indenter."""
-    correction: float
-    """How far outward of it the skin is at the end of expiration, as far as touch has told [m]."""
-    displacement: float
-    """How far outward of that the breath has moved it [m]."""
-    uncertainty: float
-    """Standard deviation of both together, and so of the depth [m]."""
+    wall: WallPlace
+    """Where the skin is outward of it; its standard deviation is that of the depth."""
     depth: float
     """Radius less the signed distance of the sphere's centre from the unpressed skin, where it is now [m]; negative: gap."""
     force: float
@@ -70,7 +66,7 @@ class ContactSensing:
         """The contact at the reading of time `t` [ns]."""
         X_WI, R_WS = self._kinematics.poses(reading.q)
         wall, foot = self.wall, self.wall.perceived.nearest(X_WI[:3, 3])
-        correction, displacement = wall.correction.height(foot.xy_A), wall.displacement(foot.xy_A, t)
+        place = wall.at(foot.xy_A, t)
         velocity = self._kinematics.jacobian(reading.q)[:3] @ reading.qd
         acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
         self._velocity = velocity
@@ -80,11 +76,9 @@ class ContactSensing:
             X_WI,
             R_WS,
             foot,
-            correction,
-            displacement,
-            wall.sigma(foot.xy_A, t),
-            self._radius - foot.distance + correction + displacement,
+            place,
+            self._radius - foot.distance + place.correction + place.displacement,
             force,
-            wall.skin(foot, correction),
+            wall.skin(foot, place.correction),
             self._touching,
         )

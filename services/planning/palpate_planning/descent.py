@@ -62,12 +62,12 @@ class Descent:
         if self._felt:
             return True
         motion = self._motion
-        unsure = SIGMAS * contact.uncertainty
+        unsure = SIGMAS * contact.wall.sigma
         braking = motion.depth.velocity**2 / DEPTH_ACCELERATION
         near = motion.depth.position > -unsure - ALLOWANCE_M - braking
         deepest = motion.depth.step(unsure + self._depth, PROBE_MPS if near else DESCEND_MPS)
         if near:
-            self._onset.add(contact.depth, contact.force, t, contact.displacement)
+            self._onset.add(contact.depth, contact.force, t, contact.wall.displacement)
         if contact.force >= FELT_N or (deepest and contact.touching):
             self.touched, outward = motion.wall.touched(contact.foot, self._onset.touch(), self.stroke, t)
             motion.shift(outward)

@@ -37,8 +37,8 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
         surface_point=Point(*p.tolist()),
         surface_normal=Vector3(*n.tolist()),
         end_tick=status.end_tick,
-        depth_uncertainty=0.0 if contact is None else contact.uncertainty,
-        wall_displacement=0.0 if contact is None else contact.displacement,
+        depth_uncertainty=0.0 if contact is None else contact.wall.sigma,
+        wall_displacement=0.0 if contact is None else contact.wall.displacement,
         stroke=status.stroke,
         patient_moved=status.patient_moved,
     )

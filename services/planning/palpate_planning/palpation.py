@@ -272,7 +272,7 @@ class Palpation:
         if not self._joined:
             self._motion.restart(contact)
             self._joined = True
-        height = _clearance(contact.uncertainty)
+        height = _clearance(contact.wall.sigma)
         if not self._watch.calm or self._recovery.displacement is not None:
             self._descent.start()
         if not self._recovery.paused and self._descent.rest(height, LIFT_MPS):

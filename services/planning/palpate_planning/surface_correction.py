@@ -77,9 +77,13 @@ class SurfaceCorrection:
 
     def sigma(self, xy_A: Array) -> float:
         """Standard deviation of c [m] at a place, shape (2,)."""
+        return self.at(xy_A)[1]
+
+    def at(self, xy_A: Array) -> tuple[float, float]:
+        """C and its standard deviation [m] at a place, shape (2,)."""
         prior = OFFSET_M**2 + TILT_RAD**2 * float(xy_A @ xy_A) + self._fit.roughness**2 * FIELD_M**2
         k = _covariance(xy_A, self._places, self._fit.roughness)
-        return math.sqrt(max(prior - float(k @ self._fit.precision @ k), 0.0))
+        return float(k @ self._fit.weights), math.sqrt(max(prior - float(k @ self._fit.precision @ k), 0.0))
 
 
 class _Fit(NamedTuple):

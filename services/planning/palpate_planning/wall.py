@@ -38,6 +38,17 @@ class TouchedSkin(NamedTuple):
     """... and the standard deviation of that [m]."""
 
 
+class WallPlace(NamedTuple):
+    """Where the wall is believed to be at one place, outward of the perceived surface at the end of expiration."""
+
+    correction: float
+    """How far the skin is from there, as touch has told [m]."""
+    displacement: float
+    """How far the breath has moved it from there [m]."""
+    sigma: float
+    """Standard deviation of both together [m]."""
+
+
 class Wall:
     """Where the skin is, and how sure that is."""
 
@@ -79,11 +90,16 @@ class Wall:
 
     def sigma(self, xy_A: Array, t: int) -> float:
         """Standard deviation of where the wall is [m] at a place, shape (2,), at `t` [ns]."""
-        return math.hypot(self.correction.sigma(xy_A), self.perceived.breathing(xy_A) * self.breath.uncertainty(t))
+        return self.at(xy_A, t).sigma
+
+    def at(self, xy_A: Array, t: int) -> WallPlace:
+        """The wall at a place, shape (2,), at `t` [ns]."""
+        (correction, sigma), share = self.correction.at(xy_A), self.perceived.breathing(xy_A)
+        return WallPlace(correction, share * self.breath.displacement(t), math.hypot(sigma, share * self.breath.uncertainty(t)))
 
     def touched(self, foot: Foot, touch: SkinDepth, stroke: int, t: int) -> tuple[TouchedSkin, float]:
         """Learns from a touch under `foot` at `t` [ns]; also returns how far the wall there moved outward by it [m]."""
-        before, before_sigma = self.correction.height(foot.xy_A), self.correction.sigma(foot.xy_A)
+        before, before_sigma = self.correction.at(foot.xy_A)
         sigma = math.hypot(touch.sigma, self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t))
         felt = before - touch.depth
         self.correction.touch(foot.xy_A, felt, sigma)
