@@ -41,7 +41,6 @@ def _figures(result: RunResult) -> dict[str, Any]:
 
 
 PARTS = {
-    "barrier": "palpate_benchmarks.barrier",
     "codec": "palpate_benchmarks.codec",
     "fmu": "palpate_benchmarks.fmu",
     "tissue": "palpate_benchmarks.tissue",
