@@ -1,0 +1,124 @@
+"""The recorder's process between its conductor and the services that it records, which a test plays."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate_bus.contract import MS, Topic, contract
+from palpate_bus.messages import JointState, RunControl, ServiceReport, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
+from palpate_bus.runtime.record_chunks import ChunkWriter
+from palpate_bus.runtime.recording import RecorderNode
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.wire.transport import ReceivedSample
+
+PRODUCERS = [name for name, role in contract().roles.items() if not role.observer]
+STATE = codec.encode(JointState(header(0), ["a"], np.zeros(1), np.zeros(1), np.zeros(1)), "sensor_msgs/msg/JointState")
+
+
+class Queue:
+    heard = True
+    garbage = 0
+
+    def __init__(self, *payloads: bytes) -> None:
+        self.waiting = deque(payloads)
+
+    def get(self, timeout: float | None) -> ReceivedSample | None:
+        return ReceivedSample(1, 0, self.waiting.popleft()) if self.waiting else None
+
+
+class Kept(Service):
+    role = "recorder"
+    trouble = ""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[str, int, int]] = []
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        return {}
+
+    def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
+        self.messages.append((topic.name, stamp, sequence))
+
+    def finish(self) -> Mapping[str, Any]:
+        return {"kept": len(self.messages)}
+
+
+class Bus:
+    """A member of a bus on which a conductor says `commands`, one a look, and the robot has sent a chunk."""
+
+    role = "recorder"
+
+    def __init__(self, *commands: RunControl) -> None:
+        self.rules = contract()
+        self.conductor_there = bool(commands)
+        self.commands = [codec.encode(command, CONTROL_TYPE) for command in commands]
+        self.reports: list[ServiceReport] = []
+        writer = ChunkWriter("robot", ("joint_states",))
+        writer.add("joint_states", STATE, 7 * MS, 8)
+        self.chunk = writer.chunk(50 * MS)
+
+    def internal_subscription(self, name: str, type_name: str) -> Queue:
+        if name == "palpate/control":
+            return Queue(*self.commands)
+        return Queue(self.chunk) if name == "palpate/record/robot" else Queue()
+
+    def subscription(self, topic: Topic) -> Queue:
+        return Queue()
+
+    def internal_publisher(self, name: str, type_name: str, qos: str) -> Any:
+        return self
+
+    def put(self, payload: bytes, sequence: int) -> None:
+        self.reports.append(codec.decode(payload, "palpation_msgs/msg/ServiceReport"))
+
+    def gone(self) -> frozenset[str]:
+        return frozenset() if self.conductor_there else frozenset({"conductor"})
+
+    def alive(self, roles: frozenset[str]) -> frozenset[str]:
+        return frozenset()
+
+    def transport_lost(self) -> bool:
+        return False
+
+    def suspicions(self) -> list[str]:
+        return []
+
+    complaints = suspicions
+
+
+def said(command: int, role: str = "") -> RunControl:
+    return RunControl(command, 0, False, role, "")
+
+
+def test_it_keeps_what_came_and_says_so_at_the_end() -> None:
+    kept = Kept()
+    member: Any = Bus(said(RunControl.HELLO), said(RunControl.GRANT), said(RunControl.END))
+    RecorderNode(kept, member).run()
+    assert kept.messages == [("joint_states", 7 * MS, 8)]
+    states = [report.state for report in member.reports if report.state != ServiceReport.PROGRESS]
+    assert states == [ServiceReport.READY, ServiceReport.FINISHED]
+    detail = json.loads(member.reports[-1].detail)
+    assert (detail["messages"], detail["garbage"], detail["facts"]) == (1, 0, {"kept": 1})
+
+
+def test_it_waits_no_more_for_a_role_that_is_lost() -> None:
+    lost = [said(RunControl.LOST, role) for role in PRODUCERS if role != "robot"]
+    member: Any = Bus(said(RunControl.HELLO), *lost, said(RunControl.END))
+    RecorderNode(Kept(), member).run()
+    assert member.reports[-1].tick == 50 * MS  # as far as the robot, the only one that is left
+
+
+def test_without_a_conductor_and_services_it_leaves_with_what_it_has() -> None:
+    kept = Kept()
+    member: Any = Bus()
+    with pytest.raises(RunAborted, match="the conductor is gone"):
+        RecorderNode(kept, member).run()
+    assert kept.messages == [("joint_states", 7 * MS, 8)]
