@@ -67,3 +67,18 @@ def test_links_lead_somewhere(page: Path) -> None:
         if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
             lost.append(link)
     assert lost == []
+
+
+HOUSE_WORDS = re.compile(
+    r"\b(one's own|nobody|somebody|anybody|everybody|whoever|comes to its end|come to their end|is worth|are worth)\b",
+    re.IGNORECASE,
+)
+"""Phrases that native engineers stumbled over; the pages say these things in the words of the field."""
+OURS = [
+    page for page in PAGES if page.relative_to(ROOT).parts[0] in {"README.md", "CONTRIBUTING.md", "docs", "palpate", "dashboards"}
+]
+
+
+@pytest.mark.parametrize("page", OURS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_page_uses_the_words_of_the_field(page: Path) -> None:
+    assert HOUSE_WORDS.findall(" ".join(page.read_text(encoding="utf-8").split())) == []

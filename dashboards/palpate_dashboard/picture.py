@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from itertools import takewhile
+from itertools import groupby, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -108,16 +107,16 @@ def film(folder: Path, target: Path, port: int, size: tuple[int, int], tell: Cal
     """
     frames: list[Image.Image] = []
     with _shown(folder, port, size) as (service, open_page):
-        recorded = deque(messages(recording_of(folder)))
-        end, page = recorded[-1][0], None
-        for number in range(1, FRAMES + 1):
-            until = end * number // FRAMES
-            draw((recorded.popleft() for _ in range(sum(1 for item in recorded if item[0] <= until))), service)
+        recording = recording_of(folder)
+        step = max(time for time, *_ in messages(recording)) // FRAMES + 1
+        page = None
+        for number, part in groupby(messages(recording), lambda item: item[0] // step):
+            draw(part, service)
             service.flush()
             page = page or open_page()
-            image = Image.fromarray(_settled(page) if number == 1 else look(page))
+            image = Image.fromarray(look(page) if frames else _settled(page))
             frames.append(image.resize(FILM_PX, Image.Resampling.LANCZOS).quantize(COLOURS, dither=Image.Dither.NONE))
-            tell(f"frame {number} of {FRAMES}, at {until / 1e9:.0f} s")
+            tell(f"frame {number + 1} of {FRAMES}")
     target.parent.mkdir(parents=True, exist_ok=True)
     durations = [round(1e3 * FRAME_S)] * (len(frames) - 1) + [round(1e3 * LAST_S)]
     frames[0].save(target, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)

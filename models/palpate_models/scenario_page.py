@@ -26,7 +26,7 @@ is refused, with the line it stands on and the field that was probably meant.
 """
 _ELSEWHERE: Final = {
     "errors": "All fields with their levels and sources: [errors.md](errors.md).",
-    "phantom.anatomy": "Nobody sets it: it is what the seed has drawn, see [persons.md](persons.md).",
+    "phantom.anatomy": "It is not set but drawn from the seed, see [persons.md](persons.md).",
 }
 """Sections that are described on a page of their own."""
 _BOUNDS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}

@@ -60,7 +60,10 @@ def _milliseconds(topic: Topic) -> str:
 
 def _dataflow(rules: Contract) -> str:
     """A mermaid diagram of the dataflow between services; observers are left out, they read nearly everything."""
-    lines = ["## Dataflow\n", "Thick arrows are of the same tick, thin ones arrive one period late, dotted ones hold nobody up."]
+    lines = [
+        "## Dataflow\n",
+        "Thick arrows are of the same tick, thin ones arrive one period late, dotted ones make no service wait.",
+    ]
     lines += [
         "The recorder and the dashboard read every topic that they may know and are not drawn.\n",
         "```mermaid",
