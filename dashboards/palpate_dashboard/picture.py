@@ -36,8 +36,8 @@ DRAWN = 3_000
 COLOURS = 256
 BAR_PX = 36
 """Height of the viewer's own top bar, which is left out: it says what machine the picture was made on."""
-FRAMES, FRAME_S, LAST_S, FILM_PX = 20, 0.5, 3.0, (960, 578)
-"""Frames of a film, how long each of them and the last are shown [s], and their size."""
+FRAMES, FRAME_S, LAST_S, FILM_PX, FILM_COLOURS = 16, 0.6, 3.0, (840, 507), 96
+"""Frames of a film, how long each of them and the last are shown [s], their size and number of colours."""
 
 Page = Any
 Pixels = NDArray[np.uint8]
@@ -114,12 +114,13 @@ def film(folder: Path, target: Path, port: int, size: tuple[int, int], tell: Cal
             draw(part, service)
             service.flush()
             page = page or open_page()
-            image = Image.fromarray(look(page) if frames else _settled(page))
-            frames.append(image.resize(FILM_PX, Image.Resampling.LANCZOS).quantize(COLOURS, dither=Image.Dither.NONE))
+            frames.append(Image.fromarray(_settled(page)).resize(FILM_PX, Image.Resampling.LANCZOS))
             tell(f"frame {number + 1} of {FRAMES}")
     target.parent.mkdir(parents=True, exist_ok=True)
-    durations = [round(1e3 * FRAME_S)] * (len(frames) - 1) + [round(1e3 * LAST_S)]
-    frames[0].save(target, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+    palette = frames[-1].quantize(FILM_COLOURS)  # one for all: what does not change then costs nothing
+    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    durations = [round(1e3 * FRAME_S)] * len(others) + [round(1e3 * LAST_S)]
+    first.save(target, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
 
 
 def _small(image: Pixels) -> Image.Image:
