@@ -99,7 +99,10 @@ def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S, n
     words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(seconds)]
     if namespace:
         words = ["ip", "netns", "exec", namespace, *words, "secure"]
-    run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env={**os.environ, **FIXED})
+    log = folder / "logs" / f"{CONDUCTOR}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w") as stderr:
+        run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
     assert run.stdout is not None
     own, at, struck_s, said = Path(), 0.0, 0.0, {}
     processes: dict[str, psutil.Process] = {}
