@@ -1,39 +1,55 @@
 """Fits the probabilities of the assessment's candidates to tuning patients, and its operating point to healthy ones.
 
-    python -m palpate_validation.assessment_calibration --patients 1000      writes calibration.yaml anew
-    python -m palpate_validation.assessment_calibration --patients 400 --first-seed 2000 --check
+    python -m palpate_validation.assessment_calibration --patients 200 -o FOLDER       writes calibration.yaml anew
+    python -m palpate_validation.assessment_calibration --patients 100 --first-seed 2000 --check -o FOLDER
 
-Every second patient is healthy, the others have one lump; persons and scans are those of `felt_scans`. What the regression
-needs of contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over the tissue, and
-a press is made beside it.
+Persons are examined by the quick tier with typical errors and quiet breathing; every second one is healthy, the others have one
+lump. What was weighed in each is kept in FOLDER, so that it can be made in pieces: cases that are there are not made again. What
+the regression needs of contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over
+the tissue, and a press is made beside it.
 """
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
+import typer
 import yaml
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy.optimize import minimize
 from scipy.special import expit
+from statsmodels.api import Logit
+from statsmodels.stats.proportion import proportion_confint
 
 import palpate_assessment
-from palpate.quick.felt import FeltPatient, felt_patient
+from palpate.quick.case import assess, examined
+from palpate.report.results import truth_of_run
+from palpate.study.statistics.estimate import LEVEL, Estimate
+from palpate.truth.felt import PALPABLE
+from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, learned
-from palpate_assessment.detection import FEATURES, FELT, detect
+from palpate_assessment.detection import FEATURES, FELT, Candidate
 from palpate_assessment.observations import observe
-from palpate_models.draw import Draw
+from palpate_assessment.service import AssessmentService
 from palpate_models.frames import Array
-from palpate_models.patient import Phantom
-from palpate_models.seeds import generator
-from palpate_validation.felt_scans import ScanErrors, felt_samples
+from palpate_models.load import exam_input, load_scenario
+from palpate_models.scenario import Scenario
+
+Mask = NDArray[np.bool_]
 
 _TAIL: Final = 0.25
 """Part of the healthy examinations that the tail is fitted to."""
-_RIDGE: Final = 0.5
+_RIDGE: Final = 0.1
+_PITCH_M: Final = 0.01
+CLASSES: Final = ((1.05, 1.3), (1.3, 1.5), (1.5, 2.0), (2.0, 20.0))
+"""Felt contrasts by which lumps are told apart."""
+WIDE_M: Final = 0.015
+"""Felt radius from which a lump is told apart, too."""
 
 
 @dataclass(frozen=True)
@@ -41,59 +57,72 @@ class WeighedPatient:
     """What was weighed in one patient."""
 
     seed: int
-    features: Array
-    """Features of the candidates, shape (k, f)."""
-    real: Array
-    """Whether each is a lump of felt contrast FELT or more, shape (k,)."""
+    features: list[list[float]]
+    """Of the candidates."""
+    real: list[bool]
+    """Whether each is a lump of felt contrast FELT or more."""
     contrast: float
-    """Greatest felt contrast of the patient's lump (its inverse if softer), 1 without one."""
+    """Felt contrast of the patient's lump (its inverse if softer), 1 without one that is palpable."""
+    radius_m: float
+    """Its felt radius, 0 without one."""
     held: float
     """Part of the examined region on which the map's 90 % band holds."""
 
 
-def phantom(seed: int) -> Phantom:
+def scenario(seed: int) -> Scenario:
     """Even seeds are healthy; every second of the others has a lump just below the skin, which is felt more."""
-    if seed % 2 == 0:
-        return Phantom(kind="person")
-    contrast = (0.2, 0.6) if seed % 10 == 9 else (1.5, 8.0)
-    depth = (0.0, 0.004) if seed % 4 == 1 else (0.0, 0.015)
-    draw = Draw(lumps=(1, 1), radius_m=(0.010, 0.035), depth_m=depth, contrast=contrast, region_m=(0.17, 0.17))
-    return Phantom(kind="person", draw=draw)
+    settings = ["errors=typical", "phantom.breathing.kind=quiet"]
+    if seed % 2:
+        contrast = (0.2, 0.6) if seed % 10 == 9 else (1.5, 8.0)
+        depth = (0.0, 0.004) if seed % 4 == 1 else (0.0, 0.015)
+        lump = (
+            f"lumps: [1, 1], radius_m: [0.010, 0.035], depth_m: {list(depth)}, contrast: {list(contrast)}, region_m: [0.17, 0.17]"
+        )
+        settings.append(f"phantom.draw={{{lump}}}")
+    return load_scenario("person", settings, seed)
 
 
-def scan_errors(seed: int) -> ScanErrors:
-    """From a third of the typical errors to one and a half times as much."""
-    scale = float(np.exp(generator(seed, "scan-errors").uniform(np.log(0.33), np.log(1.5))))
-    return ScanErrors(stroke_m=3e-4 * scale, field_m=8e-4 * scale, breathing_m=5e-4 * scale, tare_n=0.05 * scale)
-
-
-def case(seed: int, calibration: Calibration) -> WeighedPatient:
-    """One patient, scanned and weighed."""
-    patient = felt_patient(phantom(seed), seed)
-    observations = observe(felt_samples(patient, scan_errors(seed), seed), calibration)
-    assert observations is not None
-    regression, candidates = detect(observations, calibration)
-    axis = np.arange(-0.095, 0.0951, 0.01)
-    places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+def weigh(seed: int) -> WeighedPatient:
+    """One patient, examined and weighed."""
+    patient = scenario(seed)
+    gathered = examined(patient)
+    known = truth_of_run(patient, gathered).felt
+    gathered.exam_states.pop()  # that asks for findings
+    service, calibration = AssessmentService(exam_input(patient)), learned()
+    assess(service, gathered)
+    observations = observe(service.samples, calibration)
+    judged = None if observations is None else weigh_all(observations, calibration)
+    assert known is not None
+    assert judged is not None
+    regression, candidates, _ = judged
+    middle, half = np.array(patient.exam.centre_m), 0.5 * np.array(patient.exam.region_m)
+    x, y = (np.arange(c - h, c + h + 1e-9, _PITCH_M) for c, h in zip(middle, half, strict=True))
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     mean, sd = regression.field(places)
-    held = np.abs(mean - np.log(patient.force_at(places))) <= 1.6449 * sd
-    real = [_real(patient, c.bump.x, c.bump.y, c.bump.radius, np.sign(c.log_contrast)) for c in candidates]
-    greatest = float(np.exp(np.abs(patient.excess_at(places)).max()))
-    rows = np.array([c.features for c in candidates]).reshape(len(candidates), len(FEATURES))
-    return WeighedPatient(seed, rows, np.array(real, dtype=bool), greatest, float(held.mean()))
+    off = mean - np.log(known.felt.force(known.touched.places(places)))
+    palpable = [lump for lump in known.felt.lumps if lump.palpable]
 
+    def real(candidate: Candidate) -> bool:
+        """Whether a lump is felt within a candidate's radius."""
+        bump, sign = candidate.bump, np.sign(candidate.log_contrast)
+        angle, r = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), np.linspace(0, 1, 4))
+        ring = np.column_stack(((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()))
+        there = known.touched.places(np.array((bump.x, bump.y)) + bump.radius * ring)
+        return bool(np.nan_to_num(sign * known.felt.excess(there)).max() >= np.log(FELT))
 
-def _real(patient: FeltPatient, x: float, y: float, radius: float, sign: float) -> bool:
-    """Whether a lump is felt within a candidate's radius."""
-    angle, r = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), np.linspace(0, 1, 4))
-    places = np.array((x, y)) + radius * np.column_stack(((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()))
-    return bool((sign * patient.excess_at(np.clip(places, -0.14, 0.14))).max() >= np.log(FELT))
+    return WeighedPatient(
+        seed=seed,
+        features=[candidate.features.tolist() for candidate in candidates],
+        real=[real(candidate) for candidate in candidates],
+        contrast=max((float(np.exp(abs(np.log(lump.contrast)))) for lump in palpable), default=1.0),
+        radius_m=max((float(np.sqrt(lump.area / np.pi)) for lump in palpable), default=0.0),
+        held=float(np.mean(np.abs(off[np.isfinite(off)]) <= 1.6449 * sd[np.isfinite(off)])),
+    )
 
 
 def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration:
     """The calibration with probabilities and operating point of the cases: logistic regression, and an exponential tail."""
-    features = np.concatenate([c.features for c in cases if len(c.features)])
-    real = np.concatenate([c.real for c in cases if len(c.features)])
+    features, real = _every(cases)
 
     def loss(w: Array) -> float:
         logit = w[0] + features @ w[1:]
@@ -101,49 +130,102 @@ def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration
 
     weights = minimize(loss, np.zeros(features.shape[1] + 1), method="BFGS").x
     new = calibration.model_copy(update={"probability": tuple(np.round(weights, 3).tolist())})
-    greatest = np.sort([float(new.logit(c.features).max()) if len(c.features) else -20.0 for c in cases if c.contrast < 1.05])
+    greatest = np.sort([_greatest(c, new) for c in cases if c.contrast < 1 + PALPABLE])
     tail = greatest[-round(_TAIL * len(greatest)) :]
     scale = max(float(tail.mean() - tail[0]), 0.1)
     location = float(tail[0]) + scale * float(np.log(_TAIL))
     return new.model_copy(update={"tail": (round(location, 3), round(scale, 3))})
 
 
+def _every(cases: list[WeighedPatient]) -> tuple[Array, Mask]:
+    """Features (k, f) of all candidates, and whether each is a lump (k,)."""
+    rows = np.array([row for c in cases for row in c.features]).reshape(-1, len(FEATURES))
+    return rows, np.array([r for c in cases for r in c.real], dtype=bool)
+
+
+def _greatest(case: WeighedPatient, calibration: Calibration) -> float:
+    return float(calibration.logit(np.array(case.features)).max()) if case.features else -20.0
+
+
 def told(cases: list[WeighedPatient], calibration: Calibration, false_findings: float = 0.02) -> None:
-    """Prints what the calibration makes of cases."""
+    """Prints what the calibration makes of cases, with 95 % intervals."""
     threshold = calibration.threshold(false_findings)
-    logits = [calibration.logit(c.features) if len(c.features) else np.zeros(0) for c in cases]
-    healthy = [(q >= threshold).any() for q, c in zip(logits, cases, strict=True) if c.contrast < 1.05]
-    print(f"threshold: probability {expit(threshold):.3f}")
-    print(f"healthy: {sum(healthy)} of {len(healthy)} have a finding")
-    for low, high in ((1.1, 1.3), (1.3, 1.5), (1.5, 2.0), (2.0, 20.0)):
-        found = [(q[c.real] >= threshold).any() for q, c in zip(logits, cases, strict=True) if low <= c.contrast < high]
-        print(f"felt contrast {low} to {high}: {sum(found)} of {len(found)} found")
-    every, real = np.concatenate(logits), np.concatenate([c.real for c in cases])
+    logits = [calibration.logit(np.array(c.features).reshape(-1, len(FEATURES))) for c in cases]
+    print(f"{len(cases)} patients, seeds {cases[0].seed} to {cases[-1].seed}; threshold: probability {expit(threshold):.3f}")
+    healthy = [bool((q >= threshold).any()) for q, c in zip(logits, cases, strict=True) if c.contrast < 1 + PALPABLE]
+    print(f"healthy with a finding: {_part(healthy)}")
+    for low, high in CLASSES:
+        for name, least in (("", 0.0), (f", felt radius {1e3 * WIDE_M:.0f} mm or more", WIDE_M)):
+            found = [
+                bool((q[np.array(c.real, dtype=bool)] >= threshold).any())
+                for q, c in zip(logits, cases, strict=True)
+                if low <= c.contrast < high and c.radius_m >= least
+            ]
+            print(f"felt contrast {low} to {high}{name}: found {_part(found)}")
+    every, real = np.concatenate(logits), _every(cases)[1]
     probability = expit(every)
+    error = 0.0
     for low, high in ((0.0, 0.1), (0.1, 0.3), (0.3, 0.7), (0.7, 0.9), (0.9, 1.01)):
         here = (probability >= low) & (probability < high)
         if here.any():
-            mean, part = probability[here].mean(), real[here].mean()
-            print(f"probability {low} to {high}: {here.sum()} candidates, {mean:.2f} told, {part:.2f} true")
-    soft = np.concatenate([c.features[:, FEATURES.index("softer")] > 0 for c in cases])
-    for name, kind in (("stiff", ~soft), ("soft", soft)):
-        reported = kind & (every >= threshold)
-        lumps, there = (reported & real).sum(), (kind & real).sum()
-        print(f"{name}: {reported.sum()} reported, {lumps} of them lumps; {there} candidates were lumps")
+            mean, part = float(probability[here].mean()), float(real[here].mean())
+            error += here.mean() * abs(mean - part)
+            print(f"probability {low} to {high}: {here.sum()} candidates, {100 * mean:.0f} % told, {_part(real[here])} true")
+    told_true = ", ".join(f"{name} {e.value:.2f} ({e.low:.2f} to {e.high:.2f})" for name, e in slope(every, real).items())
+    print(f"expected calibration error {100 * error:.1f} %; calibration {told_true}")
     held = np.array([c.held for c in cases])
-    print(f"band holds: mean {held.mean():.3f}, median {np.median(held):.3f}, tenth {np.quantile(held, 0.1):.3f}")
+    print(f"band holds: mean {held.mean():.3f}, median {np.median(held):.3f}, tenth percentile {np.quantile(held, 0.1):.3f}")
 
 
-def main() -> None:
-    """Calibrates, or checks the calibration."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--patients", type=int, default=1000)
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--check", action="store_true", help="print figures of the present calibration, change nothing")
-    args = parser.parse_args()
+def _part(true: Iterable[bool]) -> str:
+    """How many of them, with the interval (Wilson)."""
+    rows = list(true)
+    if not rows:
+        return "0 of 0"
+    low, high = proportion_confint(sum(rows), len(rows), alpha=1 - LEVEL, method="wilson")
+    return f"{sum(rows)} of {len(rows)}: {100 * np.mean(rows):.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def slope(logits: Array, real: Mask) -> dict[str, Estimate]:
+    """Slope and intercept of a logistic regression of what is real on the logits told (Cox 1958), with 95 % intervals.
+
+    Where what is told is true they are 1 and 0.
+    """
+    found = Logit(real.astype(float), np.column_stack((np.ones(len(logits)), logits))).fit(disp=False)
+    ends = found.conf_int(alpha=1 - LEVEL)
+    return {
+        name: Estimate(
+            value=float(found.params[k]),
+            low=float(ends[k, 0]),
+            high=float(ends[k, 1]),
+            n=len(real),
+            of="candidates",
+            interval="Wald",
+        )
+        for k, name in ((1, "slope"), (0, "intercept"))
+    }
+
+
+def kept(seed: int, folder: Path) -> WeighedPatient:
+    """What was weighed in a patient, from the folder if it is there."""
+    path = folder / f"{seed}.json"
+    kind = TypeAdapter(WeighedPatient)
+    if not path.is_file():
+        path.write_bytes(kind.dump_json(weigh(seed)))
+    return kind.validate_json(path.read_bytes())
+
+
+def main(
+    patients: Annotated[int, typer.Option(min=10, help="How many persons.")] = 200,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first.")] = 0,
+    check: Annotated[bool, typer.Option("--check", help="Print figures of the present calibration, change nothing.")] = False,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where cases are kept.")] = Path("out/calibration"),
+) -> None:
+    """Calibrate, or check the calibration."""
+    out.mkdir(parents=True, exist_ok=True)
+    cases = [kept(seed, out) for seed in range(first_seed, first_seed + patients)]
     calibration = learned()
-    cases = [case(seed, calibration) for seed in range(args.first_seed, args.first_seed + args.patients)]
-    if not args.check:
+    if not check:
         calibration = fitted(cases, calibration)
         path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
         path.write_text(yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, default_flow_style=None), "utf-8")
@@ -151,4 +233,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -1,6 +1,6 @@
 """Scans of persons without physics in time: what each place feels like (`palpate.quick.felt`), read along lines, with errors.
 
-It takes a fraction of a second a person, so that thousands can be had, for the calibration of the assessment's probabilities.
+It takes a fraction of a second a person, so that thousands can be had.
 """
 
 from __future__ import annotations

@@ -52,9 +52,7 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
     none, NoTissueError for a tissue of which there is no copy, ChoiceError for an assessment that cannot be made.
     """
     begin, clock = process_time(), perf_counter()
-    with _nothing_collected():
-        examination = QuickExamination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
-        gathered = collected(examination, examination.run())
+    gathered = examined(scenario, errors, drawn)
     simulated, elapsed_s = process_time(), perf_counter() - clock
     (service,) = load_services(scenario, ("assessment",))
     facts = assess(service, gathered)
@@ -75,6 +73,13 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
     )
     report = assemble(scenario, result, truth_of_run(scenario, gathered))
     return QuickCase(report, gathered, simulated - begin, assessed - simulated, process_time() - assessed)
+
+
+def examined(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn | None = None) -> Collected:
+    """What a conductor would have collected of an examination before the assessment. Arguments and errors as of `run_quick`."""
+    with _nothing_collected():
+        examination = QuickExamination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
+        return collected(examination, examination.run())
 
 
 @contextmanager

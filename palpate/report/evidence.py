@@ -43,6 +43,10 @@ class Samples:
     """[m/s]"""
     time_in_contact: Array
     """[s]"""
+    depth_uncertainty: Array
+    """One sigma of the depth, as the examination tells it [m]."""
+    stroke: Array
+    """Number of the descent."""
     force_limited: Mask
 
 
@@ -135,6 +139,8 @@ def samples_of(messages: list[Any]) -> Samples:
         force=column([m.normal_force for m in messages]),
         speed=column([m.tangential_speed for m in messages]),
         time_in_contact=column([m.time_in_contact for m in messages]),
+        depth_uncertainty=column([m.depth_uncertainty for m in messages]),
+        stroke=column([m.stroke for m in messages]),
         force_limited=np.array([m.force_limited for m in messages], dtype=bool),
     )
 

@@ -153,6 +153,8 @@ def sample_columns(samples: Samples) -> dict[str, Array]:
         "normal_force_N": samples.force,
         "speed_mps": samples.speed,
         "time_in_contact_s": samples.time_in_contact,
+        "depth_uncertainty_m": samples.depth_uncertainty,
+        "stroke": samples.stroke,
     }
 
 

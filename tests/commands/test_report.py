@@ -124,6 +124,8 @@ def test_samples_csv_has_a_row_a_sample(scenario: Scenario, tmp_path: Path) -> N
     assert len(rows) == len(samples.time)
     assert float(rows[3]["normal_force_N"]) == pytest.approx(samples.force[3])
     assert float(rows[3]["x_m"]) == pytest.approx(samples.position[3, 0])
+    assert float(rows[3]["depth_uncertainty_m"]) == pytest.approx(c.samples[3].depth_uncertainty)
+    assert float(rows[3]["stroke"]) == c.samples[3].stroke
 
 
 def test_findings_in_words(scenario: Scenario, felt: Known) -> None:

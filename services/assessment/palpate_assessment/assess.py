@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted
-from palpate_assessment.detection import detect
+from palpate_assessment.detection import Candidate, detect
 from palpate_assessment.findings import Z90, Area, areas
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression, usual_amplitudes
-from palpate_assessment.observations import FEWEST, observe
+from palpate_assessment.observations import FEWEST, Observations, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_models.frames import Array
 
@@ -62,8 +62,24 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
     """
     calibration = learned()
     o = observe(samples, calibration)
-    if o is None:
+    judged = None if o is None else weigh_all(o, calibration)
+    if o is None or judged is None:
         return None
+    regression, candidates, reasons = judged
+    apart, nearest = cKDTree(o.xy).query(grid.nodes[:, :2])
+    unassessed = reasons[nearest]
+    unassessed[apart > reach] = Reason.NOT_REACHED
+    weighed = areas(regression, candidates, grid, unassessed == Reason.ASSESSED)
+    threshold = calibration.threshold(false_findings)
+    findings = [area for area in weighed if area.logit >= threshold]
+    return _assessment(regression, grid, unassessed.astype(np.uint8), findings, weighed[len(findings) :])
+
+
+def weigh_all(o: Observations, calibration: Calibration) -> tuple[Regression, list[Candidate], NDArray[np.int_]] | None:
+    """The regression of what can be believed, the lumps that are weighed, and of each sample the `Reason` why it is left out.
+
+    None while too few samples tell anything.
+    """
     reasons = np.where(o.limited, Reason.YIELDED, Reason.ASSESSED)
     telling = np.flatnonzero(~o.limited)
     if len(telling) < FEWEST:
@@ -73,13 +89,7 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
     if 0 < wrong.mean() < _MOST_CONTRADICTED:
         reasons[telling[wrong]] = Reason.CONTRADICTED
         regression, candidates = detect(o.part(telling[~wrong]), calibration)
-    apart, nearest = cKDTree(o.xy).query(grid.nodes[:, :2])
-    unassessed = reasons[nearest]
-    unassessed[apart > reach] = Reason.NOT_REACHED
-    weighed = areas(regression, candidates, grid, unassessed == Reason.ASSESSED)
-    threshold = calibration.threshold(false_findings)
-    findings = [area for area in weighed if area.logit >= threshold]
-    return _assessment(regression, grid, unassessed.astype(np.uint8), findings, weighed[len(findings) :])
+    return regression, candidates, reasons
 
 
 def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> AssessedMap | None:

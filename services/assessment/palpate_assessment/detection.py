@@ -19,7 +19,7 @@ from scipy.optimize import Bounds, minimize
 from scipy.spatial import cKDTree
 
 from palpate_assessment.calibration import Calibration
-from palpate_assessment.model import Bump, Regression, amplitudes
+from palpate_assessment.model import Bump, Regression, amplitudes, bone
 from palpate_assessment.observations import FEWEST, Observations
 from palpate_models.frames import Array
 
@@ -37,8 +37,9 @@ _BORDER_M = 0.010
 
 FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
-FEATURES = ("strength", "beyond", "log-radius", "softer")
-"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, sign."""
+FEATURES = ("strength", "beyond", "log-radius", "softer", "bone")
+"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, sign, and how
+well bone may lie under it, which is felt as a lump is."""
 ALIKE, HALF = 1.5, 0.5
 """Where two strokes over a lump say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
 bump is so high."""
@@ -60,7 +61,8 @@ class Candidate:
     def features(self) -> Array:
         """The FEATURES, shape (f,)."""
         size = np.log(self.bump.radius / RADII_M[2])
-        return np.array((abs(self.t), self.beyond, size, float(self.log_contrast < 0)))
+        under = float(bone(np.array([[self.bump.x, self.bump.y]]))[0])
+        return np.array((abs(self.t), self.beyond, size, float(self.log_contrast < 0), under))
 
     @property
     def beyond(self) -> float:

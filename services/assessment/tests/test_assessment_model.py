@@ -10,8 +10,8 @@ from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted, pieces
-from palpate_assessment.detection import agreed, matched
-from palpate_assessment.model import LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
+from palpate_assessment.detection import Candidate, agreed, matched
+from palpate_assessment.model import ILIAC_M, LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
 
 
@@ -91,6 +91,12 @@ def test_a_model_that_holds_is_not_contradicted() -> None:
     o = observe(lines(level), learned())
     assert o is not None
     assert not contradicted(Regression(o, learned(), (), usual_amplitudes(o))).any()
+
+
+def test_what_may_be_bone_is_less_probably_a_lump() -> None:
+    open_wall, spine = (Candidate(Bump(x, y, 0.02), 0.6, 5.0) for x, y in ((0.0, 0.0), ILIAC_M))
+    logits = learned().logit(np.array((open_wall.features, spine.features)))
+    assert logits[1] < logits[0] - 0.5
 
 
 def test_less_false_findings_need_more_evidence() -> None:
