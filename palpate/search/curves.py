@@ -33,7 +33,7 @@ def wilson(k: int, n: int) -> tuple[float, float]:
         return 0.0, 1.0
     p, z = k / n, Z95
     middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return float((middle - half) / (1 + z * z / n)), float((middle + half) / (1 + z * z / n))
+    return max(float((middle - half) / (1 + z * z / n)), 0.0), min(float((middle + half) / (1 + z * z / n)), 1.0)
 
 
 def thresholds(trials: pd.DataFrame) -> pd.Series:
@@ -54,8 +54,9 @@ def outcomes(trials: pd.DataFrame, limits: pd.Series) -> pd.DataFrame:
         right = lump and bool(len(said)) and apart <= NEAR_M
         presses = k + 1 if right else budget
         took = float(trial.seconds.iloc[k if right else budget - 1])
-        rows.append((str(name), seed, lump, bool(len(said)), right, presses, took, apart, float(trial.think_s.iloc[0])))
-    return pd.DataFrame(rows, columns=["policy", "seed", "lump", "said", "right", "presses", "seconds", "apart_m", "think_s"])
+        whole = float(trial.seconds.iloc[-1])
+        rows.append((str(name), seed, lump, bool(len(said)), right, presses, took, apart, whole))
+    return pd.DataFrame(rows, columns=["policy", "seed", "lump", "said", "right", "presses", "seconds", "apart_m", "whole_s"])
 
 
 def _interval(values: Array, statistic: float, rng: np.random.Generator) -> tuple[float, float, float]:
@@ -77,7 +78,7 @@ def against_raster(found: pd.DataFrame) -> str:
     ill = found[found.lump]
     of = {name: ill[ill.policy == name].set_index("seed").sort_index() for name in (OURS, "raster")}
     right = of["raster"].right.to_numpy()
-    whole = float(of["raster"].seconds[~right].median())
+    whole = float(of["raster"].whole_s.median())
     ours = np.where(of[OURS].right, of[OURS].seconds, np.inf)
     rng = np.random.Generator(np.random.PCG64(0))
     drawn = rng.integers(0, len(ours), (_BOOTSTRAPS, len(ours)))
@@ -118,7 +119,7 @@ def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
         values = ill.presses.to_numpy(dtype=float)
         cells += [_words(_interval(values, q, rng), "{:.0f}") for q in (0.5, 0.9)]
         cells.append(_words(_interval(ill.seconds.to_numpy(), 0.5, rng), "{:.0f}"))
-        cells.append(_words(_mean(1.0 - values / values.max(), rng), "{:.2f}"))
+        cells.append(_words(_mean(1.0 - values / found.presses.max(), rng), "{:.2f}"))
         both = ill.set_index("seed").presses
         pairs = np.log(both / ours.reindex(both.index)).dropna().to_numpy()
         middle, low, high = np.exp(_mean(pairs, rng))
@@ -148,9 +149,8 @@ def drawn(found: pd.DataFrame, trials: pd.DataFrame) -> Figure:
         presses = np.arange(1, budget + 1)
         shares = np.array([(right.presses <= k).sum() for k in presses])
         (line,) = by_press.plot(presses, shares / n, label=str(name), **style)
-        if name == OURS:
-            bands = np.array([wilson(int(k), n) for k in shares])
-            by_press.fill_between(presses, bands[:, 0], bands[:, 1], color=line.get_color(), alpha=0.15)
+        bands = np.array([wilson(int(k), n) for k in shares])
+        by_press.fill_between(presses, *bands.T, color=line.get_color(), alpha=0.15 if name == OURS else 0.06, lw=0)
         grid = np.linspace(0, float(found.seconds.max()), 200)
         by_second.plot(grid, [(right.seconds <= t).mean() * len(right) / n if len(right) else 0.0 for t in grid], **style)
         apart = trials[(trials.policy == name) & trials.seed.isin(mine.seed)].groupby("press").apart_m.median()
@@ -158,7 +158,7 @@ def drawn(found: pd.DataFrame, trials: pd.DataFrame) -> Figure:
     by_press.set(xlabel="presses", ylabel=f"lumps found at specificity {SPECIFICITY:.2f}", ylim=(0, 1), title="sensitivity")
     by_second.set(xlabel="seconds", ylim=(0, 1), title="sensitivity")
     place.set(xlabel="presses", ylabel="most probable place from the lump, median [mm]", title="localisation", ylim=(0, None))
-    by_press.legend(fontsize=7, loc="upper left")
+    place.legend(*by_press.get_legend_handles_labels(), fontsize=7, loc="upper right")
     return figure
 
 

@@ -29,14 +29,14 @@ WIDTH: Final = 16
 """Channels of the hidden layers."""
 PRESSES: Final = 30
 """Of an episode."""
-PATIENTS: Final = 128
+PATIENTS: Final = 64
 """Tuning patients that are met."""
 ENVIRONMENTS: Final = 8
 SETTINGS: Final[dict[str, Any]] = {
-    "n_steps": 4 * PRESSES,
+    "n_steps": 2 * PRESSES,
     "batch_size": 240,
-    "n_epochs": 4,
-    "learning_rate": 1e-3,
+    "n_epochs": 6,
+    "learning_rate": 2e-3,
     "gamma": 0.98,
     "ent_coef": 0.002,
 }
@@ -141,7 +141,7 @@ class Curve(BaseCallback):
 
 
 def main(
-    presses: Annotated[int, typer.Option(min=1000, help="Presses to learn from.")] = 200_000,
+    presses: Annotated[int, typer.Option(min=1000, help="Presses to learn from.")] = 30_000,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     out: Annotated[Path, typer.Option("-o", "--out", help="Where the weights go.")] = Path("ppo.npz"),
     curve: Annotated[Path, typer.Option(help="Where the training curve goes.")] = Path("ppo.csv"),
