@@ -54,7 +54,7 @@ def page_at(port: int, width: int, height: int) -> Iterator[Page]:
     if chromium is None:
         raise NoPicture(f"no browser: none of {', '.join(BROWSERS)} is on the PATH")
     try:
-        from playwright.sync_api import sync_playwright  # noqa: PLC0415  # for this alone, and not needed in a run
+        from playwright.sync_api import Error, sync_playwright  # noqa: PLC0415  # for this alone, and not needed in a run
     except ImportError as error:
         raise NoPicture("playwright is not installed: pip install playwright") from error
     with sync_playwright() as driver:
@@ -64,7 +64,10 @@ def page_at(port: int, width: int, height: int) -> Iterator[Page]:
         )  # the viewer is dark all the same
         page.set_default_timeout(1000 * PATIENCE_S)
         page.goto(f"{address(port)}&renderer=webgl")
-        yield page
+        try:
+            yield page
+        except Error as error:
+            raise NoPicture(f"the browser failed: {str(error).partition(chr(10))[0]}") from error
         browser.close()
 
 
