@@ -82,3 +82,20 @@ def test_an_integration_in_casadi_gives_the_force_of_the_fmu(coarse: Path, dae: 
         expected = exchange.runge_kutta(np.zeros(exchange.states), 80, 0.25e-3)
         np.testing.assert_allclose(found, expected, atol=1e-12)
         assert expected.max() > 0.005
+
+
+def test_a_variable_step_solver_with_the_fmus_jacobian_comes_to_an_end_in_contact(coarse: Path, dae: Any) -> None:
+    """SUNDIALS' CVODES by CasADi: BDF, sparse Newton. The sphere meets the wall at once, which then follows within some steps."""
+    with Exchange(coarse) as exchange:
+        _, u = pressed(exchange, dae)
+        function = dae.create("f", ["t", "x", "u"], ["ode"])
+        t, x, p = casadi.MX.sym("t"), casadi.MX.sym("x", exchange.states), casadi.MX.sym("u", len(u))
+        problem = {"t": t, "x": x, "u": p, "ode": function(t, x, p)}
+        options = {"newton_scheme": "direct", "linear_solver": "csparse", "reltol": 1e-4, "abstol": 1e-7}
+        simulate = casadi.integrator("simulate", "cvodes", problem, 0.0, 0.02, options)
+        found = np.asarray(simulate(x0=np.zeros(exchange.states), u=u)["xf"]).ravel()
+        assert simulate.stats()["nsteps"] < 200
+        exchange.put(np.array([0.001, 0.05, 0.0065]), np.array([0.01, 0.0, -0.02]))
+        expected = exchange.runge_kutta(np.zeros(exchange.states), 80, 0.25e-3)
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+        assert expected.max() > 0.005
