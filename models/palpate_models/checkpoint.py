@@ -18,7 +18,7 @@ class CheckpointError(ValueError):
 
 
 @dataclass(frozen=True)
-class Felt:
+class FeltSoFar:
     """Samples of the assessment, m of them, in the abdomen frame A."""
 
     time: Array
@@ -49,7 +49,7 @@ class Felt:
 class Checkpoint:
     """Where an examination stood when it ended."""
 
-    felt: Felt
+    felt: FeltSoFar
     left: Array
     """Places of the targets that it had not reached, in A [m], shape (k, 2)."""
     surface: Array
@@ -77,6 +77,6 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
         with np.load(path, allow_pickle=False) as stored:
             held = {name: stored[name] for name in stored.files}
         left, surface, strokes = (held.pop(name) for name in ("left", "surface", "strokes"))
-        return Checkpoint(Felt(**held), left, surface, int(strokes))
+        return Checkpoint(FeltSoFar(**held), left, surface, int(strokes))
     except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
         raise CheckpointError(f"{path}: is no checkpoint of this version: {error}") from error

@@ -46,9 +46,9 @@ def replay(  # noqa: PLR0913 - the options of a command
 
       palpate replay tissue.mcap --service tissue --update-refs tissue.mcap                renews it
     """
-    from palpate.replay.perform import Part, Playing, play, run_again, write_reference
+    from palpate.replay.perform import Passage, Playing, play, run_again, write_reference
 
-    part = Part(begin, length)
+    part = Passage(begin, length)
     if service is None:
         play(file, part, Playing(rate, topics, listen, hold, drive))
     elif update_refs is not None:

@@ -25,7 +25,7 @@ from palpate_models.load import ScenarioError
 
 
 @dataclass(frozen=True)
-class Part:
+class Passage:
     """The part of a recording that is meant, in simulated time."""
 
     begin_s: float
@@ -52,7 +52,7 @@ class Playing:
     drive: bool
 
 
-def play(file: Path, part: Part, how: Playing) -> None:
+def play(file: Path, part: Passage, how: Playing) -> None:
     """Plays a recording on the bus. Ends the command where that cannot be done."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     console = Console(stderr=True)
@@ -73,7 +73,7 @@ def play(file: Path, part: Part, how: Playing) -> None:
         refuse(error)
 
 
-def write_reference(file: Path, service: str, scenario: Path | None, part: Part, target: Path) -> None:
+def write_reference(file: Path, service: str, scenario: Path | None, part: Passage, target: Path) -> None:
     """Writes the reference of a service, cut from a recording. Ends the command where that cannot be done."""
     try:
         case = prepare(file, service, scenario)

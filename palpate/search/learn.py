@@ -124,7 +124,7 @@ class PlacePolicy(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
 
-class Curve(BaseCallback):
+class LearningCurve(BaseCallback):
     """Keeps the mean reward of the latest episodes."""
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ def main(
     torch.set_num_threads(1)
     many = VecMonitor(DummyVecEnv([lambda: Presses(SearchEnv(presses=PRESSES, patients=PATIENTS, maps=True))] * ENVIRONMENTS))
     model = PPO(PlacePolicy, many, seed=seed, device="cpu", policy_kwargs={"features_extractor_class": Whole}, **SETTINGS)
-    learning = Curve()
+    learning = LearningCurve()
     model.learn(presses, callback=learning)
     network: Any = model.policy.mlp_extractor
     layers = [layer for layer in (*network.hidden, network.last) if isinstance(layer, nn.Conv2d)]

@@ -8,7 +8,7 @@ from math import sqrt
 
 import numpy as np
 
-from palpate_models.checkpoint import Felt
+from palpate_models.checkpoint import FeltSoFar
 from palpate_models.frames import Array
 
 TRAVEL = 0.005
@@ -126,14 +126,14 @@ class Sampler:
         )
 
 
-def columns(samples: Sequence[ForceSample], before: float) -> Felt:
+def columns(samples: Sequence[ForceSample], before: float) -> FeltSoFar:
     """Samples as a checkpoint keeps them, with times before `before` [s], at which their examination ended."""
     names = [field.name for field in fields(ForceSample)]
     felt = {name: np.array([getattr(sample, name) for sample in samples]) for name in names}
-    return Felt(**(felt | {"time": felt["time"] - before}))
+    return FeltSoFar(**(felt | {"time": felt["time"] - before}))
 
 
-def samples_of(felt: Felt) -> list[ForceSample]:
+def samples_of(felt: FeltSoFar) -> list[ForceSample]:
     """The samples of a checkpoint."""
     names = [field.name for field in fields(ForceSample)]
     plain = ((values if values.ndim > 1 else values.tolist()) for values in (getattr(felt, name) for name in names))
