@@ -22,9 +22,9 @@ from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
-from palpate.run.roles import OBSERVERS
+from palpate.run.placement import placement
+from palpate.run.roles import OBSERVERS, workers
 from palpate_conductor.result import RunResult
-from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
 
 
@@ -53,6 +53,22 @@ PARTS = {
 Save = Callable[[dict[str, Any]], None]
 
 
+def _distributed(scenario: Scenario) -> dict[str, Callable[[Path], RunResult]]:
+    """Runs of services on processes: one process each, and the loop at 1 kHz in one process; without observers and with them."""
+    loop = ["robot,tissue,control"]
+
+    def runs(observers: tuple[str, ...], together: Sequence[str]) -> Callable[[Path], RunResult]:
+        groups = placement((*workers(scenario), *observers), together, None)
+        return lambda out: run_distributed(scenario, out, lambda _: None, observers, groups=groups)
+
+    return {
+        "distributed": runs((), ()),
+        "1 kHz loop in one process": runs((), loop),
+        "distributed, recorder and viewer": runs(OBSERVERS, ()),
+        "1 kHz loop in one process, recorder and viewer": runs(OBSERVERS, loop),
+    }
+
+
 def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], save: Save) -> dict[str, Any]:
     """The figures of some groups (see `bench_command.GROUPS`), by name.
 
@@ -60,11 +76,7 @@ def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], sav
     """
     figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
     parts = PARTS if "parts" in groups else {}
-    cases: dict[str, Callable[[Path], RunResult]] = {
-        "composed": lambda out: run_composed(scenario, out, lambda _: None, ()),
-        "distributed": lambda out: run_distributed(scenario, out, lambda _: None, ()),
-        "distributed, recorder and viewer": lambda out: run_distributed(scenario, out, lambda _: None, OBSERVERS),
-    }
+    cases = {"composed": lambda out: run_composed(scenario, out, lambda _: None, ()), **_distributed(scenario)}
     names = list(cases) if "runs" in groups else []
     total = len(parts) + len(names)
     for done, (part, module) in enumerate(parts.items()):
@@ -117,7 +129,7 @@ def tables(figures: dict[str, Any]) -> list[Table]:
     return [table for table in (runs, blame, small) if table.row_count]
 
 
-def bench(scenario: str, out: Path, console: Console, groups: Sequence[str], quiet: bool = False) -> None:
+def bench(scenario: Scenario, out: Path, console: Console, groups: Sequence[str], quiet: bool = False) -> None:
     """Measures, prints the tables and writes bench.json; shows on a terminal how far it is, unless `quiet`."""
 
     def save(figures: dict[str, Any]) -> None:
@@ -125,7 +137,7 @@ def bench(scenario: str, out: Path, console: Console, groups: Sequence[str], qui
 
     screen = Console(stderr=True)
     with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:
-        figures = measure(load_scenario(scenario), display, groups, save)
+        figures = measure(scenario, display, groups, save)
     for table in tables(figures):
         console.print(table)
     console.print(f"{platform.platform()}, written to {out}", highlight=False)

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import output_file
+from palpate.run.options import Settings
 
 GROUPS = ("parts", "runs")
 """What can be measured."""
@@ -20,6 +21,7 @@ def bench(
     scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "clean",
     out: Annotated[Path, output_file("Output file.", "--out", "-o")] = Path("bench.json"),
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
+    settings: Settings = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only.")] = False,
 ) -> None:
     """Measure the speed of the parts, the bus and whole runs; print tables and write bench.json."""
@@ -29,5 +31,4 @@ def bench(
     from palpate.run.inputs import usable
     from palpate_benchmarks.bench import bench as run_bench
 
-    usable(scenario)
-    run_bench(scenario, out, Console(width=max(WIDE, Console().width)), only or GROUPS, quiet)
+    run_bench(usable(scenario, settings), out, Console(width=max(WIDE, Console().width)), only or GROUPS, quiet)
