@@ -39,7 +39,7 @@ def test_every_column_of_the_samples_is_told() -> None:
     import numpy as np
 
     samples = Empty()
-    for name in ("time", "depth", "force", "speed", "time_in_contact"):
+    for name in ("time", "depth", "force", "speed", "time_in_contact", "depth_uncertainty", "stroke"):
         setattr(samples, name, np.empty(0))
     samples.position = samples.normal = np.empty((0, 3))
     for column in (*sample_columns(samples), "force_limited", "run"):
