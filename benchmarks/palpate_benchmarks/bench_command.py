@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import output_file
-from palpate.run.options import Settings
+from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 GROUPS = ("parts", "runs")
 """What can be measured."""
@@ -18,7 +18,7 @@ WIDE = 160
 
 
 def bench(
-    scenario: Annotated[str, typer.Argument(help="The examination to time.")] = "clean",
+    scenario: Annotated[str, typer.Argument(help="The examination to time.")] = DEFAULT_SCENARIO,
     out: Annotated[Path, output_file("Output file.", "--out", "-o")] = Path("bench.json"),
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
     settings: Settings = None,

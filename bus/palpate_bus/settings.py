@@ -28,7 +28,7 @@ DOMAIN_MAX = 232
 
 COMPOSE_VARIABLES = {
     "PALPATE_SCENARIO_NAME": (
-        "clean",
+        "lump",
         "Scenario that the containers examine: a name, or a file in the results folder as `/results/my.yaml`.",
     ),
     "PALPATE_SETTINGS": (

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate_models.anatomy import Anatomy, Muscles, Skeleton, Variation
+from palpate_models.breathing import Breathing
 from palpate_models.draw import Build, Draw
 from palpate_models.frames import Array
 from palpate_models.guarding import Guarding
@@ -28,6 +29,10 @@ FAT_YOUNG_PA = 3000.0
 BUILDS = (Build.SLIM, Build.MEDIAN, Build.OBESE)
 SHARES = (0.2, 0.5, 0.3)
 """How many are of each build [A]."""
+BREATHS_PER_MIN = (12.0, 14.0, 20.0)
+"""Least, most frequent and largest mean rate of a person's quiet breaths. Most frequent: Ragnarsdottir 2006 [V]; ends [A]."""
+BREATH_M: Interval = (0.005, 0.012)
+"""Mean depth of a person's quiet breaths at the navel, evenly drawn [A]."""
 
 
 class Figure(NamedTuple):
@@ -78,6 +83,7 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
             "stiffness": wall,
             "background": Background(cv=0, margins=1),
             "anatomy": anatomy,
+            "breathing": _breathing(phantom.breathing, generator(seed, "breath")),
             "lesions": phantom.lesions + lumps,
             "guarding": phantom.guarding + _guarding(phantom.draw, generator(seed, "guarding")),
         }
@@ -122,6 +128,12 @@ def under_fat(wall: Stiffness, fat_m: float) -> Stiffness:
             "stiffening_per_m": float(stiffening),
         }
     )
+
+
+def _breathing(breathing: Breathing, rng: np.random.Generator) -> Breathing:
+    """A person's own mean rate and depth of breath, where the scenario gives none; a deep breather has the deep ones."""
+    own = {"rate_per_min": rng.triangular(*BREATHS_PER_MIN), "peak_to_peak_m": rng.uniform(*BREATH_M)}
+    return breathing.model_copy(update={name: value for name, value in own.items() if name not in breathing.model_fields_set})
 
 
 def _skeleton(rng: np.random.Generator, length: float) -> Skeleton:

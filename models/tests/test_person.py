@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from scipy.stats import kurtosis
 
 from palpate_models.anatomy import Anatomy, Muscles, Skeleton, Variation
+from palpate_models.breathing import Breathing
 from palpate_models.draw import Build, Draw
 from palpate_models.load import ScenarioError, dump_scenario, load_scenario
 from palpate_models.patient import Phantom, Stiffness
@@ -51,6 +52,22 @@ def test_lumps_and_guarding_leave_the_body_as_it_is() -> None:
     assert lumpy.lesions
     assert lumpy.guarding
     assert plain.model_copy(update={"draw": LUMPY, "lesions": lumpy.lesions, "guarding": lumpy.guarding}) == lumpy
+
+
+def test_persons_breathe_each_in_their_own_way() -> None:
+    breaths = [drawn(PERSON, seed).breathing for seed in range(200)]
+    rates, depths = (np.array([getattr(breath, name) for breath in breaths]) for name in ("rate_per_min", "peak_to_peak_m"))
+    assert 12 <= rates.min() < 12.6 and 18.5 < rates.max() <= 20
+    assert 0.005 <= depths.min() < 0.0053 and 0.0117 < depths.max() <= 0.012
+    assert rates.mean() == pytest.approx(46 / 3, abs=0.4)
+
+
+def test_breathing_that_is_given_is_not_drawn() -> None:
+    given = PERSON.model_copy(update={"breathing": Breathing(rate_per_min=13)})
+    deep = PERSON.model_copy(update={"breathing": Breathing(kind="deep")})
+    assert drawn(given, 3).breathing.rate_per_min == 13
+    assert drawn(given, 3).breathing.peak_to_peak_m == drawn(PERSON, 3).breathing.peak_to_peak_m
+    assert drawn(deep, 3).breathing == deep.breathing
 
 
 def test_a_scenario_has_the_person_of_its_seed() -> None:

@@ -25,6 +25,7 @@ from palpate.report.page import read_report
 from palpate.report.results import clean_words, in_words
 from palpate.report.rows import Report
 from palpate.run.folder import usual_folder
+from palpate.run.options import DEFAULT_SCENARIO
 from palpate_models.load import dump_scenario
 from palpate_models.scenario import Scenario
 
@@ -117,7 +118,7 @@ class Examination:
 
 
 def run(
-    scenario: str | Path | Scenario = "clean",
+    scenario: str | Path | Scenario = DEFAULT_SCENARIO,
     /,
     *,
     seed: int | None = None,

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from palpate.run.inputs import examinable
+from palpate.run.options import DEFAULT_SCENARIO
 from palpate_models.load import ScenarioError, as_settings, load_scenario, whole_scenario
 from palpate_models.scenario import Scenario
 
 
-def scenario(source: str | Path | Scenario = "clean", /, *, seed: int | None = None, **settings: Any) -> Scenario:
+def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int | None = None, **settings: Any) -> Scenario:
     """A scenario that can be examined, checked as the command line checks it.
 
     Parameters

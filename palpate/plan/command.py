@@ -8,11 +8,13 @@ from typing import Annotated
 
 import typer
 
-from palpate.run.options import Settings
+from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 
 def plan(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "clean",
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")
+    ] = DEFAULT_SCENARIO,
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture, a PNG file.")] = Path("plan.png"),
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     settings: Settings = None,

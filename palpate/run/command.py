@@ -10,11 +10,13 @@ from typing import Annotated
 
 import typer
 
-from palpate.run.options import Record, ServiceChoices, Settings
+from palpate.run.options import DEFAULT_SCENARIO, Record, ServiceChoices, Settings
 
 
 def run(  # noqa: PLR0913 - the options of a command
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")] = "clean",
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")
+    ] = DEFAULT_SCENARIO,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the results; by default out/<scenario>-<time>.")
     ] = None,
@@ -70,7 +72,7 @@ def run(  # noqa: PLR0913 - the options of a command
 
     [bold]Examples[/]
 
-      palpate run                                   a patient who lies still, with one lump
+      palpate run                                   a patient who breathes, with one lump
 
       palpate run healthy --seed 3 --out results    another scenario, seed and folder
 
@@ -86,7 +88,7 @@ def run(  # noqa: PLR0913 - the options of a command
 
       palpate run my.yaml --composed                all services in one process, for sweeps and debugging
 
-      palpate run --resume out/clean-20260101-120000  goes on with a run that was killed or stopped
+      palpate run --resume out/lump-20260101-120000  goes on with a run that was killed or stopped
 
       palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
     """
@@ -114,7 +116,7 @@ def run(  # noqa: PLR0913 - the options of a command
         resume=resume,
     )
     if resume is not None:
-        if (scenario, out, seed, settings, services, repeat, overwrite) != ("clean", None, None, None, None, 1, False):
+        if (scenario, out, seed, settings, services, repeat, overwrite) != (DEFAULT_SCENARIO, None, None, None, None, 1, False):
             refuse("--resume DIR goes on with the examination of DIR: it takes neither a scenario nor what changes or places one")
         go_on(how)
         return
@@ -126,7 +128,7 @@ def run(  # noqa: PLR0913 - the options of a command
 
 
 def prepare(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a YAML file.")] = "clean",
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a YAML file.")] = DEFAULT_SCENARIO,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the scenario files.")] = Path("out"),
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     settings: Settings = None,

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import typer
 
+DEFAULT_SCENARIO = "lump"
+"""What is examined when no scenario is named: a patient who breathes, with one lump and typical errors of the equipment."""
 Record = Literal["none", "normal", "full"]
 """What is recorded of a run; `palpate_bus.settings.Settings.record` says what that means."""
 Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")]
