@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
+from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
@@ -159,3 +161,27 @@ def test_an_extra_has_nothing_that_nothing_imports(extra: str) -> None:
 
 def test_all_is_all_but_torch() -> None:
     assert with_named("all") == {*EXTRAS, BARE} - {"learn"}
+
+
+def with_required(distributions: set[str]) -> set[str]:
+    """Distributions, and all that they require themselves."""
+    found, left = set[str](), list(distributions)
+    while left:
+        name = re.sub(r"[-_.]+", "-", left.pop()).lower()
+        if name not in found:
+            found.add(name)
+            left += [re.split(r"[^\w.-]", line)[0] for line in (requires(name) or ()) if "extra ==" not in line]
+    return found
+
+
+def test_the_conductors_image_has_all_that_its_command_imports() -> None:
+    words = "import sys; from importlib import import_module; import_module(sys.argv[1]); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", words, "palpate.run.conducting"], capture_output=True, text=True, check=True, timeout=120
+    )
+    has = with_required(set().union(*map(own_lines, with_named("conductor"))))
+    tops = {name.partition(".")[0] for name in done.stdout.split()} - ROOMS.keys()
+    named = {DISTRIBUTION.get(top, top) for top in tops}
+    others = set().union(*(own_lines(extra) for extra in EXTRAS)) - has
+    assert "mcap" in others
+    assert not named & others, f"palpate[conductor] does not install {', '.join(sorted(named & others))}"

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -114,6 +115,8 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         logging.basicConfig(level=settings.log, format=f"%(asctime)s {name} %(levelname)s %(message)s", stream=sys.stderr)
         rules = contract()
         places = hosted()
+        if all(rules.roles[place.role].observer for place in places):
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # what was recorded is completed first
         services = [place.make() for place in places]
         if all(stands_back(rules.roles[place.role], settings.runtime) for place in places):
             in_the_background()

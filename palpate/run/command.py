@@ -151,6 +151,6 @@ def conduct(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
 ) -> None:
     """Conduct services that are started by others (containers, other machines) and write the report."""
-    from palpate.run.examine import conduct_others
+    from palpate.run.conducting import conduct_others
 
     conduct_others(out, tuple(name for name in observers.split(",") if name), realtime, wallclock, quiet)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tempfile
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,11 +14,10 @@ from rich.markup import escape
 from palpate.command_line import EXIT_FAILED, fail, refuse, say
 from palpate.environment import given
 from palpate.report.archive import EvidenceError
-from palpate.report.page import write_page
-from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.resumption import Resumption, going_on, resumption
-from palpate.report.rows import Report
 from palpate.run.composed import run_composed
+from palpate.run.conclusion import conclude
+from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
 from palpate.run.folder import FolderError, results_folder, usual_folder
 from palpate.run.options import Record
@@ -29,23 +26,17 @@ from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
 from palpate.run.repeat import repeat
-from palpate.run.roles import NONE, OBSERVERS, choice, workers, write_scenario_files
+from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
-from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration, megabytes_of, what_it_takes
+from palpate.run.space import WatchedRoom, check_room, expected_duration, what_it_takes
 from palpate_bus.implementations import ChoiceError, check_libraries
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError, Settings
-from palpate_bus.wire.zenoh_config import close_session, open_session
-from palpate_conductor.conduct import conduct as conduct_run
 from palpate_conductor.outcome import RunFailed
 from palpate_conductor.result import RunResult, Tell
 from palpate_conductor.timing import Timing
-from palpate_conductor.tree import FrameTree
-from palpate_models.load import ScenarioError, exam_input, load_scenario
 from palpate_models.scenario import Scenario
-
-NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
 
 
 @dataclass(frozen=True)
@@ -194,68 +185,3 @@ def _rate(scenario: Scenario) -> float:
     if rate < 1.0 and scenario.services.tissue == NONE:
         refuse("services.tissue = 'none' is for hardware, which cannot be slowed down")
     return rate
-
-
-def conclude(
-    console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
-) -> None:
-    """Writes the results, prints the findings, and leaves with status 3 when the run failed or its folder took no results."""
-    with nullcontext() if quiet else console.status("writing report and maps"):
-        report, page, trouble = _written(folder, scenario, result)
-    if as_json:
-        print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
-    else:
-        print_findings(Console(), report)
-    if page is not None and (trouble or not quiet):
-        console.print(f"to read: {page} ({megabytes_of(page.parent):.0f} MB in {page.parent})", highlight=False, soft_wrap=True)
-    if trouble:
-        say(trouble)
-    if result.failure:
-        fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
-    if trouble:
-        raise typer.Exit(EXIT_FAILED)
-
-
-def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:
-    """Writes the results into a folder, or into another where that takes none: the report, its page, and what went wrong.
-
-    Where no folder takes them there is no page, and the report is all the same.
-    """
-    try:
-        report = write_results(folder, scenario, result)
-        return report, write_page(folder), ""
-    except OSError as error:
-        trouble = f"{folder}: the results cannot be written there ({error.strerror})"
-    try:
-        other = another_folder()
-        write_scenario_files(scenario, other)
-        report = write_results(other, scenario, result)
-        return report, write_page(other), f"{trouble}; they are in {other}"
-    except OSError as error:
-        report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
-        return (
-            report,
-            None,
-            f"{trouble}, nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here",
-        )
-
-
-def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallclock: bool, quiet: bool) -> None:
-    """Conducts services that others start and writes the results into `out`, which has scenario.yaml."""
-    console = Console(stderr=True)
-    for name in observers:
-        if name not in OBSERVERS:
-            refuse(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
-    try:
-        chosen = load_scenario(str(out / "scenario.yaml"))
-        if chosen.services.tissue == NONE and not wallclock:
-            refuse(NEEDS_WALLCLOCK)
-        session = open_session()
-    except (ScenarioError, BusConfigError) as error:
-        refuse(error)
-    roles = (*workers(chosen), *observers)
-    with RunDisplay(console, quiet, expected_duration(chosen.exam)) as display:
-        timing = Timing(wallclock, 1.0 if realtime else None)
-        result = conduct_run(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
-    close_session(session)
-    conclude(console, out, chosen, result, quiet)

@@ -13,7 +13,7 @@ from conductor_messages import SETTINGS, collected, result
 from rich.console import Console
 
 from palpate.command_line import EXIT_FAILED
-from palpate.run.examine import conclude
+from palpate.run.conclusion import conclude
 from palpate.run.folder import FolderError
 from palpate.run.progress import RunDisplay
 from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration, what_it_takes

@@ -80,3 +80,4 @@ def test_no_container_takes_a_machine_for_itself() -> None:
         assert service["cpus"] <= 1.0
         assert service["logging"]["options"] == {"max-size": "10m", "max-file": "3"}
         assert service["cap_drop"] == ["ALL"]
+        assert service["read_only"] is True

@@ -162,7 +162,10 @@ class ObservingNode(ABC):
         """Does what the conductor says, other than to begin and to end."""
 
     def run(self) -> None:
-        """Observes until the conductor ends the run. Raises RunAborted when it is lost, and all who are observed have left."""
+        """Observes until the conductor ends the run, and has its service finish in any case.
+
+        Raises RunAborted when the conductor is lost and all who are observed have left, KeyboardInterrupt when asked to leave.
+        """
         try:
             while True:
                 busy = self._drain()
@@ -181,8 +184,8 @@ class ObservingNode(ABC):
                     self._obey(message)
             while self._drain():
                 pass
-        except RunAborted as aborted:
-            log.warning("run aborted: %s", aborted)
+        except (RunAborted, KeyboardInterrupt) as ended:
+            log.warning("run aborted: %s", str(ended) or "the process was asked to leave")
             self._drain()
             self._service.finish()
             raise

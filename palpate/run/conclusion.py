@@ -1,0 +1,64 @@
+"""The end of an examination: its results are written, its findings printed, and the command leaves with its status."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from contextlib import nullcontext
+from pathlib import Path
+
+import typer
+from rich.console import Console
+
+from palpate.command_line import EXIT_FAILED, fail, say
+from palpate.report.page import write_page
+from palpate.report.results import assemble, print_findings, truth_of_run, write_results
+from palpate.report.rows import Report
+from palpate.run.roles import write_scenario_files
+from palpate.run.space import another_folder, megabytes_of
+from palpate_conductor.result import RunResult
+from palpate_models.scenario import Scenario
+
+
+def conclude(
+    console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
+) -> None:
+    """Writes the results, prints the findings, and leaves with status 3 when the run failed or its folder took no results."""
+    with nullcontext() if quiet else console.status("writing report and maps"):
+        report, page, trouble = _written(folder, scenario, result)
+    if as_json:
+        print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
+    else:
+        print_findings(Console(), report)
+    if page is not None and (trouble or not quiet):
+        console.print(f"to read: {page} ({megabytes_of(page.parent):.0f} MB in {page.parent})", highlight=False, soft_wrap=True)
+    if trouble:
+        say(trouble)
+    if result.failure:
+        fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+    if trouble:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:
+    """Writes the results into a folder, or into another where that takes none: the report, its page, and what went wrong.
+
+    Where no folder takes them there is no page, and the report is all the same.
+    """
+    try:
+        report = write_results(folder, scenario, result)
+        return report, write_page(folder), ""
+    except OSError as error:
+        trouble = f"{folder}: the results cannot be written there ({error.strerror})"
+    try:
+        other = another_folder()
+        write_scenario_files(scenario, other)
+        report = write_results(other, scenario, result)
+        return report, write_page(other), f"{trouble}; they are in {other}"
+    except OSError as error:
+        report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
+        return (
+            report,
+            None,
+            f"{trouble}, nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here",
+        )

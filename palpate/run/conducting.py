@@ -1,0 +1,45 @@
+"""What `palpate conduct` does: conducts services that others start, such as containers.
+
+It is all that the conductor's image has to import, so nothing of a role, of a recording or of resuming is imported here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from palpate.command_line import refuse
+from palpate.run.conclusion import conclude
+from palpate.run.progress import RunDisplay
+from palpate.run.roles import NONE, OBSERVERS, workers
+from palpate.run.space import expected_duration
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire.zenoh_config import close_session, open_session
+from palpate_conductor.conduct import conduct
+from palpate_conductor.timing import Timing
+from palpate_conductor.tree import FrameTree
+from palpate_models.load import ScenarioError, exam_input, load_scenario
+
+NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
+
+
+def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallclock: bool, quiet: bool) -> None:
+    """Conducts services that others start and writes the results into `out`, which has scenario.yaml."""
+    console = Console(stderr=True)
+    for name in observers:
+        if name not in OBSERVERS:
+            refuse(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
+    try:
+        chosen = load_scenario(str(out / "scenario.yaml"))
+        if chosen.services.tissue == NONE and not wallclock:
+            refuse(NEEDS_WALLCLOCK)
+        session = open_session()
+    except (ScenarioError, BusConfigError) as error:
+        refuse(error)
+    roles = (*workers(chosen), *observers)
+    with RunDisplay(console, quiet, expected_duration(chosen.exam)) as display:
+        timing = Timing(wallclock, 1.0 if realtime else None)
+        result = conduct(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
+    close_session(session)
+    conclude(console, out, chosen, result, quiet)
