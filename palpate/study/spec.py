@@ -134,7 +134,7 @@ class Study(Section):
     """... at each of these levels, with all others as in the first of `errors`."""
     methods: Annotated[dict[Name, Method], Field(min_length=1)] = Field(default_factory=lambda: {"palpate": Method()})
     record: Literal["none"] = "none"
-    """Nothing is recorded: a recording of one examination has 255 MB."""
+    """Nothing is recorded: a recording of one examination has 57 MB."""
 
     @model_validator(mode="after")
     def _each(self) -> Self:
