@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 import yaml
 
+from palpate.run.options import DEFAULT_SCENARIO
 from palpate_bus.contract import contract
+from palpate_bus.settings import COMPOSE_VARIABLES
 from palpate_models.load import view_of
 
 ROOT = Path(__file__).parents[2]
@@ -71,6 +73,11 @@ def test_each_container_has_the_scenario_file_of_its_role_and_no_other() -> None
             view = view_of(role)
             assert COMPOSE[role]["environment"]["PALPATE_SCENARIO"] == f"{folders[view]}/{view}.yaml"
             assert [volume.split(":")[-1 if view == "scenario" else -2] for volume in COMPOSE[role]["volumes"]] == [folders[view]]
+
+
+def test_containers_examine_what_palpate_run_does_unless_told_otherwise() -> None:
+    assert COMPOSE["prepare"]["environment"]["PALPATE_SCENARIO_NAME"] == f"${{PALPATE_SCENARIO_NAME:-{DEFAULT_SCENARIO}}}"
+    assert COMPOSE_VARIABLES["PALPATE_SCENARIO_NAME"][0] == DEFAULT_SCENARIO
 
 
 def test_no_container_takes_a_machine_for_itself() -> None:
