@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -40,6 +41,7 @@ class Kept(Service):
 
     def __init__(self) -> None:
         self.messages: list[tuple[str, int, int]] = []
+        self.finished = False
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         return {}
@@ -48,6 +50,7 @@ class Kept(Service):
         self.messages.append((topic.name, stamp, sequence))
 
     def finish(self) -> Mapping[str, Any]:
+        self.finished = True
         return {"kept": len(self.messages)}
 
 
@@ -121,4 +124,19 @@ def test_without_a_conductor_and_services_it_leaves_with_what_it_has() -> None:
     member: Any = Bus()
     with pytest.raises(RunAborted, match="the conductor is gone"):
         RecorderNode(kept, member).run()
+    assert kept.messages == [("joint_states", 7 * MS, 8)]
+
+
+def test_told_to_leave_by_a_signal_it_completes_what_it_has() -> None:
+    kept = Kept()
+    member: Any = Bus(said(RunControl.HELLO))
+    member.alive = lambda roles: signal.raise_signal(signal.SIGTERM)
+    member.conductor_there = False
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            RecorderNode(kept, member).run()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert kept.finished
     assert kept.messages == [("joint_states", 7 * MS, 8)]
