@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from examination import SHORT, Finished, palpate_run
 
+from palpate.run.options import DEFAULT_SCENARIO
+
 ROOT = Path(__file__).parents[2]
 PROJECT = "palpate-test"
 USER = str(os.getuid() or 1000)
@@ -69,7 +71,7 @@ def images(engine: None) -> None:
 
 @pytest.fixture(scope="module")
 def local(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    finished = palpate_run("clean", tmp_path_factory.mktemp("local"), "--composed", "--record", "none", settings=SHORT)
+    finished = palpate_run(DEFAULT_SCENARIO, tmp_path_factory.mktemp("local"), "--composed", "--record", "none", settings=SHORT)
     assert finished.status == 0, finished.output
     return finished
 
