@@ -7,9 +7,7 @@ from typing import Annotated
 import typer
 
 from palpate.command_line import refuse
-from palpate.live.connection import Connect
-from palpate.live.console import EXIT_TROUBLE, command, print_json
-from palpate_bus.runs.joining import NoBus
+from palpate.live.options import Connect
 
 LISTEN = "tcp/127.0.0.1:7447"
 
@@ -40,7 +38,10 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.check.rig import RigSettings
     from palpate.check.suites import SUITES
     from palpate.check.suites.tissue import STILL
+    from palpate.live.connection import command
+    from palpate.live.console import EXIT_TROUBLE, print_json
     from palpate_bus.implementations import ChoiceError
+    from palpate_bus.runs.joining import NoBus
     from palpate_models.load import ScenarioError, load_scenario
 
     with command():

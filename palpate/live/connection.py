@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic, sleep
-from typing import Annotated
 
 import typer
 import zenoh
 
+from palpate.command_line import refuse
+from palpate.live.options import ChosenBus
 from palpate_bus.contract import Contract
 from palpate_bus.runs.joining import BusTarget, NoBus, find
 from palpate_bus.security.access import public
@@ -20,13 +22,17 @@ from palpate_bus.wire.zenoh_config import BusOptions, session
 FIND_S = 1.0
 """How long a tool waits for its links before it goes on with those that it has."""
 
-Connect = Annotated[
-    list[str] | None,
-    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Endpoint to join, e.g. tcp/10.0.0.5:7447; may be repeated."),
-]
-ChosenRun = Annotated[str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")]
-Domain = Annotated[int | None, typer.Option(help="ROS domain; by default the run's, else ROS_DOMAIN_ID.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+@contextmanager
+def command() -> Iterator[None]:
+    """Wraps a command: no bus and bad input end it with a sentence and status 2, Ctrl-C with status 0."""
+    try:
+        yield
+    except (NoBus, BusConfigError) as error:
+        refuse(error)
+    except KeyboardInterrupt:
+        sys.stdout.flush()
+        raise typer.Exit(0) from None
 
 
 @dataclass(frozen=True)
@@ -47,9 +53,9 @@ class Joined:
 
 
 @contextmanager
-def joined(connect: Sequence[str] | None, chosen: str | None, domain: int | None) -> Iterator[Joined]:
+def joined(chosen: ChosenBus) -> Iterator[Joined]:
     """Joins the bus that the user means, for a `with` block. Raises NoBus."""
-    target = find(connect, chosen, domain)
+    target = find(*chosen)
     try:
         with session(target.options) as bus:
             settle(bus, target.options)

@@ -1,20 +1,12 @@
-"""Output of the tools: tables for people, JSON for programs, and a clean end on Ctrl-C."""
+"""Output of the tools: tables for people, JSON for programs."""
 
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
-import typer
 from rich.console import Console
 from rich.table import Table
-
-from palpate.command_line import refuse
-from palpate_bus.runs.joining import NoBus
-from palpate_bus.settings import BusConfigError
 
 EXIT_TROUBLE = 1
 WIDE = 140
@@ -42,18 +34,6 @@ def table(*columns: str) -> Table:
     for name in columns:
         made.add_column(name.lstrip(">"), justify="right" if name.startswith(">") else "left", overflow="fold")
     return made
-
-
-@contextmanager
-def command() -> Iterator[None]:
-    """Wraps a command: no bus and bad input end it with a sentence and status 2, Ctrl-C with status 0."""
-    try:
-        yield
-    except (NoBus, BusConfigError) as error:
-        refuse(error)
-    except KeyboardInterrupt:
-        sys.stdout.flush()
-        raise typer.Exit(0) from None
 
 
 def number(value: float | None, unit: str = "", digits: int = 4) -> str:

@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-from time import monotonic, sleep
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
-from palpate.live.connection import AsJson, ChosenRun, Connect, Domain, joined
-from palpate.live.console import EXIT_TROUBLE, bandwidth, command, console, number, print_json, print_line, table
-from palpate.live.doctor import POLL_S, Diagnosis, Severity, examine
-from palpate_bus.contract import contract
-from palpate_bus.monitor.health import TopicHealth, Violation
-from palpate_bus.monitor.live import LiveMonitor
-from palpate_bus.runs.announcement import live
-from palpate_bus.runs.run_folder import remove_leftovers
-
-_COLOURS = {Severity.OK: "green", Severity.WARN: "yellow", Severity.BAD: "bold red"}
+from palpate.live.options import AsJson, ChosenBus, ChosenRun, Connect, Domain
 
 
 def doctor(
@@ -33,82 +22,11 @@ def doctor(
 
     The exit status is 0 when all is well, 1 when something is wrong, 2 when there is no bus.
     """
+    from palpate.live.doctor_report import clear, report, watch_violations
+
     if clean:
-        left = remove_leftovers()
-        live()
-        console().print("\n".join(f"removed {path}" for path in left) or "nothing left of killed runs", highlight=False)
-        return
-    with command(), joined(connect, run, domain) as bus:
-        rules = contract()
-        if watch:
-            wallclock = bus.target.run is not None and bus.target.run.runtime == "wallclock"
-            _watch(LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), wallclock), as_json)
-            return
-        diagnosis = examine(bus, rules, seconds)
-    if as_json:
-        print_json(diagnosis.as_json())
+        clear()
+    elif watch:
+        watch_violations(ChosenBus(connect, run, domain), as_json)
     else:
-        _print(diagnosis)
-    if not diagnosis.healthy:
-        raise typer.Exit(EXIT_TROUBLE)
-
-
-def _watch(live: LiveMonitor, as_json: bool) -> None:
-    began = monotonic()
-    try:
-        while True:
-            for violation in live.poll():
-                if as_json:
-                    print_line({"after_s": round(monotonic() - began, 3), **_facts(violation)})
-                else:
-                    console().print(f"[dim]{monotonic() - began:8.2f} s[/]  [red]{escape(str(violation))}[/]", soft_wrap=True)
-            sleep(POLL_S)
-    finally:
-        live.close()
-
-
-def _facts(violation: Violation) -> dict[str, str]:
-    return {
-        "topic": violation.topic, "sender": violation.sender, "kind": str(violation.kind), "field": violation.field,
-        "expected": violation.expected, "got": violation.got,
-    }  # fmt: skip
-
-
-def _print(diagnosis: Diagnosis) -> None:
-    out = console()
-    listed = table("", "", "")
-    said = ""
-    for finding in diagnosis.findings:
-        about = "" if finding.about == said else finding.about
-        said = finding.about
-        listed.add_row(f"[bold]{about}[/]", f"[{_COLOURS[finding.level]}]{finding.level}[/]", escape(finding.text))
-    listed.show_header = False
-    out.print(listed)
-    out.print()
-    rows = table("topic", "from", "state", ">Hz", ">by the bus's time", ">contract", ">age", ">load", ">messages", ">missing")
-    for health in diagnosis.topics:
-        rows.add_row(*_row(health))
-    out.print(rows)
-    out.print()
-    for violation, count in diagnosis.violations:
-        times = f" ({count} times)" if count > 1 else ""
-        out.print(f"[bold red]violation[/]  {escape(str(violation))}{times}", soft_wrap=True)
-    if not diagnosis.violations:
-        out.print("[green]no violation of the contract[/]")
-
-
-def _row(health: TopicHealth) -> tuple[str, ...]:
-    topic = health.topic
-    state = {None: "[dim]rests[/]", True: "[green]alive[/]", False: "[red]silent[/]"}[health.alive]
-    if health.violations:
-        state = "[bold red]violates[/]"
-    elif not health.senders:
-        state = "[dim]no sender[/]"
-    wanted = "latched" if topic.latched else "event" if topic.event else f"{1000 / topic.period_ms:g}"
-    periodic = topic.periodic and health.messages
-    return (
-        topic.name, ", ".join(health.senders), state, number(health.rate_hz) if periodic else "",
-        number(health.bus_rate_hz) if periodic and health.bus_rate_hz is not None else "", wanted,
-        number(health.age_ms, "ms", 2) if periodic else "", bandwidth(health.bytes_per_s) if health.bytes_per_s else "",
-        str(health.messages) if health.messages else "", str(health.missing) if health.missing else "",
-    )  # fmt: skip
+        report(ChosenBus(connect, run, domain), seconds, as_json)

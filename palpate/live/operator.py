@@ -1,9 +1,8 @@
-"""`palpate stop`, `release`, `pause`, `resume`, `step`: an operator controls a run from another terminal."""
+"""What an operator asks of a run from another terminal."""
 
 from __future__ import annotations
 
 from time import monotonic, sleep
-from typing import Annotated
 
 import typer
 import zenoh
@@ -19,48 +18,12 @@ from palpate_bus.wire.zenoh_config import session
 MEET_S = 1.0
 """How long a run may take to be met on the bus."""
 
-Named = Annotated[str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")]
 
+def request(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
+    """Sends a request to the run that is meant, or to every one, and prints the answers.
 
-def stop(
-    reason: Annotated[str, typer.Argument(help="Why, for the record.")] = "palpate stop",
-    soft: Annotated[
-        bool, typer.Option("--soft", help="Retreat along the normal and wait, instead of holding where it is.")
-    ] = False,
-    run: Named = None,
-) -> None:
-    """Stop a run at once: the arm holds safely until `palpate release`. Without --run, every run on this machine stops."""
-    _say("soft-stop" if soft else "stop", reason, run, everyone=True)
-
-
-def release(
-    end: Annotated[bool, typer.Option("--end", help="End the examination: the arm goes home.")] = False,
-    reason: Annotated[str, typer.Option(help="Why, for the record.")] = "palpate release",
-    run: Named = None,
-) -> None:
-    """Release a stop: the examination continues where it was, or with --end the arm goes home and the run ends."""
-    _say("end" if end else "release", reason, run)
-
-
-def pause(run: Named = None) -> None:
-    """Pause simulated time, within half a simulated second. No safety stop: the arm does not retreat. Not with --wallclock."""
-    _say("pause", "palpate pause", run)
-
-
-def resume(run: Named = None) -> None:
-    """Resume a paused run."""
-    _say("resume", "palpate resume", run)
-
-
-def step(
-    ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milliseconds.")] = 1,
-    run: Named = None,
-) -> None:
-    """Advance a paused run by some milliseconds."""
-    _say("step", "palpate step", run, ms=ms)
-
-
-def _say(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
+    Raises typer.Exit where there is no such run, or one does not answer.
+    """
     console = Console(stderr=True)
     try:
         buses = find_all(chosen=name) if everyone else [find(chosen=name)]

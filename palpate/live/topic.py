@@ -1,4 +1,4 @@
-"""`palpate topic list|info|echo|hz|bw`: topics on a live bus."""
+"""What `palpate topic` does with the topics on a live bus."""
 
 from __future__ import annotations
 
@@ -7,34 +7,29 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from math import inf
 from time import monotonic
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
-import typer
 import yaml
 from rich.console import Console
 
 from palpate.live import graph
-from palpate.live.connection import AsJson, ChosenRun, Connect, Domain, Joined, joined
-from palpate.live.console import bandwidth, command, console, print_json, print_line, table
+from palpate.live.connection import command, joined
+from palpate.live.console import bandwidth, console, print_json, print_line, table
 from palpate.live.listening import Heard, Listener, plain
+from palpate.live.options import ChosenBus
 from palpate.live.statistics import Spacing
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.runs.joining import NoBus
 
-app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
-
-Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
-Seconds = Annotated[float | None, typer.Option("--seconds", help="Stop after this long; by default Ctrl-C ends it.")]
 EVERY_S = 1.0
 BANDWIDTH_OVER = 5
 """Bandwidth is the mean over so many seconds."""
 
 
-@app.command("list")
-def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
-    """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
-    with command(), joined(connect, run, domain) as bus:
+def list_topics(chosen: ChosenBus, as_json: bool) -> None:
+    """Prints the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
+    with command(), joined(chosen) as bus:
         found = graph.topics(graph.present(bus))
         rules = contract().topics
         if as_json:
@@ -52,10 +47,9 @@ def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain =
         console().print(out)
 
 
-@app.command()
-def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
-    """Show a topic: its row of the contract, and who publishes and subscribes on the bus with which type hash."""
-    with command(), joined(connect, run, domain) as bus:
+def show_topic(name: str, chosen: ChosenBus, as_json: bool) -> None:
+    """Prints a topic's row of the contract, and who publishes and subscribes on the bus with which type hash."""
+    with command(), joined(chosen) as bus:
         name = name.strip("/")
         found = [e for e in graph.present(bus) if e.endpoint is not None and e.endpoint.topic == name]
         row = contract().topics.get(name)
@@ -91,25 +85,24 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
         console().print(ends_table)
 
 
-@app.command()
-def echo(  # noqa: PLR0913 - the options of a command
-    name: Name,
-    connect: Connect = None,
-    run: ChosenRun = None,
-    domain: Domain = None,
-    as_json: AsJson = False,
-    field: Annotated[str | None, typer.Option(help="Only this field, e.g. wrench.force.")] = None,
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after N messages.")] = None,
-    once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
-    full: Annotated[bool, typer.Option("--full", help="Print long arrays in full.")] = False,
-    seconds: Seconds = None,
-) -> None:
-    """Print the messages of a topic as they come."""
-    left = 1 if once else count
-    with command(), _listening(name, connect, run, domain) as (_, topic, listener):
-        for heard in _until(listener, seconds):
+class Echo(NamedTuple):
+    """What of the messages of a topic is printed, and for how long."""
+
+    field: str | None = None
+    """Only this field."""
+    at_most: int | None = None
+    full: bool = False
+    """Long arrays in full."""
+    seconds: float | None = None
+
+
+def print_messages(name: str, chosen: ChosenBus, wanted: Echo, as_json: bool) -> None:
+    """Prints the messages of a topic as they come."""
+    left = wanted.at_most
+    with command(), _listening(name, chosen) as (topic, listener):
+        for heard in _until(listener, wanted.seconds):
             message = _message(heard, topic)
-            value = plain(message, full=full or as_json, path=field)
+            value = plain(message, full=wanted.full or as_json, path=wanted.field)
             if as_json:
                 print_line({"topic": topic.name, "sequence": heard.sequence, "sent_ns": heard.sent, "message": value})
             else:
@@ -119,17 +112,9 @@ def echo(  # noqa: PLR0913 - the options of a command
                 return
 
 
-@app.command()
-def hz(
-    name: Name,
-    connect: Connect = None,
-    run: ChosenRun = None,
-    domain: Domain = None,
-    as_json: AsJson = False,
-    seconds: Seconds = None,
-) -> None:
-    """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
-    with command(), _listening(name, connect, run, domain) as (_, topic, listener):
+def measure_rate(name: str, chosen: ChosenBus, seconds: float | None, as_json: bool) -> None:
+    """Measures a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
+    with command(), _listening(name, chosen) as (topic, listener):
         spacing = Spacing()
         for heard in _each_second(listener, seconds):
             for one in heard:
@@ -139,17 +124,9 @@ def hz(
             _say_rate(spacing, topic, as_json, whole=True)
 
 
-@app.command()
-def bw(
-    name: Name,
-    connect: Connect = None,
-    run: ChosenRun = None,
-    domain: Domain = None,
-    as_json: AsJson = False,
-    seconds: Seconds = None,
-) -> None:
-    """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
-    with command(), _listening(name, connect, run, domain) as (_, topic, listener):
+def measure_bandwidth(name: str, chosen: ChosenBus, seconds: float | None, as_json: bool) -> None:
+    """Measures a topic's bandwidth, once a second: payload bytes per second and per message."""
+    with command(), _listening(name, chosen) as (topic, listener):
         window: deque[list[int]] = deque(maxlen=BANDWIDTH_OVER)
         for heard in _each_second(listener, seconds):
             window.append([len(one.payload) for one in heard])
@@ -157,11 +134,9 @@ def bw(
 
 
 @contextmanager
-def _listening(
-    name: str, connect: list[str] | None, run: str | None, domain: int | None
-) -> Iterator[tuple[Joined, Topic, Listener]]:
+def _listening(name: str, chosen: ChosenBus) -> Iterator[tuple[Topic, Listener]]:
     """Joins the bus and listens to a topic: the contract's, or any that is there with a message type that we know."""
-    with joined(connect, run, domain) as bus:
+    with joined(chosen) as bus:
         name = name.strip("/")
         row = contract().topics.get(name)
         if row is None:
@@ -176,7 +151,7 @@ def _listening(
             row = Topic(name=name, type=types[0], producer="", readers={}, qos="event", event=True, doc="")
         listener = Listener(bus.session, row, bus.domain)
         try:
-            yield bus, row, listener
+            yield row, listener
         finally:
             listener.close()
 

@@ -237,7 +237,7 @@ def clean_words(report: Report) -> str:
 def in_words(s: scoring.Scores) -> str:
     """Scores in a line."""
     parts = [f"{s.matched} matched, {s.missed} missed"]
-    parts += [f"{s.not_palpable} not palpable"] if s.not_palpable else []
+    parts += [f"{s.not_palpable} not palpable in the region"] if s.not_palpable else []
     parts += [f"{s.false_findings} false" + (f" ({s.on_guarding} on guarding)" if s.on_guarding else "")]
     parts += [f"place within {s.place_error_m * 1e3:.1f} mm"] if s.place_error_m is not None else []
     parts += [f"Dice {s.dice:.2f}"] if s.dice is not None else []

@@ -69,7 +69,8 @@ def _observers(scenario: Scenario, how: How, console: Console) -> tuple[str, ...
         check_libraries("dashboard", choice(scenario, "dashboard"))
     except ChoiceError as error:
         why = str(error).partition(": ")[2]
-        console.print(f"[dim]no recording for the dashboard (recording.rrd): {escape(why)}[/]", highlight=False, soft_wrap=True)
+        later = f"the dashboard can draw this run later, from its recording: {escape(why)}"
+        console.print(f"[dim]{later}[/]", highlight=False, soft_wrap=True)
         return tuple(role for role in OBSERVERS if role != "dashboard")
     return OBSERVERS
 

@@ -13,9 +13,7 @@ import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, NamedTuple, NoReturn
-
-import typer
+from typing import NamedTuple, NoReturn
 
 from palpate.command_line import refuse
 from palpate_bus import implementations
@@ -27,12 +25,6 @@ from palpate_conductor.handover import ROLES
 
 FILE = "places.json"
 """In the results folder of a run."""
-
-NameOrFile = Annotated[
-    str | None,
-    typer.Option("--service", metavar="NAME_OR_FILE", help="An installed implementation or a Python file; else the run's own."),
-]
-RunName = Annotated[str | None, typer.Option(help="The run: its process id, or part of its name; by default the newest.")]
 
 
 class PlaceError(ValueError):
@@ -152,25 +144,8 @@ def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
     os.execvpe(program, [program, *command[1:]], {**os.environ, **environment})
 
 
-def join(
-    role: Annotated[str, typer.Argument(help="The role that the run was started without.")],
-    service: NameOrFile = None,
-    run: RunName = None,
-) -> NoReturn:
-    """Join a run that was started with --without ROLE; becomes that service."""
-    _enter(place_to_join, role, service, run)
-
-
-def takeover(
-    role: Annotated[str, typer.Argument(help=f"One of {', '.join(sorted(ROLES))}.")],
-    service: NameOrFile = None,
-    run: RunName = None,
-) -> NoReturn:
-    """Take the place of a service that was stopped, in a run with --wallclock --handover SECONDS; becomes that service."""
-    _enter(place_to_take, role, service, run)
-
-
-def _enter(find: Callable[[str, runs.Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
+def enter(find: Callable[[str, runs.Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
+    """Becomes the process of the place that `find` finds in the run. Raises typer.Exit where there is none."""
     try:
         place = find(role, live_run(run))
         command = command_for(role, place, service)

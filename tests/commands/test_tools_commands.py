@@ -19,8 +19,8 @@ from small_bus import RULES, SmallRobot, small_bus
 from typer.testing import CliRunner, Result
 
 from palpate.live.doctor_command import doctor
-from palpate.live.node import app as node
-from palpate.live.topic import app as topic
+from palpate.live.node_command import app as node
+from palpate.live.topic_command import app as topic
 from palpate_bus.runs.announcement import Announcement, Run, live
 from palpate_bus.wire.liveliness import NodeTokens
 
@@ -131,7 +131,7 @@ def test_doctor_finds_what_is_wrong(robot: SmallRobot) -> None:
 
 
 def test_ctrl_c_ends_a_tool_with_status_0_and_whole_lines(robot: SmallRobot) -> None:
-    words = [sys.executable, "-c", "from palpate.live.topic import app; app()", "echo", "joint_states", "--json"]
+    words = [sys.executable, "-c", "from palpate.live.topic_command import app; app()", "echo", "joint_states", "--json"]
     # A shell lets what it starts in the background ignore SIGINT, and that is inherited.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

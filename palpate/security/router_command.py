@@ -6,13 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-
-from palpate.command_line import refuse
-from palpate_bus.contract import contract
-from palpate_bus.security.access import access_control
-from palpate_bus.wire.router import DEFAULT_ENDPOINT, serve
-from palpate_bus.wire.zenoh_config import BusConfigError
 
 SECURE_ENDPOINT = "tls/[::]:7447"
 
@@ -24,6 +17,14 @@ def router(
     ] = None,
 ) -> None:
     """Run a zenoh router for services in containers or on several machines, until it is stopped."""
+    from rich.console import Console
+
+    from palpate.command_line import refuse
+    from palpate_bus.contract import contract
+    from palpate_bus.security.access import access_control
+    from palpate_bus.wire.router import DEFAULT_ENDPOINT, serve
+    from palpate_bus.wire.zenoh_config import BusConfigError
+
     console = Console(stderr=True)
     try:
         if keys is not None:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.command_line import refuse
-from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, DAYS, KEY, KeysError, certificates, init, members
+from palpate_bus.security import DAYS
 
 app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
 
@@ -26,6 +26,8 @@ def make(
     days: Annotated[int, typer.Option(min=1, help="Validity of the certificates [days].")] = DAYS,
 ) -> None:
     """Make a certificate authority and a certificate for each role; valid ones are kept."""
+    from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, KEY, KeysError, init, members
+
     console = Console(stderr=True)
     for known in name or ():
         if known not in members():
@@ -51,6 +53,8 @@ def make(
 @app.command()
 def show(folder: Folder = DEFAULT) -> None:
     """List the certificates of a folder, their expiry and fingerprints."""
+    from palpate_bus.security.keys import KeysError, certificates
+
     try:
         found = certificates(folder)
     except KeysError as error:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from palpate.live import graph
-from palpate.live.connection import AsJson, ChosenRun, Connect, Domain, joined
-from palpate.live.console import command, console, print_json, table
-from palpate_bus.contract import contract
+from palpate.live.options import AsJson, ChosenBus, ChosenRun, Connect, Domain
 
 app = typer.Typer(help="Nodes on a live bus.", no_args_is_help=True)
 
@@ -20,7 +17,12 @@ def _group() -> None:
 @app.command("list")
 def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the nodes on the bus, with what each publishes and subscribes to, and the roles that are missing."""
-    with command(), joined(connect, run, domain) as bus:
+    from palpate.live import graph
+    from palpate.live.connection import command, joined
+    from palpate.live.console import console, print_json, table
+    from palpate_bus.contract import contract
+
+    with command(), joined(ChosenBus(connect, run, domain)) as bus:
         found = graph.present(bus)
         nodes, rules = graph.nodes(found), contract()
         absent = graph.missing(rules, found)
