@@ -13,6 +13,7 @@ from itertools import groupby
 from pathlib import Path
 
 from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -69,6 +70,16 @@ def recording_of(folder: Path) -> tuple[Path, ...]:
     """The MCAP files of the run in `folder`, in order; empty when there are none. A long recording has several."""
     files = (folder / "recording_mcap").glob("recording_mcap_*.mcap")
     return tuple(sorted(files, key=lambda path: int(path.stem.rpartition("_")[2])))
+
+
+def end_of(files: Sequence[Path]) -> int | None:
+    """The time of a recording's last message [ns]; None where its last file is not complete. Raises OSError."""
+    with files[-1].open("rb") as stream:
+        try:
+            summary = make_reader(stream).get_summary()
+        except _BROKEN:
+            return None
+    return None if summary is None or summary.statistics is None else summary.statistics.message_end_time
 
 
 def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import typer
 from dashboard_messages import run
 from mcap.writer import CompressionType, Writer
+from test_dashboard_browser import free_ports, wait_for
 from typer.testing import CliRunner
 
 from palpate.live.dashboard import dashboard
@@ -86,3 +89,22 @@ def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) 
     assert replay.main(tmp_path, heard.append) == tmp_path / FILE
     assert heard == sorted(heard)
     assert heard[-1] >= 0.9e9
+
+
+def test_the_end_of_a_recording_is_known_once_it_is_complete(tmp_path: Path) -> None:
+    path = record(tmp_path, 1.0)
+    last = max(time for time, _, _ in replay.messages((path,)))
+    assert replay.end_of((path,)) == last
+    path.write_bytes(path.read_bytes()[:-100])
+    assert replay.end_of((path,)) is None
+
+
+def test_a_recorded_run_is_served_to_the_browser(tmp_path: Path) -> None:
+    record(tmp_path, 0.5)
+    port = free_ports()
+    words = [sys.executable, "-m", "palpate", "dashboard", str(tmp_path), "--port", str(port)]
+    with subprocess.Popen(words, stderr=subprocess.DEVNULL) as process:
+        try:
+            wait_for(port + 1, process)
+        finally:
+            process.terminate()

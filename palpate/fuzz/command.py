@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from palpate.case_display import CaseDisplay
 from palpate.command_line import EXIT_FAILED, refuse
 
 
@@ -24,7 +25,8 @@ def fuzz(
         chosen = choose(names or [])
     except ValueError as error:
         refuse(error)
-    done = campaign(chosen, inputs, seed, lambda line: console.print(line, highlight=False))
+    with CaseDisplay(console, False, "targets") as display:
+        done = campaign(chosen, inputs, seed, display.tell)
     for find in done.finds:
         console.print(f"[red]{find.target}[/] {escape(find.error)}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
     rate = sum(done.inputs.values()) / done.seconds

@@ -84,11 +84,14 @@ def campaign(
     chosen: Sequence[FuzzTarget],
     inputs: int,
     seed: int = 0,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Callable[[int, int, str], None] = lambda *_: None,
     most: int = 100,
     slow_s: float = SLOW_S,
 ) -> FuzzCampaign:
-    """Runs `inputs` inputs, shared out among the targets. A target stops after `most` finds; one of each kind is kept."""
+    """Runs `inputs` inputs, shared out among the targets. A target stops after `most` finds; one of each kind is kept.
+
+    `tell` hears how many targets are done, how many there are, and what became of the last.
+    """
     done = FuzzCampaign(seed)
     begin = perf_counter()
     for index, target in enumerate(chosen):
@@ -112,7 +115,7 @@ def campaign(
                 break
         done.finds += mine
         done.inputs[target.name] = share
-        tell(f"{target.name}: {share} inputs, {found} finds")
+        tell(index + 1, len(chosen), f"{target.name}: {share} inputs, {found} finds")
     done.seconds = perf_counter() - begin
     return done
 

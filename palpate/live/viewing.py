@@ -6,14 +6,14 @@ import os
 import subprocess
 import tempfile
 import webbrowser
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from time import sleep
 
 from rich.console import Console
-from rich.status import Status
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from palpate_bus.runs.announcement import Run, live, matching
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
@@ -76,22 +76,25 @@ def recording(source: Path, console: Console) -> Path:
             raise NothingToShow(f"{scenario} is not there: a recording is drawn with its run's scenario.yaml, two folders up")
         target = Path(tempfile.mkdtemp(prefix="palpate-dashboard-")) / FILE
         drawn = DashboardService(load_scenario(str(scenario)), target, Live(), paced=False)
-        with _drawing(console) as status:
-            replay.replay((source,), drawn, _teller(status))
+        with _drawing(console, (source,)) as tell:
+            replay.replay((source,), drawn, tell)
         return target
-    if replay.recording_of(source):
-        with _drawing(console) as status:
-            return replay.main(source, _teller(status))
+    if files := replay.recording_of(source):
+        with _drawing(console, files) as tell:
+            return replay.main(source, tell)
     raise NothingToShow(f"{source}: neither a .rrd nor a .mcap file, nor the folder of a run that was recorded")
 
 
-def _drawing(console: Console) -> AbstractContextManager[Status | None]:
-    """A line that shows how far the drawing is, where there is a terminal."""
-    return console.status("drawing") if console.is_terminal else nullcontext()
-
-
-def _teller(status: Status | None) -> Callable[[int], None] | None:
-    return None if status is None else lambda t: status.update(f"drawing {t / 1e9:.0f} s")
+@contextmanager
+def _drawing(console: Console, files: Sequence[Path]) -> Iterator[Callable[[int], None] | None]:
+    """A bar with the time that the drawing still takes, where there is a terminal; gives what hears how far it is [ns]."""
+    if not console.is_terminal:
+        yield None
+        return
+    columns = (TextColumn("drawing"), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("drawing", total=replay.end_of(files))
+        yield lambda t: bar.update(task, completed=t)
 
 
 def view(recording: Path, port: int, native: bool, show: bool, console: Console) -> None:
@@ -112,7 +115,7 @@ def view(recording: Path, port: int, native: bool, show: bool, console: Console)
         "--server-memory-limit",
         MEMORY_LIMIT,
     ]
-    server = subprocess.Popen([*_rerun(str(recording)), "--serve-web", *ports, "--server-memory-limit", MEMORY_LIMIT])
+    server = subprocess.Popen([*_rerun(str(recording)), "--serve-web", *ports])
     try:
         status = server.wait()
     finally:
