@@ -18,6 +18,7 @@ from pathlib import Path
 
 import jupytext
 from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
 from nbconvert import MarkdownExporter
 from nbconvert.writers import FilesWriter
 
@@ -54,7 +55,14 @@ def carry_out(notebook: Path, into: Path) -> None:
     """Carries a notebook out, and writes it into the folder as a page with its pictures. Raises CellExecutionError."""
     cells = jupytext.read(ROOT / notebook)
     with tempfile.TemporaryDirectory(prefix="palpate-notebook-") as place:
-        NotebookClient(cells, timeout=1800, kernel_name="python3", resources={"metadata": {"path": place}}).execute()
+        try:
+            NotebookClient(cells, timeout=1800, kernel_name="python3", resources={"metadata": {"path": place}}).execute()
+        except CellExecutionError:
+            said = [
+                output["text"] for cell in cells.cells for output in cell.get("outputs", ()) if output.get("name") == "stderr"
+            ]
+            print(f"{notebook}: before its error it said:", *said, sep="\n", file=sys.stderr)  # such as why an examination failed
+            raise
     pictures = {"unique_key": notebook.stem, "output_files_dir": f"{notebook.stem}_files"}
     text, resources = MarkdownExporter().from_notebook_node(cells, resources=pictures)
     FilesWriter(build_directory=str(into)).write(text, resources, notebook_name=notebook.stem)

@@ -93,9 +93,24 @@ def run(  # noqa: PLR0913 - the options of a command
       palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
     """
     from palpate.command_line import refuse
+    from palpate.run.inputs import usable
+
+    unchanged = (scenario, out, seed, settings, services, repeat, overwrite) == (
+        DEFAULT_SCENARIO,
+        None,
+        None,
+        None,
+        None,
+        1,
+        False,
+    )
+    if resume is not None and not unchanged:
+        refuse("--resume DIR goes on with the examination of DIR: it takes neither a scenario nor what changes or places one")
+    chosen = None if resume is not None else usable(scenario, settings, seed, services)
+
+    # Only now, so that a mistake in the input is told a second sooner.
     from palpate.run.examine import How, examine, examine_again
     from palpate.run.examine import resume as go_on
-    from palpate.run.inputs import usable
 
     how = How(
         out=out,
@@ -115,13 +130,9 @@ def run(  # noqa: PLR0913 - the options of a command
         as_json=as_json,
         resume=resume,
     )
-    if resume is not None:
-        if (scenario, out, seed, settings, services, repeat, overwrite) != (DEFAULT_SCENARIO, None, None, None, None, 1, False):
-            refuse("--resume DIR goes on with the examination of DIR: it takes neither a scenario nor what changes or places one")
+    if chosen is None:
         go_on(how)
-        return
-    chosen = usable(scenario, settings, seed, services)
-    if repeat > 1:
+    elif repeat > 1:
         examine_again(chosen, how, repeat)
     else:
         examine(chosen, how)
