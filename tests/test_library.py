@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.py"))
 SMALL = {"region_m": [0.04, 0.04], "centre_m": [-0.055, -0.055]}
 REGION = {"region_m": [0.1, 0.1], "centre_m": [-0.055, -0.055]}
-"""As in GATE."""
+"""That of GATE."""
 LAZY = """
 import sys
 import palpate
@@ -216,8 +216,9 @@ def test_the_assessment_is_the_one_that_the_scenario_names() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_an_examination_is_that_of_the_command_line(composed: Finished, tmp_path: Path) -> None:
-    assert (*(f"exam.{name}={value}" for name, value in REGION.items()), "camera.frames=10") == GATE
-    made = palpate.run("clean", out=tmp_path / "made", record="none", exam=REGION, camera={"frames": 10}, quiet=True)
+    exam = {**REGION, "spacing_m": 0.02}
+    assert (*(f"exam.{name}={value}" for name, value in exam.items()), "camera.frames=10") == GATE
+    made = palpate.run("clean", out=tmp_path / "made", record="none", exam=exam, camera={"frames": 10}, quiet=True)
     assert made.report.run_hash == composed.report["run_hash"] is not None
 
 
