@@ -28,7 +28,7 @@ from palpate.search.population import SearchCase, case
 from palpate_models.frames import Array
 from palpate_search.maps import LAYERS, maps, shape
 from palpate_search.posterior import Posterior
-from palpate_search.presses import Budget, seconds
+from palpate_search.presses import Budget, Task, seconds
 
 ID: Final = "Palpate/Search-v0"
 TIME_COST: Final = 0.01
@@ -101,6 +101,16 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         budget = Budget(self._presses, hands.task.budget.seconds)
         self._posterior = Posterior(replace(hands.task, budget=budget), models=ONE_MODEL)
         self._history = np.zeros((self._presses, 5), dtype=np.float32)
+
+    @property
+    def task(self) -> Task:
+        """What is searched in this episode."""
+        return self._hand.task
+
+    @property
+    def posterior(self) -> Posterior:
+        """What is known in this episode."""
+        return self._posterior
 
     @property
     def maps_shape(self) -> tuple[int, int, int]:

@@ -1,5 +1,6 @@
 """Trains the policy `ppo`: `python -m palpate.search.learn`, for which `pip install 'palpate[learn]'`.
 
+First it imitates `informed` (behaviour cloning), since from nothing the reward did not rise; then it learns by itself, by
 Stable-Baselines3's proximal policy optimisation on `Palpate/Search-v0`. Actor and critic share the convolutions over the maps
 of what is known; the actor's last one gives each place and depth a logit: few weights are learned, and none belongs to a place.
 """
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 import typer
 from gymnasium import spaces
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -23,23 +25,30 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from torch import nn
 
 from palpate.search.environment import SearchEnv
+from palpate_search.choice import policy
 from palpate_search.maps import LAYERS
 
 WIDTH: Final = 16
 """Channels of the hidden layers."""
-PRESSES: Final = 30
+PRESSES: Final = 40
 """Of an episode."""
-PATIENTS: Final = 64
-"""Tuning patients that are met."""
+PATIENTS: Final = 100
+"""Tuning patients that are met: seeds from 0 on."""
 ENVIRONMENTS: Final = 8
 SETTINGS: Final[dict[str, Any]] = {
     "n_steps": 2 * PRESSES,
-    "batch_size": 240,
-    "n_epochs": 6,
-    "learning_rate": 2e-3,
+    "batch_size": 320,
+    "n_epochs": 4,
+    "learning_rate": 3e-4,
     "gamma": 0.98,
-    "ent_coef": 0.002,
+    "ent_coef": 0.0,
+    "target_kl": 0.03,
 }
+TEACHER: Final = "informed"
+ASTRAY: Final = 0.15
+"""Share of the teacher's presses that go to a random place: it shows how to go on from there, too."""
+PASSES: Final = 8
+"""Through all that the teacher showed."""
 
 
 class Presses(gymnasium.Env[NDArray[np.float32], int]):
@@ -50,7 +59,8 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
     def __init__(self, env: SearchEnv) -> None:
         self._env, self._shape = env, env.maps_shape
         self.observation_space = spaces.Box(-20.0, 20.0, self._shape, np.float32)
-        self.action_space: spaces.Space[Any] = spaces.Discrete(2 * self._shape[1] * self._shape[2])
+        self.choices = 2 * self._shape[1] * self._shape[2]
+        self.action_space: spaces.Space[Any] = spaces.Discrete(self.choices)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -67,6 +77,13 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
         observed, reward, over, cut, told = self._env.step(press)
         return observed["maps"], reward, over, cut, told
 
+    def shown(self) -> int:
+        """The action that the teacher would take."""
+        task, posterior = self._env.task, self._env.posterior
+        xy, depth = policy(TEACHER)(posterior, posterior.left(0.0))
+        place = int(np.argmin(np.linalg.norm(task.places - xy, axis=1)))
+        return place + len(task.places) * (depth > task.depth)
+
 
 class Network(nn.Module):
     """Maps to the actor's logits and to what the critic sees."""
@@ -75,7 +92,7 @@ class Network(nn.Module):
         super().__init__()
         layers, nx, ny = space.shape
         self.hidden = nn.Sequential(
-            nn.Conv2d(layers, WIDTH, 3, padding=1),
+            nn.Conv2d(layers, WIDTH, 5, padding=2),
             nn.Tanh(),
             nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
             nn.Tanh(),
@@ -140,16 +157,88 @@ class LearningCurve(BaseCallback):
         print(f"{self.num_timesteps:8d} presses, reward {self.rows[-1][1]:.2f}", flush=True)
 
 
+def lessons(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], float]:
+    """Of the teacher with each patient: maps (n, layers, nx, ny), its actions (n,), what came of them (n,), mean reward."""
+    env = Presses(SearchEnv(presses=PRESSES, patients=PATIENTS, maps=True))
+    seen: list[NDArray[np.float32]] = []
+    chosen: list[int] = []
+    returns: list[float] = []
+    total = 0.0
+    for patient in range(PATIENTS):
+        observed, _ = env.reset(options={"patient": patient})
+        rewards: list[float] = []
+        over = False
+        while not over:
+            seen.append(observed)
+            chosen.append(env.shown())
+            astray = rng.random() < ASTRAY
+            observed, reward, over, _, _ = env.step(int(rng.integers(env.choices)) if astray else chosen[-1])
+            rewards.append(reward)
+        total += sum(rewards)
+        to_come = 0.0
+        for k in reversed(range(len(rewards))):
+            to_come = rewards[k] = rewards[k] + SETTINGS["gamma"] * to_come
+        returns += rewards
+    return np.array(seen), np.array(chosen), np.array(returns, dtype=np.float32), total / PATIENTS
+
+
+def turned(maps: NDArray[np.float32], action: NDArray[np.int64], how: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The same of a mirrored or transposed patient, one of 8 ways: no direction differs from another in a square region."""
+    n, _, nx, ny = maps.shape
+    place = np.zeros((n, 2 * nx * ny), dtype=bool)
+    place[np.arange(n), action] = True
+    both = [maps, place.reshape(n, 2, nx, ny)]
+    for bit, axes in ((1, 2), (2, 3)):
+        if how & bit:
+            both = [np.flip(layers, axes) for layers in both]
+    if how & 4 and nx == ny:
+        both = [np.swapaxes(layers, 2, 3) for layers in both]
+    return np.ascontiguousarray(both[0]), both[1].reshape(n, -1).argmax(axis=1)
+
+
+def imitate(model: PPO, rng: np.random.Generator) -> float:
+    """Fits actor and critic to what the teacher shows; returns the teacher's mean reward."""
+    maps, actions, returns, reward = lessons(rng)
+    optimizer = torch.optim.Adam(model.policy.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, PASSES)
+    for k in range(PASSES):
+        losses = []
+        for batch in np.array_split(rng.permutation(len(maps)), len(maps) // 128):
+            some, action = turned(maps[batch], actions[batch], int(rng.integers(8)))
+            values, log_probability, _ = model.policy.evaluate_actions(torch.from_numpy(some), torch.from_numpy(action))
+            loss = -log_probability.mean() + 0.05 * ((values[:, 0] - torch.from_numpy(returns[batch])) ** 2).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(-float(log_probability.detach().mean()))
+        schedule.step()
+        print(f"pass {k + 1} of {PASSES}, loss {np.mean(losses):.3f}", flush=True)
+    return reward
+
+
+def drawn(rows: list[tuple[int, float]], teacher: float) -> Figure:
+    """Reward against presses."""
+    figure = Figure(figsize=(6, 3.2), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    axes.plot(*np.array(rows).T, label="mean of the latest 100 episodes")
+    axes.axhline(teacher, color="black", ls=":", label=f"the teacher, {100 * ASTRAY:.0f} % of whose presses go astray")
+    axes.set(xlabel="presses learned from after the imitation", ylabel="reward of an episode")
+    axes.legend(fontsize=8)
+    return figure
+
+
 def main(
-    presses: Annotated[int, typer.Option(min=1000, help="Presses to learn from.")] = 30_000,
+    presses: Annotated[int, typer.Option(min=1000, help="Presses to learn from.")] = 6_400,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     out: Annotated[Path, typer.Option("-o", "--out", help="Where the weights go.")] = Path("ppo.npz"),
-    curve: Annotated[Path, typer.Option(help="Where the training curve goes.")] = Path("ppo.csv"),
+    curve: Annotated[Path, typer.Option(help="Where the training curve goes.")] = Path("ppo.png"),
 ) -> None:
     """Train the policy on tuning patients."""
     torch.set_num_threads(1)
     many = VecMonitor(DummyVecEnv([lambda: Presses(SearchEnv(presses=PRESSES, patients=PATIENTS, maps=True))] * ENVIRONMENTS))
     model = PPO(PlacePolicy, many, seed=seed, device="cpu", policy_kwargs={"features_extractor_class": Whole}, **SETTINGS)
+    teacher = imitate(model, np.random.default_rng(seed))
+    print(f"teacher: reward {teacher:.2f}", flush=True)
     learning = LearningCurve()
     model.learn(presses, callback=learning)
     network: Any = model.policy.mlp_extractor
@@ -157,7 +246,7 @@ def main(
     arrays = {f"kernel{k}": layer.weight.detach().numpy() for k, layer in enumerate(layers)}
     arrays |= {f"bias{k}": layer.bias.detach().numpy() for k, layer in enumerate(layers) if layer.bias is not None}
     np.savez(out, **arrays)
-    np.savetxt(curve, learning.rows, fmt=("%d", "%.3f"), delimiter=",", header="presses,reward", comments="")
+    drawn(learning.rows, teacher).savefig(curve)
     assert layers[0].in_channels == LAYERS
     print(f"{out}: {sum(array.size for array in arrays.values())} weights")
 

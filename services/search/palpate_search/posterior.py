@@ -45,7 +45,7 @@ BONE_SD: Final = 0.27
 """... of bone, ..."""
 SURFACE_SHARE, STROKE_SHARE = 0.45, 0.75
 """... of what neighbouring presses' depths get wrong alike, and each by itself, of the uncertainty that is told; by maximum
-likelihood over healthy tuning patients: `python -m palpate.search.prior`."""
+likelihood over healthy tuning patients, by an earlier form of `palpate.search.prior`: docs/search.md says what it prints now."""
 ROUGH: Final = (0.75, 1.3)
 """Natural variation, of its usual amplitude."""
 WRONG: Final = (0.75, 1.3)
