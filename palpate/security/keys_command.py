@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.command_line import refuse
-from palpate_bus.security import DAYS
 
 app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
 
@@ -23,17 +22,19 @@ def make(
     folder: Folder = DEFAULT,
     host: Annotated[list[str] | None, typer.Option(help="Name or address of the router; may be repeated.")] = None,
     name: Annotated[list[str] | None, typer.Option(help="Members; by default all roles, router, viewer and operator.")] = None,
-    days: Annotated[int, typer.Option(min=1, help="Validity of the certificates [days].")] = DAYS,
+    days: Annotated[
+        int | None, typer.Option(min=1, help="Validity of the certificates in days; by default two years and three months.")
+    ] = None,
 ) -> None:
     """Make a certificate authority and a certificate for each role; valid ones are kept."""
-    from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, KEY, KeysError, init, members
+    from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, DAYS, KEY, KeysError, init, members
 
     console = Console(stderr=True)
     for known in name or ():
         if known not in members():
             refuse(f"--name {known}: members are {', '.join(members())}")
     try:
-        made = init(folder, name or (), host or (), days)
+        made = init(folder, name or (), host or (), days or DAYS)
     except (KeysError, OSError, ValueError) as error:
         refuse(error)
     for certificate in made:

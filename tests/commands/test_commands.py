@@ -45,7 +45,19 @@ def test_the_list_of_commands_imports_none_and_says_what_each_is_for() -> None:
 
 SLOW_TO_IMPORT = (
     *("casadi", "coal", "dartpy", "distributed", "fmpy", "jinja2", "matplotlib", "mcap", "mujoco", "numba", "ompl", "open3d"),
-    *("palpate_bus.contract", "pandas", "PIL", "pinocchio", "plotly", "pyarrow", "pydantic_settings", "rerun", "ruckig", "scipy"),
+    *(
+        "palpate_bus.contract",
+        "palpate_bus.messages",
+        "pandas",
+        "PIL",
+        "pinocchio",
+        "plotly",
+        "pyarrow",
+        "pydantic_settings",
+        "rerun",
+        "ruckig",
+        "scipy",
+    ),
     *("sklearn", "statsmodels", "trimesh"),
 )
 """Modules that take a command's help over half a second to import, one or two of them together."""

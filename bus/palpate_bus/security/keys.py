@@ -22,12 +22,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from palpate_bus.contract import contract
-from palpate_bus.security import DAYS
 from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER
 
 CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
 CA_KEY = "ca.key"
 CA_YEARS = 10
+DAYS = 825
+"""Days that a certificate holds unless said otherwise."""
 HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names under which a router is always known; others are given."""
 _SKEW = timedelta(minutes=5)
