@@ -51,7 +51,8 @@ class Search(Section):
 
     policy: str = "informed"
     """What chooses the next press: `informed`, `raster`, `random`, `latin-hypercube`, `expected-improvement`,
-    `upper-confidence-bound`, `straddle`, `garg-2016`, `yan-pan-2021`, or a Python file with `next_press(posterior, budget)`."""
+    `upper-confidence-bound`, `straddle`, `garg-2016`, `yan-pan-2021`, `ppo`, or a Python file with
+    `next_press(posterior, budget)`."""
     missed: Annotated[float, Field(gt=0, lt=1)] = 0.05
     """It is over when a lump that was not found is less probable than this, or the budget is spent."""
 

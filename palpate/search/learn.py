@@ -1,6 +1,6 @@
 """Trains the policy `ppo`: `python -m palpate.search.learn`, for which `pip install 'palpate[learn]'`.
 
-First it imitates `informed` (behaviour cloning), since from nothing the reward did not rise; then it learns by itself, by
+First it imitates `informed` (behaviour cloning), which is quicker than to begin from nothing; then it learns by itself, by
 Stable-Baselines3's proximal policy optimisation on `Palpate/Search-v0`. Actor and critic share the convolutions over the maps
 of what is known; the actor's last one gives each place and depth a logit: few weights are learned, and none belongs to a place.
 """

@@ -11,10 +11,12 @@ from scipy.ndimage import correlate
 
 from palpate_search.choice import PolicyError, policies, policy
 from palpate_search.policies.fixed import latin_hypercube, raster
-from palpate_search.policies.learned import convolved
+from palpate_search.policies.learned import convolved, ppo
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, Press, Task, seconds
 
+DECIDED = (0.05, 0.0)
+"""Where the learned policy presses next after four presses."""
 TASK = Task(centre=(0.03, -0.02), size=(0.12, 0.10), budget=Budget(24, 600.0))
 
 
@@ -58,6 +60,15 @@ def test_the_learned_policy_is_a_convolution_with_zeros_beyond_the_edge() -> Non
     layers, kernel, bias = rng.normal(size=(2, 6, 5)), rng.normal(size=(3, 2, 3, 3)), rng.normal(size=3)
     expected = [sum(correlate(a, k, mode="constant") for a, k in zip(layers, one, strict=True)) for one in kernel]
     np.testing.assert_allclose(convolved(layers, kernel, bias), np.array(expected) + bias[:, None, None])
+
+
+def test_the_learned_policy_decides_as_its_weights_do() -> None:
+    posterior = Posterior(TASK)
+    for x, y, force in ((0.0, -0.03, 4.0), (0.06, -0.03, 4.2), (0.05, 0.0, 9.0), (0.0, 0.01, 4.1)):
+        posterior.add(Press(x, y, TASK.depth, force, 3.0 * len(posterior.presses)))
+    place, depth = ppo(posterior, posterior.left(12.0))
+    np.testing.assert_allclose(place, DECIDED, atol=1e-9)
+    assert depth == TASK.deepest
 
 
 def test_ours_counts_the_way() -> None:
