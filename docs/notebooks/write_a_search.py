@@ -128,4 +128,4 @@ plt.show()
 #
 # Where to press next is a function of the map. Try another: the place where the apparent stiffness is greatest, a press and its
 # uncertainty together, or a line of a `slide` where a line tells more a second. Compare on patients that breathe:
-# `palpate.Patient("lump", seed=7)`. And say when to stop. [Search](../search.md) compares nine policies.
+# `palpate.Patient("lump", seed=7)`. And say when to stop. [Search](../search.md) compares ten policies.

@@ -72,7 +72,7 @@ def what_it_takes(exam: Exam, record: Record) -> str:
     """How long an examination takes and how much it writes, in words for its user."""
     seconds = expected_duration(exam)
     time = f"{seconds / _MINUTE_S:.0f} min" if seconds > 2 * _MINUTE_S else f"{seconds:.0f} s"
-    return f"about {time} of simulated time, and about {expected_mb(exam, record):.0f} MB of results (--record {record})"
+    return f"about {time} of simulated time, and up to {expected_mb(exam, record):.0f} MB of results (--record {record})"
 
 
 def megabytes_of(folder: Path) -> float:

@@ -43,9 +43,9 @@ def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, m
 
 def test_it_is_said_before_the_start_how_long_it_takes_and_how_much_it_writes() -> None:
     assert re.fullmatch(
-        r"about \d min of simulated time, and about \d\d MB of results \(--record normal\)", what_it_takes(Exam(), "normal")
+        r"about \d min of simulated time, and up to \d\d MB of results \(--record normal\)", what_it_takes(Exam(), "normal")
     )
-    assert what_it_takes(Exam(mode=Mode.POINT), "none").startswith("about 14 min of simulated time, and about 10 MB")
+    assert what_it_takes(Exam(mode=Mode.POINT), "none").startswith("about 14 min of simulated time, and up to 10 MB")
 
 
 def test_a_larger_region_and_points_take_longer() -> None:
