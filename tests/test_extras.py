@@ -13,6 +13,7 @@ from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -35,6 +36,7 @@ EXTRA_OF = {
     "palpate.search": "library",
     "palpate.search.environment": "learn-env",
     "palpate.search.learn": "learn",
+    "palpate.search.speed": "learn-env",
     "palpate.study": "study",
     "palpate_bus": BARE,
     "palpate_bus.recordings": "recordings",
@@ -170,7 +172,8 @@ def with_required(distributions: set[str]) -> set[str]:
         name = re.sub(r"[-_.]+", "-", left.pop()).lower()
         if name not in found:
             found.add(name)
-            left += [re.split(r"[^\w.-]", line)[0] for line in (requires(name) or ()) if "extra ==" not in line]
+            required = map(Requirement, requires(name) or ())
+            left += [line.name for line in required if line.marker is None or line.marker.evaluate({"extra": ""})]
     return found
 
 
