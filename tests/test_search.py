@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from examination import GATE, palpate_run
 
 import palpate
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import Trial, search
+from palpate.search.whole import told
 from palpate_search.choice import policy
 
 CENTRE = (0.04, -0.03)
@@ -64,3 +66,18 @@ def test_the_arm_presses_where_the_search_asks(tmp_path: Path) -> None:
     scores = report["scores"]
     assert (scores["matched"], scores["false_findings"]) == (1, 0)
     assert scores["place_error_m"] < 0.012
+
+
+def test_a_lump_that_was_missed_counts_as_the_whole_budget() -> None:
+    one = {"policy": "informed", "failure": None, "seconds": 120.0, "dice": 0.8, "max_force_N": 6.0, "false_findings": 0}
+    rows = pd.DataFrame(
+        [
+            {**one, "seed": 1, "lump": True, "found": True, "presses": 20, "place_error_m": 0.001},
+            {**one, "seed": 3, "lump": True, "found": False, "presses": 30, "place_error_m": np.nan},
+            {**one, "seed": 2, "lump": False, "found": False, "presses": 12, "place_error_m": np.nan, "false_findings": 1},
+        ]
+    )
+    said = "\n".join(told(rows))
+    assert "found 1 of 2" in said
+    assert "presses 60 (" in said
+    assert "no finding 0 of 1" in said

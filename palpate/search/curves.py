@@ -59,11 +59,11 @@ def outcomes(trials: pd.DataFrame, limits: pd.Series) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["policy", "seed", "lump", "said", "right", "presses", "seconds", "apart_m", "whole_s"])
 
 
-def _interval(values: Array, statistic: float, rng: np.random.Generator) -> tuple[float, float, float]:
+def in_words(values: Array, quantile: float, rng: np.random.Generator) -> str:
     """A quantile of values, and its 95 % interval."""
     drawn = values[rng.integers(0, len(values), (_BOOTSTRAPS, len(values)))]
-    low, high = np.quantile(np.quantile(drawn, statistic, axis=1), (0.025, 0.975))
-    return float(np.quantile(values, statistic)), float(low), float(high)
+    low, high = np.quantile(np.quantile(drawn, quantile, axis=1), (0.025, 0.975))
+    return _words((float(np.quantile(values, quantile)), float(low), float(high)), "{:.0f}")
 
 
 def _mean(values: Array, rng: np.random.Generator) -> tuple[float, float, float]:
@@ -85,7 +85,7 @@ def against_raster(found: pd.DataFrame) -> str:
     ratios = [_reached(ours[k], right[k].mean()) / whole for k in drawn]
     low, high = np.quantile(ratios, (0.025, 0.975), method="nearest")
     return (
-        f"the raster finds {_share(int(right.sum()), len(right))} in {whole:.0f} s; ours has found as many after "
+        f"the raster finds {share(int(right.sum()), len(right))} in {whole:.0f} s; ours has found as many after "
         f"{_words((_reached(ours, right.mean()) / whole, float(low), float(high)), '{:.2f}')} of that time"
     )
 
@@ -114,11 +114,11 @@ def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
         cells = [f"`{name}`"]
         for press in (10, 30):
             apart = there[(there.policy == name) & (there.press == press)].apart_m
-            cells.append(_share(int((apart <= NEAR_M).sum()), len(apart)))
-        cells += [f"{limits[str(name)]:.2f}", _share(k, n), _share(quiet, healthy)]
+            cells.append(share(int((apart <= NEAR_M).sum()), len(apart)))
+        cells += [f"{limits[str(name)]:.2f}", share(k, n), share(quiet, healthy)]
         values = ill.presses.to_numpy(dtype=float)
-        cells += [_words(_interval(values, q, rng), "{:.0f}") for q in (0.5, 0.9)]
-        cells.append(_words(_interval(ill.seconds.to_numpy(), 0.5, rng), "{:.0f}"))
+        cells += [in_words(values, q, rng) for q in (0.5, 0.9)]
+        cells.append(in_words(ill.seconds.to_numpy(), 0.5, rng))
         cells.append(_words(_mean(1.0 - values / found.presses.max(), rng), "{:.2f}"))
         both = ill.set_index("seed").presses
         pairs = np.log(both / ours.reindex(both.index)).dropna().to_numpy()
@@ -128,7 +128,8 @@ def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def _share(k: int, n: int) -> str:
+def share(k: int, n: int) -> str:
+    """A share, k of n, with its 95 % interval."""
     low, high = wilson(k, n)
     return f"{k} of {n}: {100 * k / max(n, 1):.0f} % ({100 * low:.0f} to {100 * high:.0f})"
 

@@ -1,0 +1,88 @@
+"""The whole system searches: the arm presses the patients of the study. `python -m palpate.search.whole` examines and prints.
+
+Each patient is examined by `palpate run --composed` with the pattern `search`, and what counts is what the examination reports:
+the findings of the assessment, scored as those of any scan. An examination that failed has found nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import pandas as pd
+import typer
+from rich.progress import track
+
+import palpate
+from palpate.search.curves import in_words, share
+from palpate.search.population import PRESSES, case
+from palpate_bus.messages.geometry import Array
+
+FILE: Final = "whole.csv"
+
+
+def examined(seed: int, name: str, folder: Path) -> dict[str, object]:
+    """A row: the patient of a seed, examined by the arm with the policy of a name."""
+    patient = case(seed)
+    scenario = palpate.scenario(patient.scenario, exam={"pattern": "search"}, search={"policy": name})
+    examination = palpate.run(scenario, out=folder / f"{seed}-{name}", overwrite=True, record="none", quiet=True)
+    report, facts = examination.report, examination.report.services["search"].facts
+    scores = report.scores
+    return {
+        "seed": seed,
+        "policy": name,
+        "lump": patient.centre is not None,
+        "failure": report.failure,
+        "found": bool(scores and scores.matched),
+        "false_findings": scores.false_findings if scores else 0,
+        "presses": facts["presses"],
+        "seconds": report.sim_time_s,
+        "place_error_m": scores.place_error_m if scores else None,
+        "dice": scores.dice if scores else None,
+        "max_force_N": report.max_force_N,
+    }
+
+
+def told(rows: pd.DataFrame) -> Iterator[str]:
+    """What came of the examinations, a line for each policy and kind of patient. Misses count as the whole budget of presses."""
+    rng = np.random.default_rng(0)
+    for name, mine in rows.groupby("policy"):
+        ill, healthy = mine[mine.lump], mine[~mine.lump]
+        presses: Array = np.where(ill.found, ill.presses, PRESSES).astype(float)
+        if len(ill):
+            middle, most = (in_words(presses, quantile, rng) for quantile in (0.5, 0.9))
+            found, false = share(int(ill.found.sum()), len(ill)), share(int((ill.false_findings > 0).sum()), len(ill))
+            yield f"{name}, with a lump: found {found}; with a false finding {false}; presses {middle}, 90 % {most}"
+            yield f"    seconds {in_words(ill.seconds.to_numpy(), 0.5, rng)}, off {1e3 * ill.place_error_m.median():.1f} mm"
+        if len(healthy):
+            quiet = share(int((healthy.false_findings == 0).sum()), len(healthy))
+            took = in_words(healthy.presses.to_numpy(dtype=float), 0.5, rng)
+            yield f"{name}, healthy: no finding {quiet}; presses {took}"
+        yield f"    failed: {int(mine.failure.notna().sum())} of {len(mine)}; highest force {mine.max_force_N.max():.1f} N"
+
+
+def main(
+    first_seed: Annotated[int, typer.Option(min=0, help="Of the patients; odd seeds have a lump.")] = 1000,
+    number: Annotated[int, typer.Option("-n", min=1, help="Patients.")] = 60,
+    names: Annotated[list[str] | None, typer.Option("--policy", help="These policies; by default ours.")] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder; what is there is not examined again.")] = Path(
+        "out/search-whole"
+    ),
+) -> None:
+    """Examine patients with the whole system, and say what it found."""
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / FILE
+    rows: list[Any] = pd.read_csv(file).to_dict("records") if file.exists() else []
+    known = {(row["seed"], row["policy"]) for row in rows}
+    wanted = [(seed, name) for seed in range(first_seed, first_seed + number) for name in names or ["informed"]]
+    for seed, name in track([key for key in wanted if key not in known], "examining"):
+        rows.append(examined(seed, name, out))
+        pd.DataFrame(rows).to_csv(file, index=False, float_format="%.6g")
+    frame = pd.DataFrame(rows)
+    print(f"{frame.seed.nunique()} patients", *told(frame), sep="\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)
