@@ -26,7 +26,9 @@ FILE: Final = "whole.csv"
 def examined(seed: int, name: str, folder: Path) -> dict[str, object]:
     """A row: the patient of a seed, examined by the arm with the policy of a name."""
     patient = case(seed)
-    scenario = palpate.scenario(patient.scenario, exam={"pattern": "search"}, search={"policy": name})
+    drawn = patient.scenario
+    exam, chosen = drawn.exam.model_copy(update={"pattern": "search"}), drawn.search.model_copy(update={"policy": name})
+    scenario = drawn.model_copy(update={"exam": exam, "search": chosen})
     examination = palpate.run(scenario, out=folder / f"{seed}-{name}", overwrite=True, record="none", quiet=True)
     report, facts = examination.report, examination.report.services["search"].facts
     scores = report.scores
