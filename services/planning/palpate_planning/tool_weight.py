@@ -50,11 +50,6 @@ class ToolWeight:
         self.tared = True
         self.bias = self._sum / self._count
 
-    @property
-    def readings(self) -> int:
-        """Number of readings that the bias is the mean of."""
-        return self._count
-
     def contact(self, R_WS: Array, wrench_S: Array, a_W: Array) -> Array:
         """Force [N] that the environment exerts on the tool, world axes, shape (3,).
 

@@ -53,7 +53,6 @@ def test_taring_averages_noise_out() -> None:
     R = np.diag((-1.0, 1.0, -1.0))
     for _ in range(300):
         tool.tare(R, reading(R, np.zeros(3), np.full(6, 0.5), 0.35, com) + rng.normal(0, 0.05, 6))
-    assert tool.readings == 300
     assert tool.bias == pytest.approx(np.full(3, 0.5), abs=0.012)
 
 

@@ -89,7 +89,6 @@ def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
         plant.step(torque, force, moment, NO_DAMPING)
         J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
         expected = pin.aba(model, data, q, v, torque + J.T @ np.concatenate((force, moment)))
-        np.testing.assert_allclose(plant.accelerations(), expected, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(plant.v, v + DT * expected, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(plant.q, q + DT * plant.v, rtol=1e-12, atol=1e-12)
 
@@ -111,7 +110,7 @@ def test_friction_is_implicit() -> None:
             M = pin.crba(model, data, q)
             M = np.triu(M) + np.triu(M, 1).T
             expected = np.linalg.solve(M + DT * np.diag(D), torque - h - D * v)
-            np.testing.assert_allclose(plant.accelerations(), expected, rtol=1e-8, atol=1e-8)
+            np.testing.assert_allclose(plant.v, v + DT * expected, rtol=1e-9, atol=1e-9)
 
 
 def test_gravity_torque_holds_the_arm_still() -> None:

@@ -202,10 +202,6 @@ class DartPlant:
             self._known = self._kinematics.state(self.q, self.v)
         return self._known
 
-    def accelerations(self) -> Array:
-        """Joint accelerations of the last step [rad/s^2], shape (7,)."""
-        return np.asarray(self._arm.getAccelerations())
-
     def kinetic_energy(self) -> float:
         """[J]."""
         return float(self._arm.computeKineticEnergy())

@@ -42,8 +42,6 @@ class PressedSlab:
     """Along the slab's outward normal, on the indenter."""
     displacement_m: Array
     """Inward displacement of every vertex, shape (n,)."""
-    vertex_force_n: Array
-    """On every vertex, inward, shape (n,)."""
     contact_radius_m: float
     """Radius of the circle that is as large as the area of the vertices in contact."""
 
@@ -100,7 +98,7 @@ class FlatSlab:
             force[free[near]] = solver.solve(held[near])[0]
             displacement[free] = self._matrix[:, near] @ force[free[near]]
         area = float(self.model.areas[force > 0].sum())
-        return PressedSlab(float(force.sum()), displacement, force, math.sqrt(area / math.pi))
+        return PressedSlab(float(force.sum()), displacement, math.sqrt(area / math.pi))
 
     def tissue(self, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3) -> ElasticTissue:
         """The same slab as a tissue that steps in time: `tissue.step(t_s, p_A, v_A, radius)` gives force and torque."""
