@@ -56,6 +56,10 @@ def run(  # noqa: PLR0913 - the options of a command
         Path | None,
         typer.Option("--resume", metavar="DIR", help="Go on with the run in DIR that broke off; the results go to DIR/resumed."),
     ] = None,
+    repeat: Annotated[
+        int,
+        typer.Option(metavar="N", min=1, help="Run N examinations, each with its own folder and seed; see soak.json."),
+    ] = 1,
     settings: Settings = None,
     services: ServiceChoices = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
@@ -91,13 +95,21 @@ def run(  # noqa: PLR0913 - the options of a command
     from palpate.command_line import refuse
     from palpate.run.inputs import usable
 
-    unchanged = (scenario, out, seed, settings, services, overwrite) == (DEFAULT_SCENARIO, None, None, None, None, False)
+    unchanged = (scenario, out, seed, settings, services, repeat, overwrite) == (
+        DEFAULT_SCENARIO,
+        None,
+        None,
+        None,
+        None,
+        1,
+        False,
+    )
     if resume is not None and not unchanged:
         refuse("--resume DIR goes on with the examination of DIR: it takes neither a scenario nor what changes or places one")
     chosen = None if resume is not None else usable(scenario, settings, seed, services)
 
     # Only now, so that a mistake in the input is told a second sooner.
-    from palpate.run.examine import How, examine
+    from palpate.run.examine import How, examine, examine_again
     from palpate.run.examine import resume as go_on
 
     how = How(
@@ -120,6 +132,8 @@ def run(  # noqa: PLR0913 - the options of a command
     )
     if chosen is None:
         go_on(how)
+    elif repeat > 1:
+        examine_again(chosen, how, repeat)
     else:
         examine(chosen, how)
 

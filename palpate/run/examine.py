@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.command_line import fail, refuse, say
+from palpate.command_line import EXIT_FAILED, fail, refuse, say
 from palpate.environment import given
 from palpate.report.archive import EvidenceError
 from palpate.report.resumption import Resumption, going_on, resumption
@@ -24,6 +25,7 @@ from palpate.run.placement import Groups, PlacementError, placement
 from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
+from palpate.run.repeat import repeat
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
@@ -116,6 +118,23 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
         refuse(error)
     except RunFailed as error:
         fail(error)
+
+
+def examine_again(scenario: Scenario, how: How, count: int) -> None:
+    """Runs so many examinations one after another, with seeds from the scenario's on; ends the command when one has failed."""
+    folder = how.out or usual_folder(scenario.name)
+
+    def once(number: int, own: Path) -> bool:
+        try:
+            examine(scenario.model_copy(update={"seed": scenario.seed + number - 1}), replace(how, out=own))
+        except typer.Exit as left:
+            if left.exit_code != EXIT_FAILED:
+                raise  # what cannot start once cannot start again
+            return False
+        return True
+
+    if failed := repeat(count, folder, once):
+        fail(f"{failed} of {count} examinations did not come to a good end")
 
 
 def _refuse_contradictions(scenario: Scenario, how: How) -> None:
