@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import yaml
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
 
 from palpate_bus.contract import Contract
 
@@ -148,3 +149,13 @@ def open_recording(path: Path) -> Recording:
     if not first:
         raise RecordingError(f"{path}: holds no message")
     return Recording(path, files, types, counts, thinned, min(first), max(last), scenario)
+
+
+BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
+"""What reading across a break raises: a short record, a chunk that does not decompress, a wrong checksum."""
+
+
+def complete_records(path: Path) -> Iterator[object]:
+    """Schemas, channels and messages of an MCAP file, in order, up to its end or to where it breaks. Raises OSError."""
+    with path.open("rb") as stream, suppress(*BROKEN):
+        yield from StreamReader(stream, validate_crcs=True).records

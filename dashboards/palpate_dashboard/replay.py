@@ -5,30 +5,26 @@ python -m palpate_dashboard.replay DIR            # writes DIR/recording.rrd fro
 
 from __future__ import annotations
 
-import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from heapq import heappop, heappush
 from itertools import groupby
 from pathlib import Path
 
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
+from palpate_bus.recordings import BROKEN, complete_records
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.load import load_scenario
 
 DISORDER = 2_000_000_000
 """Messages in a recording are at most so far out of order [ns]."""
-_BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
-"""What reading beyond the last complete chunk raises."""
 
 
 class RecordedInbox:
@@ -77,7 +73,7 @@ def end_of(files: Sequence[Path]) -> int | None:
     with files[-1].open("rb") as stream:
         try:
             summary = make_reader(stream).get_summary()
-        except _BROKEN:
+        except BROKEN:
             return None
     return None if summary is None or summary.statistics is None else summary.statistics.message_end_time
 
@@ -103,17 +99,11 @@ def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
 def _records(files: Sequence[Path], topics: Set[str]) -> Iterator[tuple[str, McapMessage]]:
     for path in files:
         names: dict[int, str] = {}
-        with path.open("rb") as stream:
-            records = StreamReader(stream).records
-            while True:
-                try:
-                    record = next(records)
-                except (StopIteration, *_BROKEN):
-                    break
-                if isinstance(record, Channel) and record.topic in topics:
-                    names[record.id] = record.topic.removeprefix("/")
-                elif isinstance(record, McapMessage) and record.channel_id in names:
-                    yield names[record.channel_id], record
+        for record in complete_records(path):
+            if isinstance(record, Channel) and record.topic in topics:
+                names[record.id] = record.topic.removeprefix("/")
+            elif isinstance(record, McapMessage) and record.channel_id in names:
+                yield names[record.channel_id], record
 
 
 def draw(source: Iterable[tuple[int, str, bytes]], service: DashboardService, tell: Callable[[int], None] | None = None) -> int:

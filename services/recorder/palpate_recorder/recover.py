@@ -7,7 +7,6 @@ writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken fi
 
 from __future__ import annotations
 
-import struct
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -17,29 +16,11 @@ from operator import attrgetter
 from pathlib import Path
 
 import yaml
-from mcap.exceptions import McapError
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Message, Schema
-from mcap.stream_reader import StreamReader
 
-from palpate_bus.recordings import KEPT_EVERY, RecordedMessage, Recording
+from palpate_bus.recordings import KEPT_EVERY, RecordedMessage, Recording, complete_records
 from palpate_recorder.bag import BagWriter, Channel
-
-_BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
-"""What reading across the break raises: a short record, a chunk that does not decompress, a wrong checksum."""
-
-
-def complete_records(path: Path) -> Iterator[object]:
-    """Schemas, channels and messages of an MCAP file, in order, up to its end or to where it breaks."""
-    with path.open("rb") as stream:
-        records = StreamReader(stream, validate_crcs=True).records
-        while True:
-            try:
-                yield next(records)
-            except StopIteration:
-                return
-            except _BROKEN:
-                return
 
 
 def recover(folder: Path) -> Path:
