@@ -28,14 +28,6 @@ def triples(flat: NDArray[Any]) -> NDArray[Any]:
     return flat.reshape(-1, 3)
 
 
-def depth_image(message: Message) -> NDArray[np.float32]:
-    """A 32FC1 image [m], shape (height, width). Raises ValueError for another encoding."""
-    if message.encoding != "32FC1":
-        raise ValueError(f"camera/depth/image_raw: encoding {message.encoding!r}, want 32FC1")
-    rows = np.asarray(message.data).reshape(message.height, message.step)[:, : 4 * message.width]
-    return np.ascontiguousarray(rows).view(">f4" if message.is_bigendian else "<f4").astype(np.float32, copy=False)
-
-
 def cloud(message: Message) -> NDArray[np.float32]:
     """The x y z of a PointCloud2 of 32-bit floats [m], shape (n, 3), without invalid points."""
     offsets = {field.name: field.offset for field in message.fields}

@@ -18,6 +18,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_matrix, transform_matrix
+from palpate_bus.messages.images import depth_in_metres
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.run_name import run_of
 from palpate_bus.service import Inbox, Outbox, Service
@@ -248,7 +249,7 @@ class DashboardService(Service):
         self._scene.lens(np.asarray(message.k).reshape(3, 3), message.width, message.height)
 
     def _depth(self, t: int, message: Message) -> None:
-        self._scene.depth(t, arrays.depth_image(message))
+        self._scene.depth(t, depth_in_metres("camera/depth/image_raw", message))
 
     def _points(self, t: int, message: Message) -> None:
         self._scene.cloud(t, arrays.cloud(message))

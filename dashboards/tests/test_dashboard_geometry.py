@@ -62,19 +62,6 @@ def test_a_cloud_with_padding_and_invalid_points() -> None:
     assert np.array_equal(arrays.cloud(message), packed)
 
 
-def test_depth_image_with_padded_rows_and_wrong_encoding() -> None:
-    message = look(0)["camera/depth/image_raw"]
-    plain = arrays.depth_image(message)
-    assert plain.shape == (480, 640)
-    rows = np.zeros((480, 2576), dtype=np.uint8)
-    rows[:, :2560] = np.asarray(message.data).reshape(480, 2560)
-    message.step, message.data = 2576, rows.ravel()
-    assert np.array_equal(arrays.depth_image(message), plain, equal_nan=True)
-    message.encoding = "16UC1"
-    with pytest.raises(ValueError, match="16UC1"):
-        arrays.depth_image(message)
-
-
 def test_viewer_setting() -> None:
     assert Live.parse("") == Live()
     assert Live.parse("serve") == Live(serve_port=9876)

@@ -25,7 +25,7 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_camera.backends.ros.convert import CameraError, depth_metres
+from palpate_camera.backends.ros.convert import CameraError
 from palpate_camera.backends.ros.service import CameraPort, RosCameraService, ZenohCamera
 from palpate_models.scenario import RosCamera
 
@@ -76,22 +76,6 @@ class Port(CameraPort):
 def asked(frames: int) -> HandInbox:
     """An inbox with a trigger for so many frames."""
     return HandInbox().put("planning/camera_trigger", CameraTrigger(header(0), frames))
-
-
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-@pytest.mark.parametrize("big_endian", [False, True])
-def test_depth_is_in_metres_with_nan_where_there_is_none(encoding: str, big_endian: bool) -> None:
-    image = ros_image(encoding, big_endian)
-    found = depth_metres(encoding, 2, 3, image.step, big_endian, image.data)
-    np.testing.assert_allclose(found, METRES, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("encoding", "step", "words"), [("rgb8", 11, "16UC1"), ("16UC1", 4, "too few"), ("32FC1", 12, "too few")]
-)
-def test_what_is_no_depth_image_is_named(encoding: str, step: int, words: str) -> None:
-    with pytest.raises(CameraError, match=words):
-        depth_metres(encoding, 2, 3, step, False, np.zeros(11, np.uint8))
 
 
 def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:

@@ -13,7 +13,6 @@ from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox
 from palpate_models.frames import Array
-from palpate_perception.fusion import Image
 from palpate_perception.tracker import Followed
 from palpate_perception.views import Intrinsics
 
@@ -29,25 +28,6 @@ def intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
     if info is None or X_WC is None:
         return None
     return Intrinsics(np.array(info.k, np.float64).reshape(3, 3), X_WC, (int(info.height), int(info.width)))
-
-
-def depth_in_metres(topic: str, message: Message) -> Image:
-    """Depth [m], shape (height, width), NaN where invalid, of a sensor_msgs/Image of encoding 32FC1 [m] or 16UC1 [mm].
-
-    Raises ValueError for another encoding, or data that does not fit the size.
-    """
-    kinds = {"32FC1": "f4", "16UC1": "u2"}
-    if message.encoding not in kinds:
-        raise ValueError(f"{topic}: encoding = {message.encoding!r}, want one of {sorted(kinds)}")
-    kind = np.dtype((">" if message.is_bigendian else "<") + kinds[message.encoding])
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    data = np.frombuffer(message.data, np.uint8)
-    if step < width * kind.itemsize or data.size != height * step:
-        raise ValueError(f"{topic}: {data.size} bytes for {height} rows of {step}, {width} pixels each")
-    raw = np.ascontiguousarray(data.reshape(height, step)[:, : width * kind.itemsize]).view(kind)
-    depth = raw.astype(np.float32) * np.float32(1.0 if kind.kind == "f" else 1e-3)
-    depth[~(depth > 0)] = np.nan
-    return depth
 
 
 def camera_pose(message: Message, frame: str) -> Array | None:

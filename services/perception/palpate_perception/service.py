@@ -10,6 +10,7 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.messages import PalpationTargets, Point, PointCloud2, PointField, SurfaceMesh, Vector3
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.images import depth_in_metres
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import Array
@@ -58,7 +59,7 @@ class PerceptionService(Service):
     def _follow(self, image: Message, inbox: Inbox) -> Message:
         """What a small image tells."""
         stamp, status = nanoseconds(image.header.stamp), inbox.latest("robot/status")
-        depth = messages.depth_in_metres("camera/follow/depth", image)
+        depth = depth_in_metres("camera/follow/depth", image)
         camera = messages.intrinsics(inbox, "camera/follow/camera_info", image)
         q = None if status is None else np.asarray(status.position, np.float64)
         return messages.motion(stamp, self._follower.take(stamp / NS, depth, camera, q))
@@ -122,7 +123,7 @@ class PerceptionService(Service):
             for image in burst.waiting[: burst.wanted - burst.fusion.frames]:
                 burst.wrong = burst.wrong or _disagreement(image, burst.camera)
                 if not burst.wrong:
-                    burst.fusion.add(messages.depth_in_metres(IMAGE, image))
+                    burst.fusion.add(depth_in_metres(IMAGE, image))
                     burst.stamps_s.append(nanoseconds(image.header.stamp) / NS)
             burst.waiting.clear()
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.interpolate import LinearNDInterpolator
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import CameraTrigger, Image, SurfaceMesh, SurfaceMotion, TFMessage, codec
+from palpate_bus.messages import CameraTrigger, SurfaceMesh, SurfaceMotion, TFMessage, codec
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
@@ -21,7 +21,6 @@ from palpate_models.patterns.lattice import lattice
 from palpate_models.phantom import PhantomModel, build_phantom
 from palpate_models.scenario import Scenario
 from palpate_perception import cloud, pattern, pipeline
-from palpate_perception.messages import depth_in_metres
 from palpate_perception.service import PerceptionService, create
 from palpate_perception.tracker import FORECAST_S
 
@@ -348,27 +347,6 @@ def test_an_image_that_camera_info_is_not_of_is_answered_in_words(larger: str) -
     assert len(targets.positions) == 0
     told = f"depth image is {width} x {height}, camera_info says {info.width} x {info.height}"
     assert targets.message == f"nothing seen: {told}"
-
-
-def image(encoding: str, data: np.ndarray, width: int, step: int, bigendian: int = 0) -> Any:
-    return Image(header(0, "c"), 2, width, encoding, bigendian, step, data.view(np.uint8).reshape(-1))
-
-
-def test_depth_in_metres_and_in_millimetres_with_padding_and_either_byte_order() -> None:
-    truth = np.array([[0.5, np.nan, 1.25], [2.0, 0.75, np.nan]])
-    metres = np.zeros((2, 4), "<f4")
-    metres[:, :3] = truth
-    metres[1, 2] = 0.0
-    np.testing.assert_array_equal(depth_in_metres("camera", image("32FC1", metres, 3, 16)), truth.astype(np.float32))
-    millimetres = np.nan_to_num(1000 * truth).astype(">u2")
-    np.testing.assert_allclose(depth_in_metres("camera", image("16UC1", millimetres, 3, 6, 1)), truth, rtol=1e-6)
-
-
-def test_a_strange_image_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="encoding = 'rgb8', want one of"):
-        depth_in_metres("camera", image("rgb8", np.zeros(18, np.uint8), 3, 9))
-    with pytest.raises(ValueError, match="18 bytes for 2 rows of 16, 3 pixels each"):
-        depth_in_metres("camera", image("32FC1", np.zeros(18, np.uint8), 3, 16))
 
 
 def test_forecasts_are_at_the_times_that_the_message_says() -> None:

@@ -12,10 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message, decode
+from palpate_bus.messages.images import depth_in_metres
 from palpate_bus.messages.stamps import time_message
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
@@ -77,8 +76,7 @@ class ReplayedCamera(Service):
         if self._small:
             return self._pair(t, self._small, self._ticks, (SMALL_IMAGE, SMALL_INFO))
         image, info = self._pair(t, self._frames, self._ticks, (IMAGE, INFO)).values()
-        depth = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)[:, : 4 * image.width].copy().view("<f4")
-        return messages.every_few(t, depth, messages.pinhole_of(info))
+        return messages.every_few(t, depth_in_metres(IMAGE, image), messages.pinhole_of(info))
 
     def _pair(self, t: int, pairs: list[_Pair], index: int, topics: tuple[str, str]) -> dict[str, Message]:
         image, info = (self._message(part) for part in pairs[index % len(pairs)])

@@ -11,13 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
+from palpate_bus.messages.images import depth_in_metres
 from palpate_bus.messages.stamps import header
 from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera import messages
-from palpate_camera.backends.ros.convert import CameraError, Depth, chain, depth_metres
+from palpate_camera.backends.ros.convert import CameraError, chain
 from palpate_camera.messages import FRAME
 from palpate_camera.pinhole import Pinhole
 from palpate_models.frames import Array
@@ -103,9 +104,9 @@ class RosCameraService(Service):
             return {}
         try:
             _agree(images[-1], info, self._frame)
-            depth = _depth(images[-1])
+            depth = depth_in_metres("depth image", images[-1])
             pinhole = _pinhole(info, rectified=self._port.rectified)
-        except CameraError as error:
+        except ValueError as error:
             self._facts["frames_rejected"] += 1
             self._problem = str(error)
             return {}
@@ -148,12 +149,6 @@ def _agree(image: Any, info: Any, frame: str) -> None:
             raise CameraError(f"{what} is in frame {named!r}, the pose is that of {frame!r}: set camera.ros.frame={named}")
     if (image.width, image.height) != (info.width, info.height):
         raise CameraError(f"depth image is {image.width} x {image.height}, camera_info says {info.width} x {info.height}")
-
-
-def _depth(image: Any) -> Depth:
-    return depth_metres(
-        image.encoding, int(image.height), int(image.width), int(image.step), bool(image.is_bigendian), np.asarray(image.data)
-    )
 
 
 def _pinhole(info: Any, *, rectified: bool) -> Pinhole:
