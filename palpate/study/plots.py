@@ -203,19 +203,20 @@ def errors(analysis: Analysis) -> str | None:
     _title(place, f"Place, n = {len(x)}")
     _bland_altman(size, e.radius, 1e3)
     plain(size, "estimated less true radius [mm]", "mean of both [mm]")
-    _title(size, f"Size, n = {e.radius.bias.n}")
+    _title(size, f"Size, n = {e.radius.figures.bias.n}")
     _bland_altman(ratio, e.log_ratio, 1.0)
     plain(ratio, "estimated over true ratio", "geometric mean of both")
     for axis in (ratio.xaxis, ratio.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{np.exp(value):.2f}"))
-    _title(ratio, f"Stiffness ratio, n = {e.log_ratio.bias.n}")
+    _title(ratio, f"Stiffness ratio, n = {e.log_ratio.figures.bias.n}")
     return _svg(figure)
 
 
 def _bland_altman(axes: Axes, agreement: Agreement, scale: float) -> None:
     many = len(agreement.mean) > MANY
     axes.plot(scale * agreement.mean, scale * agreement.difference, ".", ms=4, color=COLOURS[0], alpha=0.6, rasterized=many)
-    for line, style in ((agreement.bias, "-"), (agreement.lower, "--"), (agreement.upper, "--")):
+    found = agreement.figures
+    for line, style in ((found.bias, "-"), (found.lower, "--"), (found.upper, "--")):
         if line.value is not None:
             axes.axhline(scale * line.value, color=INK, lw=1.1, ls=style)
         if line.low is not None and line.high is not None:
@@ -231,7 +232,7 @@ def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> str | None:
     (axes,) = _axes(figure)
     for color, (name, calibrated) in zip(COLOURS, rows, strict=False):
         x, parts = zip(*calibrated.bins, strict=True)
-        slope = calibrated.slope.value
+        slope = calibrated.figures.slope.value
         label = name if slope is None else f"{name}: slope {slope:.2f}"
         _errorbar(axes, x, parts, color, label)
         axes.plot(x, [part.value for part in parts], color=color, lw=1)

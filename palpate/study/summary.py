@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.report.files import write_text
@@ -16,11 +16,12 @@ from palpate.study import human_line
 from palpate.study.page import render
 from palpate.study.spec import load_study, study_names
 from palpate.study.statistics.analysis import Analysis, analyse
+from palpate.study.statistics.calibration import CalibrationRow
 from palpate.study.statistics.comparison import Comparison, compare
 from palpate.study.statistics.detectability import Surface
 from palpate.study.statistics.effort import Spread
-from palpate.study.statistics.errors import Agreement
-from palpate.study.statistics.estimate import FOLDS, LEVEL, Estimate
+from palpate.study.statistics.errors import ErrorsRow
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Estimate, Row
 from palpate.study.statistics.rates import Rates
 from palpate.study.statistics.reading import Tables, TablesError, read_tables
 
@@ -28,11 +29,7 @@ JSON: Final = "study.json"
 PAGE: Final = "study.html"
 
 
-class _Row(BaseModel):
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
-
-
-class SurfaceRow(_Row):
+class SurfaceRow(Row, allow_inf_nan=False):
     """A psychometric surface over standardised covariates."""
 
     covariates: tuple[str, ...]
@@ -54,45 +51,7 @@ class SurfaceRow(_Row):
     """Radius [m] from which lumps are found with 90 %, by contrast (its quartiles), depth at its median."""
 
 
-class AgreementRow(_Row):
-    """Of estimated and true (Bland and Altman)."""
-
-    bias: Estimate
-    lower: Estimate
-    """Limits of agreement."""
-    upper: Estimate
-
-
-class ErrorsRow(_Row):
-    """Of the findings that match a lump."""
-
-    place_mean_m: Estimate
-    place_median_m: Estimate
-    place_p95_m: Estimate
-    size_mean: Estimate
-    """Area over the true area, less one."""
-    ratio_mean: Estimate
-    """Stiffness ratio over the true ratio, less one."""
-    radius_m: AgreementRow
-    """Of the radius of the circle of equal area."""
-    log_ratio: AgreementRow
-    """Of the natural logarithm of the stiffness ratio."""
-    ratio_held: Estimate
-    """Findings whose 90 % band holds the true ratio."""
-
-
-class CalibrationRow(_Row):
-    """Of the confidences."""
-
-    slope: Estimate
-    in_the_large: Estimate
-    expected_error: Estimate
-    expected_error_by_chance: float
-    """95 % of studies with right confidences have less."""
-    brier: Estimate
-
-
-class MethodRow(_Row):
+class MethodRow(Row):
     """All figures of one method."""
 
     rates: Rates
@@ -112,7 +71,7 @@ class MethodRow(_Row):
     coverage: dict[str, Estimate]
 
 
-class StudySummary(_Row):
+class StudySummary(Row):
     """study.json."""
 
     study: str
@@ -203,7 +162,6 @@ def command_of(study: str, splits: Sequence[str], patients: Mapping[str, int]) -
 
 
 def _method(a: Analysis) -> MethodRow:
-    e, c = a.errors, a.calibration
     return MethodRow(
         rates=a.rates,
         populations=a.populations,
@@ -213,32 +171,11 @@ def _method(a: Analysis) -> MethodRow:
         sensitivity_at_zero=None if a.froc is None else a.froc.at_zero,
         felt=None if a.felt is None else _surface(a.felt, "felt_contrast", "felt_radius_m"),
         made=None if a.made is None else _surface(a.made, "contrast", "radius_m"),
-        errors=ErrorsRow(
-            place_mean_m=e.place_mean,
-            place_median_m=e.place_median,
-            place_p95_m=e.place_p95,
-            size_mean=e.size_mean,
-            ratio_mean=e.ratio_mean,
-            radius_m=_agreement(e.radius),
-            log_ratio=_agreement(e.log_ratio),
-            ratio_held=e.ratio_held,
-        ),
-        calibration=None
-        if c is None
-        else CalibrationRow(
-            slope=c.slope,
-            in_the_large=c.in_the_large,
-            expected_error=c.expected_error,
-            expected_error_by_chance=c.by_chance,
-            brier=c.brier,
-        ),
+        errors=a.errors.figures,
+        calibration=None if a.calibration is None else a.calibration.figures,
         effort=a.effort,
         coverage=a.coverage,
     )
-
-
-def _agreement(a: Agreement) -> AgreementRow:
-    return AgreementRow(bias=a.bias, lower=a.lower, upper=a.upper)
 
 
 def _surface(s: Surface, contrast: str, radius: str) -> SurfaceRow:

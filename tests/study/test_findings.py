@@ -34,8 +34,8 @@ def _matched(n: int, seed: int = 0) -> Tables:
 
 def test_bias_and_limits_of_agreement() -> None:
     tables = _matched(400)
-    errors = finding_errors(tables.variants[0], tables.bootstrap)
-    for line, true in ((errors.radius.bias, 1e-3), (errors.radius.lower, 1e-3 - 0.98e-3), (errors.radius.upper, 1.98e-3)):
+    errors = finding_errors(tables.variants[0], tables.bootstrap).figures
+    for line, true in ((errors.radius_m.bias, 1e-3), (errors.radius_m.lower, 1e-3 - 0.98e-3), (errors.radius_m.upper, 1.98e-3)):
         assert line.value == pytest.approx(true, abs=1e-4)
         assert line.low is not None
         assert line.high is not None
@@ -43,7 +43,7 @@ def test_bias_and_limits_of_agreement() -> None:
         assert line.high - line.low < 3e-4
     assert errors.log_ratio.bias.value == pytest.approx(np.log(0.95), abs=0.005)
     assert errors.ratio_held.value == pytest.approx(0.8)
-    assert errors.place_mean.value == pytest.approx(0.003 * np.sqrt(np.pi / 2), rel=0.1)
+    assert errors.place_mean_m.value == pytest.approx(0.003 * np.sqrt(np.pi / 2), rel=0.1)
 
 
 def test_candidates_and_false_findings_are_no_matched_findings() -> None:
@@ -51,8 +51,8 @@ def test_candidates_and_false_findings_are_no_matched_findings() -> None:
     findings = tables.variants[0].findings.copy()
     findings.loc[findings.index[:10], "reported"] = False
     findings.loc[findings.index[10:15], "lump"] = -1
-    errors = finding_errors(replace(tables.variants[0], findings=findings), tables.bootstrap)
-    assert errors.place_mean.n == 15
+    errors = finding_errors(replace(tables.variants[0], findings=findings), tables.bootstrap).figures
+    assert errors.place_mean_m.n == 15
 
 
 def _areas(n: int, power: float, seed: int = 0) -> Tables:
@@ -72,25 +72,27 @@ def _areas(n: int, power: float, seed: int = 0) -> Tables:
 def test_confidences_that_are_right() -> None:
     held, less = 0, 0
     for seed in range(20):
-        found = calibration(_areas(200, 1.0, seed).variants[0], Bootstrap.draw(["lumps"] * 200, 80, seed))
-        assert found is not None
+        calibrated = calibration(_areas(200, 1.0, seed).variants[0], Bootstrap.draw(["lumps"] * 200, 80, seed))
+        assert calibrated is not None
+        found = calibrated.figures
         assert found.slope.low is not None
         assert found.slope.high is not None
         held += found.slope.low <= 1.0 <= found.slope.high
-        less += (found.expected_error.value or 0) < found.by_chance
-        assert sum(part.n for _, part in found.bins) == 400
+        less += (found.expected_error.value or 0) < found.expected_error_by_chance
+        assert sum(part.n for _, part in calibrated.bins) == 400
     assert held >= 16
     assert less >= 16
 
 
 def test_confidences_that_are_too_sure() -> None:
     tables = _areas(600, 2.0)
-    found = calibration(tables.variants[0], tables.bootstrap)
-    assert found is not None
+    calibrated = calibration(tables.variants[0], tables.bootstrap)
+    assert calibrated is not None
+    found = calibrated.figures
     assert found.slope.value == pytest.approx(0.5, abs=0.08)
     assert found.slope.high is not None
     assert found.slope.high < 0.8
-    assert (found.expected_error.value or 0) > 2 * found.by_chance
+    assert (found.expected_error.value or 0) > 2 * found.expected_error_by_chance
 
 
 def test_no_area_no_calibration() -> None:

@@ -12,7 +12,7 @@ from scipy.special import logit
 from sklearn.metrics import brier_score_loss
 
 from palpate.study.statistics.detectability import fit
-from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Estimate, bounded, estimate
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Estimate, Row, bounded, estimate
 from palpate.study.statistics.reading import Variant
 
 BINS: Final = 10
@@ -20,8 +20,7 @@ LEAST: Final = 1e-6
 """Confidences are kept this far from 0 and 1 before their log odds are taken."""
 
 
-@dataclass(frozen=True)
-class FindingCalibration:
+class CalibrationRow(Row):
     """Of findings and candidates together, or of the reported findings where a method publishes no candidates."""
 
     slope: Estimate
@@ -31,10 +30,17 @@ class FindingCalibration:
     expected_error: Estimate
     """Mean distance of hits from confidence over ten bins of equal number (Naeini et al., AAAI 2015). Resampling adds to it what
     chance makes of it; the interval is moved back by the mean of that."""
-    by_chance: float
+    expected_error_by_chance: float
     """95 % of studies have less of it with confidences that are right (Broecker and Smith, Weather Forecast 2007;22:651)."""
     brier: Estimate
     """Mean square of confidence less hit (Brier 1950)."""
+
+
+@dataclass(frozen=True)
+class FindingCalibration:
+    """The calibration of one method's confidences."""
+
+    figures: CalibrationRow
     bins: tuple[tuple[float, Estimate], ...]
     """Mean confidence and part of hits of each bin: the reliability diagram."""
 
@@ -57,14 +63,15 @@ def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | 
     error = float(_expected_error(p, hit, label, np.ones((1, len(p))))[0])
     errors = _expected_error(p, hit, label, drawn)
     errors = np.maximum(errors - np.nanmean(errors) + error, 0)
-    return FindingCalibration(
+    figures = CalibrationRow(
         slope=estimate(slope, slopes, len(p), "areas"),
         in_the_large=estimate(float(np.mean(hit - p)), gaps, len(p), "areas"),
         expected_error=estimate(error, errors, len(p), "areas"),
-        by_chance=_by_chance(p, label),
+        expected_error_by_chance=_by_chance(p, label),
         brier=estimate(float(brier_score_loss(hit, p, labels=[False, True])), squares, len(p), "areas"),
-        bins=tuple(_bin(p[label == i], hit[label == i], patient[label == i], bootstrap) for i in np.unique(label)),
     )
+    bins = tuple(_bin(p[label == i], hit[label == i], patient[label == i], bootstrap) for i in np.unique(label))
+    return FindingCalibration(figures, bins)
 
 
 def _bins(p: Array) -> NDArray[np.intp]:

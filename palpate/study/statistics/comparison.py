@@ -7,11 +7,10 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.weightstats import ttost_paired
 
-from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, estimate, percentiles, wilson
+from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, Row, estimate, percentiles, wilson
 from palpate.study.statistics.froc import froc
 from palpate.study.statistics.reading import Variant
 from palpate.study.statistics.roc import roc
@@ -41,10 +40,8 @@ COUNTED: Final = ("lumps_found", "false_findings")
 """Quantities of which equal values in every patient say no more than how rare unequal ones are."""
 
 
-class McNemar(BaseModel):
+class McNemar(Row):
     """Patients in whom two methods differ (McNemar, Psychometrika 1947;12:153), by the exact binomial test."""
-
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     only_reference: int
     """Right with the reference alone."""
@@ -56,10 +53,8 @@ class McNemar(BaseModel):
     p: float
 
 
-class Difference(BaseModel):
+class Difference(Row):
     """The other method less the reference, patient by patient."""
-
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     words: str
     unit: str
@@ -75,10 +70,8 @@ class Difference(BaseModel):
     """Whether the 90 % interval is within the margins; None where it is not known."""
 
 
-class Comparison(BaseModel):
+class Comparison(Row):
     """Another method against the reference, on the patients that both examined."""
-
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     reference: str
     other: str

@@ -5,20 +5,17 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from palpate.study.statistics.errors import Sample
-from palpate.study.statistics.estimate import Bootstrap, Estimate
+from palpate.study.statistics.estimate import Bootstrap, Estimate, Row
 from palpate.study.statistics.reading import Variant
 
 MEASURED: Final = ("peak_force_n", "exam_time_s", "depth_rms_m")
 COVERED: Final = ("coverage_area", "coverage_lumps", "coverage_ratio")
 
 
-class Spread(BaseModel):
+class Spread(Row):
     """One value of each examination that came to its end."""
-
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     mean: Estimate
     median: Estimate

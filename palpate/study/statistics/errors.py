@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.study.statistics.estimate import Array, Bootstrap, Estimate, bounded, estimate
+from palpate.study.statistics.estimate import Array, Bootstrap, Estimate, Row, bounded, estimate
 from palpate.study.statistics.reading import Variant
 
 NORMAL: Final = 1.959964
@@ -40,6 +40,36 @@ class Sample:
         return estimate(value, bootstrap.quantile(self.values, self.patient, q), len(self.values), "findings")
 
 
+class AgreementRow(Row):
+    """Agreement of estimated and true."""
+
+    bias: Estimate
+    """Mean difference."""
+    lower: Estimate
+    """Limits of agreement, bias less and plus 1.96 standard deviations: 95 % of the differences, were they normal."""
+    upper: Estimate
+
+
+class ErrorsRow(Row):
+    """Of the reported findings that match a lump."""
+
+    place_mean_m: Estimate
+    """Distance of the centres."""
+    place_median_m: Estimate
+    place_p95_m: Estimate
+    """95 % of the findings have less."""
+    size_mean: Estimate
+    """Area over the true area, less one."""
+    ratio_mean: Estimate
+    """Stiffness ratio over the true ratio, less one."""
+    radius_m: AgreementRow
+    """Of the radius of the circle of equal area."""
+    log_ratio: AgreementRow
+    """Of the natural logarithm of the stiffness ratio."""
+    ratio_held: Estimate
+    """Findings whose 90 % band of the ratio holds the true one."""
+
+
 @dataclass(frozen=True)
 class Agreement:
     """Estimated against true (Bland and Altman, Lancet 1986;1:307): differences against means."""
@@ -48,11 +78,7 @@ class Agreement:
     """Of estimated and true, shape (m,)."""
     difference: Array
     """Estimated less true."""
-    bias: Estimate
-    """Mean difference."""
-    lower: Estimate
-    """Limits of agreement, bias less and plus 1.96 standard deviations: 95 % of the differences, were they normal."""
-    upper: Estimate
+    figures: AgreementRow
 
 
 @dataclass(frozen=True)
@@ -61,20 +87,11 @@ class FindingErrors:
 
     place_m: Sample
     """Distance of the centres."""
-    place_mean: Estimate
-    place_median: Estimate
-    place_p95: Estimate
-    """95 % of the findings have less."""
-    size_mean: Estimate
-    """Area over the true area, less one."""
-    ratio_mean: Estimate
-    """Stiffness ratio over the true ratio, less one."""
     radius: Agreement
     """Radius of the circle of the finding's area [m]."""
     log_ratio: Agreement
     """Natural logarithm of the stiffness ratio."""
-    ratio_held: Estimate
-    """Findings whose 90 % band of the ratio holds the true one."""
+    figures: ErrorsRow
 
 
 def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
@@ -99,17 +116,19 @@ def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
     held, place = sample(inside), sample(column("place_error_m"))
     patients = len(np.unique(held.patient))
     share = float(held.values.mean()) if len(held.values) else np.nan
-    return FindingErrors(
-        place_m=place,
-        place_mean=place.mean(bootstrap),
-        place_median=place.quantile(0.5, bootstrap),
-        place_p95=place.quantile(0.95, bootstrap),
+    radius = agreement(np.sqrt(area / np.pi), np.sqrt(area_true / np.pi), patient, bootstrap)
+    log_ratio = agreement(*logs, patient, bootstrap)
+    figures = ErrorsRow(
+        place_mean_m=place.mean(bootstrap),
+        place_median_m=place.quantile(0.5, bootstrap),
+        place_p95_m=place.quantile(0.95, bootstrap),
         size_mean=sample(size).mean(bootstrap),
         ratio_mean=sample(stiffness).mean(bootstrap),
-        radius=agreement(np.sqrt(area / np.pi), np.sqrt(area_true / np.pi), patient, bootstrap),
-        log_ratio=agreement(*logs, patient, bootstrap),
+        radius_m=radius.figures,
+        log_ratio=log_ratio.figures,
         ratio_held=bounded(share, held.mean_replicates(bootstrap), len(held.values), "findings", patients),
     )
+    return FindingErrors(place, radius, log_ratio, figures)
 
 
 def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstrap: Bootstrap) -> Agreement:
@@ -123,4 +142,4 @@ def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstra
     spreads = np.sqrt(np.maximum(second - first**2, 0) * n / max(n - 1, 1))
     middle = float(difference.mean()) if n else np.nan
     lower, upper = (estimate(middle + side * NORMAL * spread, first + side * NORMAL * spreads, n, "findings") for side in (-1, 1))
-    return Agreement(mean, difference, bias.mean(bootstrap), lower, upper)
+    return Agreement(mean, difference, AgreementRow(bias=bias.mean(bootstrap), lower=lower, upper=upper))

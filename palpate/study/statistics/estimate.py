@@ -21,10 +21,14 @@ FOLDS: Final = 1000
 """Resamplings of a bootstrap."""
 
 
-class Estimate(BaseModel):
-    """A figure with its 95 % interval; None where the data do not give it."""
+class Row(BaseModel):
+    """A part of study.json."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+
+class Estimate(Row):
+    """A figure with its 95 % interval; None where the data do not give it."""
 
     value: float | None
     low: float | None = None

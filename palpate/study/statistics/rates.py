@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from pydantic import BaseModel, ConfigDict
 from statsmodels.stats.rates import confint_poisson
 
-from palpate.study.statistics.estimate import LEVEL, Bootstrap, Estimate, bounded, estimate, wilson
+from palpate.study.statistics.estimate import LEVEL, Bootstrap, Estimate, Row, bounded, estimate, wilson
 from palpate.study.statistics.reading import Variant
 
 
-class Rates(BaseModel):
+class Rates(Row):
     """Of what the examination reports as a finding, without any threshold of ours."""
-
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     completed: Estimate
     """Cases that came to their end."""
