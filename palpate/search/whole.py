@@ -23,15 +23,18 @@ from palpate_bus.messages.geometry import Array
 FILE: Final = "whole.csv"
 
 
-def examined(seed: int, name: str, folder: Path) -> dict[str, object]:
-    """A row: the patient of a seed, examined by the arm with the policy of a name."""
+def examined(seed: int, name: str, folder: Path) -> dict[str, Any]:
+    """A row: the patient of a seed, examined by the arm with the policy of a name. What is in the folder is not done again."""
     patient = case(seed)
-    drawn = patient.scenario
-    exam, chosen = drawn.exam.model_copy(update={"pattern": "search"}), drawn.search.model_copy(update={"policy": name})
-    scenario = drawn.model_copy(update={"exam": exam, "search": chosen})
-    examination = palpate.run(scenario, out=folder / f"{seed}-{name}", overwrite=True, record="none", quiet=True)
-    report, facts = examination.report, examination.report.services["search"].facts
-    scores = report.scores
+    if (folder / "report.json").exists():
+        examination = palpate.Examination(folder)
+    else:
+        drawn = patient.scenario
+        exam, chosen = drawn.exam.model_copy(update={"pattern": "search"}), drawn.search.model_copy(update={"policy": name})
+        scenario = drawn.model_copy(update={"exam": exam, "search": chosen})
+        examination = palpate.run(scenario, out=folder, overwrite=True, record="none", quiet=True)
+    report, scores = examination.report, examination.report.scores
+    presses = report.services["search"]["facts"]["presses"]
     return {
         "seed": seed,
         "policy": name,
@@ -39,7 +42,7 @@ def examined(seed: int, name: str, folder: Path) -> dict[str, object]:
         "failure": report.failure,
         "found": bool(scores and scores.matched),
         "false_findings": scores.false_findings if scores else 0,
-        "presses": facts["presses"],
+        "presses": presses,
         "seconds": report.sim_time_s,
         "place_error_m": scores.place_error_m if scores else None,
         "dice": scores.dice if scores else None,
@@ -74,15 +77,9 @@ def main(
     ),
 ) -> None:
     """Examine patients with the whole system, and say what it found."""
-    out.mkdir(parents=True, exist_ok=True)
-    file = out / FILE
-    rows: list[Any] = pd.read_csv(file).to_dict("records") if file.exists() else []
-    known = {(row["seed"], row["policy"]) for row in rows}
     wanted = [(seed, name) for seed in range(first_seed, first_seed + number) for name in names or ["informed"]]
-    for seed, name in track([key for key in wanted if key not in known], "examining"):
-        rows.append(examined(seed, name, out))
-        pd.DataFrame(rows).to_csv(file, index=False, float_format="%.6g")
-    frame = pd.DataFrame(rows)
+    frame = pd.DataFrame([examined(seed, name, out / f"{seed}-{name}") for seed, name in track(wanted, "examining")])
+    frame.to_csv(out / FILE, index=False, float_format="%.6g")
     print(f"{frame.seed.nunique()} patients", *told(frame), sep="\n")
 
 
