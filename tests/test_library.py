@@ -202,6 +202,11 @@ def test_order_does_not_matter_and_few_touches_say_nothing() -> None:
     assert len(palpate.assess(touches[0]).findings) == 0
 
 
+def test_the_breath_hides_no_lump_from_a_hand_that_follows_it() -> None:
+    breathing = palpate.scenario("clean", exam=REGION, phantom={"breathing": {"kind": "deep"}})
+    assert palpate.assess(presses(palpate.Patient(breathing), 9)).findings.quadrant.tolist() == ["RLQ"]
+
+
 def test_the_assessment_is_the_one_that_the_scenario_names() -> None:
     own = str(ROOT / "docs/examples/threshold_assessment.py")
     found = palpate.assess(presses(palpate.Patient(palpate.scenario("clean", exam=REGION, services={"assessment": own})), 9))

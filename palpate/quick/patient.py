@@ -6,12 +6,13 @@
     ((100,), True)
 
 Everything is in the abdomen frame A: x to the patient's left, y to the head, z outward, from the umbilicus, where the patient
-truly lies. He breathes, guards and moves as the scenario says, and remembers what was pressed before.
+truly lies. He breathes, guards and moves as the scenario says, and remembers what was pressed before. The indenter follows the
+breath as the scenario's `exam.breathing` says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,8 +27,9 @@ from palpate_models.frames import Array, inverse, matrix
 from palpate_models.load import seen, true_pose, whole_scenario
 from palpate_models.motion import BodyMotion
 from palpate_models.patterns.lattice import stations
-from palpate_models.scenario import Exam, Scenario
+from palpate_models.scenario import Exam, Following, Scenario
 from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
+from palpate_planning.wall_watch import GATE_M
 
 PERIOD_S: Final = 0.010
 """Between two readings of the force, as of an examination's states."""
@@ -62,13 +64,20 @@ class Touch:
     normal: Array
     """Outward unit normals there, shape (n, 3)."""
     depth: Array
-    """How far the indenter's lowest point is below the skin at rest, at the end of expiration [m], shape (n,)."""
+    """How far the indenter's lowest point is below the skin where that would be untouched [m], shape (n,): lifted by the breath,
+    or with `exam.breathing: ignore` at the end of expiration, however the patient breathes."""
     force: Array
     """Along the outward normal [N], shape (n,)."""
     steady: NDArray[np.bool_]
-    """Whether the indenter is held, or slides, at the depth that was asked for, shape (n,)."""
+    """Whether the indenter is held, or slides, at the depth that was asked for, shape (n,); with `exam.breathing: gate` only
+    where the breath lifts the skin there by less than a millimetre."""
     seen: Seen
     """Who is touched, as he is seen."""
+
+    def __repr__(self) -> str:
+        (x, y, _), seconds = self.position[0], PERIOD_S * len(self.time)
+        deepest, most = 1e3 * self.depth.max(), self.force.max()
+        return f"Touch({len(self.time)} instants in {seconds:.2f} s from ({x:.3f}, {y:.3f}) m, {deepest:.1f} mm, {most:.1f} N)"
 
 
 class Patient:
@@ -114,6 +123,12 @@ class Patient:
         there = np.isfinite(places).all(axis=1)
         return Seen(seen(self.scenario, "exam"), places[there], normals[there])
 
+    @cached_property
+    def _follows(self) -> Callable[[Array], Array]:
+        """Which part of the breathing excursion the indenter follows at points [m], shape (n, 2) -> (n,)."""
+        share = self.tissue.model.breathing
+        return self.surface.between(np.zeros_like(share) if self.scenario.exam.breathing is Following.IGNORE else share)
+
     def stiffness(self, xy: Array) -> Array:
         """True foundation modulus k_w [N/m^3] at points [m], shape (p, 2) -> (p,); NaN off the body."""
         return np.asarray(self.surface.between(self.tissue.model.stiffness)(xy))
@@ -121,8 +136,10 @@ class Patient:
     def press(self, xy: Sequence[float] | Array, depth: float, speed: float, hold: float) -> Touch:
         """Presses at a place, along the inward normal, to `depth` [m] at `speed` [m/s], holds for `hold` [s], and lets go.
 
-        `xy`: metres from the umbilicus, shape (2,). Returns what was felt from the touch to the end of the hold. Raises
-        ValueError for a place off the body, and for a depth or speed beyond the scenario's `limits`.
+        Depth is from the skin as the breath lifts it, and speed is against it; with `exam.breathing: ignore` the indenter does
+        not follow, and depth is from the skin at the end of expiration. `xy`: metres from the umbilicus, shape (2,). Returns
+        what was felt from the touch to the end of the hold. Raises ValueError for a place off the body, and for a depth or
+        speed beyond the scenario's `limits`.
         """
         self._within_limits(depth, speed)
         if not 0 <= hold <= _LONGEST_HOLD_S:
@@ -196,14 +213,20 @@ class Patient:
         off = ~np.isfinite(places).all(axis=1)
         if off.any():
             raise ValueError(f"({xy[off][0, 0]:g}, {xy[off][0, 1]:g}) m is off the body: want metres from the umbilicus")
-        times, force = np.empty(len(xy)), np.empty(len(xy))
-        for k, (place, normal, depth) in enumerate(zip(places, normals, depths, strict=True)):
-            force[k] = self.move(place + (self.radius - depth) * normal) @ normal
+        shares = self._follows(xy)
+        times, force, lifted = np.empty(len(xy)), np.empty(len(xy)), np.empty(len(xy))
+        for k, (place, normal, depth, share) in enumerate(zip(places, normals, depths, shares, strict=True)):
+            lifted[k] = share * self.tissue.excursion(self.time + PERIOD_S)
+            force[k] = self.move(place + (self.radius - depth + lifted[k]) * normal) @ normal
             times[k] = self.time
         for height in _ramp(-float(depths[-1]), 0.0, _LIFT_MPS):
-            self.move(places[-1] + (self.radius + height) * normals[-1])
+            up = shares[-1] * self.tissue.excursion(self.time + PERIOD_S)
+            self.move(places[-1] + (self.radius + height + up) * normals[-1])
         self._p = None
-        return Touch(times, places, normals, depths, force, np.arange(len(depths)) >= descent, self.seen)
+        there = np.arange(len(depths)) >= descent
+        if self.scenario.exam.breathing is Following.GATE:
+            there &= np.abs(lifted) < GATE_M
+        return Touch(times, places, normals, depths, force, there, self.seen)
 
 
 def seen_lattice(exam: Exam) -> Array:

@@ -12,7 +12,7 @@ from palpate.quick.case import QuickCase, run_quick
 from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops, loop_errors
 from palpate.quick.examination import QuickExamination
 from palpate.quick.messages import collected
-from palpate.quick.patient import NoTissueError, Patient
+from palpate.quick.patient import NoTissueError, Patient, Touch
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
 
@@ -130,12 +130,22 @@ def test_it_remembers_and_forgets() -> None:
     assert again < other.press((0.03, 0.03), depth=0.010, speed=0.02, hold=0.5).force[-1] < first
 
 
-def test_breathing_is_felt() -> None:
-    forces = [
-        Patient(scenario(1, settings=("errors=none", f"phantom.breathing.kind={kind}"))).press((0.0, 0.0), 0.008, 0.02, 5.0).force
-        for kind in ("none", "quiet")
-    ]
-    assert np.ptp(forces[0][60:]) < 0.5 * np.ptp(forces[1][60:])
+def long_press(breath: str, following: str) -> Touch:
+    words = ("errors=none", f"phantom.breathing.kind={breath}", f"exam.breathing={following}")
+    return Patient(scenario(1, settings=words)).press((0.0, 0.0), 0.008, 0.02, 5.0)
+
+
+def test_breathing_is_felt_unless_the_indenter_follows_it() -> None:
+    still, ignored, followed = (long_press(*how).force for how in (("none", "follow"), ("deep", "ignore"), ("deep", "follow")))
+    assert np.ptp(still[60:]) < 0.5 * np.ptp(ignored[60:])
+    assert np.abs(followed - still).max() < 0.2 * still.max() < np.abs(ignored - still).max()
+    assert followed[0] < 0.1 < ignored[0]  # depth is from the skin where the breath has lifted it
+
+
+def test_a_gated_press_counts_at_the_end_of_expiration_alone() -> None:
+    gated, followed = long_press("deep", "gate"), long_press("deep", "follow")
+    assert np.array_equal(gated.force, followed.force)
+    assert 0 < gated.steady.sum() < followed.steady.sum()
 
 
 def test_a_tissue_without_a_copy_is_refused() -> None:
