@@ -1,7 +1,7 @@
 """Entry point of the `palpate` command: fixes the environment that makes results repeatable, then runs the command.
 
 Where the environment does not have the values of `FIXED` yet, the interpreter is started again with them, before anything heavy
-is imported.
+is imported. Ctrl-C while that goes on is kept until the command can tell of it.
 """
 
 from __future__ import annotations
@@ -12,14 +12,33 @@ import sys
 
 from palpate.environment import FIXED
 
+EXIT_INTERRUPTED = 130
+"""What a shell makes of a command that SIGINT ended, and what Typer leaves with then."""
+
 
 def main() -> None:
     """Runs the command in an environment that makes its runs repeatable."""
     if any(os.environ.get(name) != value for name, value in FIXED.items()):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # until the interpreter is up again
         os.execve(sys.executable, [sys.executable, "-m", "palpate", *sys.argv[1:]], {**os.environ, **FIXED})
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # `docker stop`, systemd: what Ctrl-C does
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         signal.signal(signal.SIGHUP, signal.default_int_handler)  # the terminal was closed
+    try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        _run()
+    except KeyboardInterrupt:
+        pass
+    except SystemExit as left:
+        if left.code != EXIT_INTERRUPTED:
+            raise
+    else:
+        return
+    print("palpate: interrupted", file=sys.stderr)
+    sys.exit(EXIT_INTERRUPTED)
+
+
+def _run() -> None:
     try:
         from palpate.commands import main as run  # noqa: PLC0415
     except ModuleNotFoundError as error:

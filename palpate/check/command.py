@@ -38,13 +38,13 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.check.rig import RigSettings
     from palpate.check.suites import SUITES
     from palpate.check.suites.tissue import STILL
-    from palpate.live.connection import command
+    from palpate.live.connection import refusing
     from palpate.live.console import EXIT_TROUBLE, print_json
     from palpate_bus.implementations import ChoiceError
     from palpate_bus.runs.joining import NoBus
     from palpate_models.load import ScenarioError, load_scenario
 
-    with command():
+    with refusing():
         if role not in SUITES:
             raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
         try:

@@ -7,6 +7,7 @@ import os
 import typer
 
 from palpate.check.live_rig import LiveRig
+from palpate.check.progress import CheckDisplay
 from palpate.check.report import ConformanceReport, Verdict
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
@@ -20,7 +21,9 @@ _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED
 
 def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceReport:
     """Checks an implementation in this process, in simulated time. Raises ChoiceError for one that there is not."""
-    return check(ServiceRig(implementations.create(role, choice, settings.scenario), settings))
+    rig, report = ServiceRig(implementations.create(role, choice, settings.scenario), settings), ConformanceReport(role)
+    with CheckDisplay(rig, report):
+        return check(rig, report)
 
 
 def check_live(
@@ -36,8 +39,9 @@ def check_live(
         try:
             with started(start, role, settings, where, domain):
                 rig.await_implementation(wait, report)
-                check(rig, report)
-                rig.finish(report)
+                with CheckDisplay(rig, report):
+                    check(rig, report)
+                    rig.finish(report)
         finally:
             rig.close()
     return report

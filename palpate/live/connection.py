@@ -24,12 +24,20 @@ FIND_S = 1.0
 
 
 @contextmanager
-def command() -> Iterator[None]:
-    """Wraps a command: no bus and bad input end it with a sentence and status 2, Ctrl-C with status 0."""
+def refusing() -> Iterator[None]:
+    """Wraps a command: no bus and bad input end it with a sentence and status 2."""
     try:
         yield
     except (NoBus, BusConfigError) as error:
         refuse(error)
+
+
+@contextmanager
+def command() -> Iterator[None]:
+    """As `refusing`, for a command that goes on until Ctrl-C, which ends it with status 0."""
+    try:
+        with refusing():
+            yield
     except KeyboardInterrupt:
         sys.stdout.flush()
         raise typer.Exit(0) from None

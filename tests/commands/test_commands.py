@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -126,3 +127,24 @@ def test_options_are_alike_everywhere(word: str) -> None:
             assert "-q" in options["--quiet"].opts, path
         for name, option in options.items():
             assert not re.search(r"\bms\b|[Mm]illisecond", option.help or ""), f"{path} {name}: times are in seconds"
+
+
+def test_ctrl_c_during_the_start_is_a_line() -> None:
+    """The signal is there before the interpreter is, and before the environment is fixed."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        started = subprocess.Popen([sys.executable, "-m", "palpate", "plan"], stderr=subprocess.PIPE, text=True)
+        started.send_signal(signal.SIGINT)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    _, said = started.communicate(timeout=60)
+    assert started.returncode in (130, -signal.SIGINT)  # a shell makes 130 of both
+    assert len(said.splitlines()) == 1
+
+
+def test_a_check_that_is_interrupted_has_not_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("palpate.check.perform.check_here", interrupted)
+    assert CliRunner().invoke(app_for("check"), ["check", "tissue", "--service", "winkler"]).exit_code == 130

@@ -15,10 +15,11 @@ from palpate.check.live_rig import LiveRig
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
-from palpate.check.suites import SUITES, check
+from palpate.check.suites import LASTS_S, SUITES, check
 from palpate.check.suites.tissue import STILL
 from palpate_bus.implementations import create, names
 from palpate_bus.messages import JointTorqueCommand, Point, Pose
+from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.load import load_scenario
@@ -39,8 +40,10 @@ def made(name: str) -> Service:
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in IMPLEMENTATIONS]
 )
 def test_an_implementation_of_ours_conforms(name: str) -> None:
-    report = check(ServiceRig(made(name), RigSettings(SCENARIO)))
+    rig = ServiceRig(made(name), RigSettings(SCENARIO))
+    report = check(rig)
     assert report.failed == []
+    assert rig.t / NS == pytest.approx(LASTS_S[rig.role.name], rel=0.25)
     assert report.passed
     assert len(report.results) > 10
 
