@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate_models import pattern_choice as choice
+from palpate_models.named_function import is_file
 from palpate_models.pattern_choice import PatternError
 from palpate_models.patterns.scan import Scan, scan_of
 from palpate_models.phantom import PhantomModel
@@ -39,7 +39,7 @@ def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
 def with_whole_path(scenario: Scenario) -> Scenario:
     """The scenario with a pattern's file by its absolute path: services have other working directories."""
     pattern = scenario.exam.pattern
-    if not choice.is_file(pattern):
+    if not is_file(pattern):
         return scenario
     exam = scenario.exam.model_copy(update={"pattern": str(Path(pattern).resolve())})
     return scenario.model_copy(update={"exam": exam})

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.frames import Array
-from palpate_models.pattern_choice import PatternError, load, told
+from palpate_models.pattern_choice import PATTERN, PatternError
 from palpate_models.scenario import Exam
 
 Surface = Callable[[Array], tuple[Array, Array]]
@@ -44,11 +44,11 @@ class Scan:
 
 def scan_of(exam: Exam, surface: Surface) -> Scan:
     """The scan that the examination's pattern makes. Raises PatternError for one that cannot be used, with what is wrong."""
-    function = load(exam.pattern)
+    function = PATTERN.load(exam.pattern)
     try:
         made = function(exam, surface)
     except Exception as error:
-        raise PatternError(told(exam.pattern, error)) from error
+        raise PatternError(PATTERN.told(exam.pattern, error)) from error
     if not isinstance(made, Scan):
         raise PatternError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan")
     lines = [np.asarray(line, dtype=np.float64) for line in made.lines]
