@@ -78,9 +78,9 @@ class Observation(NamedTuple):
     end: str = ""
     """Why the exam is to go home and end; given at one step only."""
     lost: tuple[str, ...] = ()
+    """Roles whose services are gone."""
     request: PressRequest | None = None
     """What the search asks for, at the step at which it came."""
-    """Roles whose services are gone."""
 
 
 @dataclass(slots=True)
