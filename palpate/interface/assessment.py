@@ -17,6 +17,7 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from palpate.exam_state import exam_state
 from palpate.quick.case import assess as have_assessed
 from palpate.quick.patient import PERIOD_S, Seen, Touch
 from palpate.report.evidence import map_of, samples_of
@@ -24,7 +25,7 @@ from palpate.report.results import finding_row, sample_columns
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import Map
 from palpate.run.composed import load_services
-from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
+from palpate_bus.messages import ExamState, SurfaceMesh
 from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
 from palpate_models.band import half_width
@@ -198,27 +199,18 @@ def _state(
     """`exam/state` at time `t` [ns], with depth [m] and force [N] as they are felt."""
     depth, force = felt
     touching = force > CONTACT_ON_N
-    return ExamState(
-        header=header(t, "world"),
-        phase=phase,
-        message="",
-        target_index=0,
-        target_count=0,
-        targets_skipped=0,
+    return exam_state(
+        t,
+        phase,
+        p_W,
+        n_W,
         in_contact=touching,
         steady=steady and touching,
-        force_limited=False,
-        view_blocked=False,
         depth_setpoint=depth,
         depth=depth,
         normal_force=force,
-        surface_point=Point(*p_W.tolist()),
-        surface_normal=Vector3(*n_W.tolist()),
-        end_tick=-1,
         depth_uncertainty=KNOWN_M,
-        wall_displacement=0.0,
         stroke=stroke,
-        patient_moved=False,
     )
 
 

@@ -6,9 +6,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from palpate.exam_state import exam_state
 from palpate.quick.examination import PeriodRow, QuickExamination
 from palpate.quick.patient import Patient
-from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, SurfaceMesh, Vector3
+from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, SurfaceMesh
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
@@ -47,27 +48,21 @@ def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected
 def _state(row: PeriodRow, phase: int, time: float, sigma: float) -> Any:
     """`exam/state`."""
     over = phase == ExamState.PHASE_ASSESS
-    return ExamState(
-        header=header(round(time * NS), "world"),
-        phase=phase,
-        message="",
+    return exam_state(
+        round(time * NS),
+        phase,
+        row.way.believed_W[row.at],
+        row.way.outward_W[row.at],
         target_index=row.way.target[row.at],
-        target_count=0,
-        targets_skipped=0,
         in_contact=row.touching and not over,
         steady=row.steady and not over,
         force_limited=row.limited,
-        view_blocked=False,
         depth_setpoint=row.setpoint,
         depth=row.depth,
         normal_force=row.force,
-        surface_point=Point(*row.way.believed_W[row.at]),
-        surface_normal=Vector3(*row.way.outward_W[row.at]),
-        end_tick=-1,
         depth_uncertainty=sigma,
         wall_displacement=row.followed,
         stroke=row.stroke,
-        patient_moved=False,
     )
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from palpate.check import shapes
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Rig
+from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
-from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
+from palpate_bus.messages import ExamState, SurfaceMesh
 from palpate_bus.messages.stamps import header
 from palpate_models.frames import Array, apply
 from palpate_models.load import exam_input
@@ -49,10 +50,20 @@ class PlayedScan:
         p_W, n_W = apply(self._X_WA, p_A)[0], (n_A @ self._X_WA[:3, :3].T)[0]
         depth = self._depth if scanning else -0.01
         force = FORCE_N * self.stiffness(x, y) if scanning else 0.0
-        return ExamState(
-            header(t, "world"), phase, "conformance check", 0, 1, 0, scanning, scanning, False, False, self._depth, depth, force,
-            Point(*map(float, p_W)), Vector3(*map(float, n_W)), -1, 0.0005, 0.0, 1, False,
-        )  # fmt: skip
+        return exam_state(
+            t,
+            phase,
+            p_W,
+            n_W,
+            target_count=1,
+            in_contact=scanning,
+            steady=scanning,
+            depth_setpoint=self._depth,
+            depth=depth,
+            normal_force=force,
+            depth_uncertainty=0.0005,
+            stroke=1,
+        )
 
     @staticmethod
     def stiffness(x: float, y: float) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Rig
+from palpate.exam_state import exam_state
 from palpate_bus.messages import ExamState, PalpationSample, Point, SearchRequest, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import header
@@ -29,10 +30,10 @@ class Play:
 
     def state(self, t: int) -> Any:
         """The state at `t` [ns]."""
-        return ExamState(
-            header(t, "world"), self.phase, "conformance check", self.over, 0, 0, False, False, False, False, -0.01, -0.01, 0.0,
-            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0005, 0.0, self.over, False,
-        )  # fmt: skip
+        over = self.over
+        return exam_state(
+            t, self.phase, target_index=over, stroke=over, depth_setpoint=-0.01, depth=-0.01, depth_uncertainty=0.0005
+        )
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

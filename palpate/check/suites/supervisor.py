@@ -8,8 +8,9 @@ import numpy as np
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, HeardMessage, Rig
+from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
-from palpate_bus.messages import ExamState, OperatorRequest, Point, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
+from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
 from palpate_bus.messages.stamps import header
 from palpate_models import lbr
 from palpate_models.frames import Array, apply, inverse
@@ -60,10 +61,7 @@ class PlayedArm:
         return RobotStatus(header(t), self.mode, cause, self.reason, self.q, self.qd, wrench, np.zeros(7), 0)
 
     def _exam(self, t: int) -> Any:
-        return ExamState(
-            header(t, "world"), ExamState.PHASE_SCAN, "conformance check", 0, 1, 0, False, False, False, False, 0.0, 0.0, 0.0,
-            Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0, 0.0, 0, False,
-        )  # fmt: skip
+        return exam_state(t, ExamState.PHASE_SCAN, target_count=1)
 
     def surface(self, t: int, depth: float) -> Any:
         """A level patch below which the sphere is `depth` [m]."""

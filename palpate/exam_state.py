@@ -1,0 +1,41 @@
+"""`exam/state` of an examination that planning does not conduct: a quick one, touches of one's own, a conformance check."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from palpate_bus.messages import ExamState, Point, Vector3
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import header
+
+AT_REST: Final[dict[str, Any]] = {
+    "message": "",
+    "target_index": 0,
+    "target_count": 0,
+    "targets_skipped": 0,
+    "in_contact": False,
+    "steady": False,
+    "force_limited": False,
+    "view_blocked": False,
+    "depth_setpoint": 0.0,
+    "depth": 0.0,
+    "normal_force": 0.0,
+    "end_tick": -1,
+    "depth_uncertainty": 0.0,
+    "wall_displacement": 0.0,
+    "stroke": 0,
+    "patient_moved": False,
+}
+"""Fields of an arm that touches nothing."""
+
+
+def exam_state(
+    t: int, phase: int, p_W: Iterable[float] = (0.0, 0.0, 0.0), n_W: Iterable[float] = (0.0, 0.0, 1.0), **fields: Any
+) -> Message:
+    """`palpation_msgs/ExamState` at `t` [ns] over a place p_W of the skin [m] with the outward normal n_W, each of three numbers.
+
+    Other fields than `fields` are `AT_REST`.
+    """
+    point, normal = Point(*map(float, p_W)), Vector3(*map(float, n_W))
+    return ExamState(header(t, "world"), phase=phase, surface_point=point, surface_normal=normal, **(AT_REST | fields))
