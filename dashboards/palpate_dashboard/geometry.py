@@ -57,24 +57,6 @@ def creased(
     return vertices[at[first]].astype(np.float32), index.reshape(-1, 3), normals[first].astype(np.float32)
 
 
-def level_lines(vertices: Array, triangles: Indices, values: Array, level: float) -> NDArray[np.float64]:
-    """Segments along which `values`, linear on each triangle, equal `level`; shape (k, 2, 3), in the vertices' frame [m]."""
-    above = values > level
-    count = above[triangles].sum(axis=1)
-    crossed = triangles[(count == 1) | (count == 2)]
-    if not len(crossed):
-        return np.empty((0, 2, 3))
-    alone = np.where(above[crossed].sum(axis=1) == 1, above[crossed].argmax(axis=1), (~above[crossed]).argmax(axis=1))
-    row = np.arange(len(crossed))
-    tip = crossed[row, alone]
-    ends = []
-    for step in (1, 2):
-        other = crossed[row, (alone + step) % 3]
-        share = (level - values[tip]) / (values[other] - values[tip])
-        ends.append(vertices[tip] + share[:, None] * (vertices[other] - vertices[tip]))
-    return np.stack(ends, axis=1).astype(np.float64)
-
-
 class Carry:
     """Carries values from the vertices of one mesh to the nearest ones of another, within a reach."""
 

@@ -26,7 +26,7 @@ from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, patient, plots, truth, words
 from palpate_dashboard.columns import Columns
 from palpate_dashboard.force_depth import ForceDepth, ForceDepthPlane
-from palpate_dashboard.geometry import VertexNormals, creased, level_lines
+from palpate_dashboard.geometry import VertexNormals, creased
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.map import MapView
 from palpate_dashboard.plots import Plots
@@ -36,6 +36,7 @@ from palpate_models import lbr, table
 from palpate_models.band import half_width
 from palpate_models.frames import apply, inverse
 from palpate_models.lbr_visual import visual_meshes
+from palpate_models.level_lines import level_lines
 from palpate_models.load import exam_input
 from palpate_models.scenario import Robot, Scenario
 

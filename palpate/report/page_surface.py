@@ -15,10 +15,14 @@ from palpate.report.evidence import map_of
 from palpate.report.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS
 from palpate_models.band import half_width
 from palpate_models.frames import Array
+from palpate_models.level_lines import level_lines
+from palpate_models.phantom.mesh import vertex_normals
 
 MAX_VERTICES = 65_535
 """The viewer's indices have 16 bits."""
 _UNKNOWN = 0.80
+ABOVE_SKIN_M = np.array((0.0, 0.0, 0.001))
+"""The findings' outline is drawn so far above the surface."""
 AXIS_M = 0.05
 """Length of the axes of the abdomen frame."""
 
@@ -37,7 +41,7 @@ class Layer:
 def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     """Layers and data of the viewer for a `palpation_msgs/StiffnessMap`; None when there is nothing to see."""
     mapped = map_of(message)
-    triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
+    triangles = np.asarray(message.triangles, dtype=np.int32).reshape(-1, 3)
     whole = mapped.scanned[triangles].all(axis=1)
     triangles = np.concatenate((triangles[whole], triangles[~whole]))
     if not mapped.scanned.any() or len(mapped.vertices) > MAX_VERTICES:
@@ -66,15 +70,16 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     add("force as height", relief, force, force_norm, FORCE_COLOURS, "{:.1f} N", False)
     top = Normalize(0.0, float(np.quantile(half[known], 0.995)), clip=True)
     add("uncertainty on the skin", shape, half, top, UNCERTAINTY_COLOURS, "± {:.0f} %", True)
+    outline = level_lines(shape, triangles, (mapped.finding >= 0).astype(np.float64), 0.5)
     data = {
         "radius": radius,
         "triangles": _text(triangles.astype(np.uint16)),
         **_labels(shape, known, middle),
-        "outline": _text(_outline(shape, triangles, mapped.finding >= 0)),
+        "outline": _text((outline + ABOVE_SKIN_M).astype(np.float32)),
         "layers": [
             {
                 "positions": _text(positions.astype(np.float32)),
-                "normals": _text(_normals(positions, triangles[: None if outlined else whole.sum()]).astype(np.float32)),
+                "normals": _text(vertex_normals(positions, triangles[: None if outlined else whole.sum()]).astype(np.float32)),
                 "colors": _text(np.round(255 * colors).astype(np.uint8)),
                 "outlined": outlined,
                 "corners": 3 * (len(triangles) if outlined else int(whole.sum())),
@@ -117,27 +122,3 @@ def _labels(shape: Array, known: NDArray[np.bool_], middle: Array) -> dict[str, 
 def _text(array: NDArray[Any]) -> str:
     little = array.astype(array.dtype.newbyteorder("<"))
     return base64.b64encode(np.ascontiguousarray(little).tobytes()).decode("ascii")
-
-
-def _normals(vertices: Array, triangles: NDArray[np.int64]) -> Array:
-    """Area-weighted vertex normals, not yet of unit length, shape (n, 3)."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, triangles[:, corner], np.cross(b - a, c - a))
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
-
-
-def _outline(vertices: Array, triangles: NDArray[np.int64], member: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Segments between the midpoints of edges that leave a finding, a little above the surface, shape (k, 2, 3)."""
-    count = member[triangles].sum(axis=1)
-    crossed = triangles[(count == 1) | (count == 2)]
-    if not len(crossed):
-        return np.empty((0, 2, 3), dtype=np.float32)
-    flags = member[crossed]
-    alone = np.where(flags.sum(axis=1) == 1, flags.argmax(axis=1), (~flags).argmax(axis=1))
-    rows = np.arange(len(crossed))
-    tip = vertices[crossed[rows, alone]]
-    ends = [(tip + vertices[crossed[rows, (alone + step) % 3]]) / 2 for step in (1, 2)]
-    raised = np.stack(ends, axis=1) + np.array((0.0, 0.0, 0.001))
-    return np.asarray(raised, dtype=np.float32)
