@@ -1,9 +1,15 @@
-"""A smooth belly that the suites show to perception and assessment: a paraboloid in the abdomen's frame."""
+"""What the suites show: a smooth belly, a paraboloid in the abdomen's frame, and a level square in world."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterable
 
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_bus.messages import SurfaceMesh
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import header
 from palpate_models.frames import Array
 
 CURVATURE = 2.0
@@ -23,14 +29,27 @@ def normals(x: Array, y: Array) -> Array:
     return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
 
 
-def mesh(half: float, pitch: float) -> tuple[Array, Array, Array]:
+def mesh(half: float, pitch: float) -> tuple[Array, Array, NDArray[np.uint32]]:
     """Vertices and normals, shape (n, 3), and triangles, shape (m, 3), of a square patch in the abdomen's frame."""
+    x, y, triangles = grid(half, pitch)
+    return np.column_stack((x, y, height(x, y))), normals(x, y), triangles
+
+
+def grid(half: float, pitch: float) -> tuple[Array, Array, NDArray[np.uint32]]:
+    """X and y of a square lattice about the origin, shapes (n,); its triangles, shape (m, 3), counter-clockwise from above."""
     axis = np.arange(-half, half + 1e-9, pitch)
     x, y = (part.ravel() for part in np.meshgrid(axis, axis))
-    index = np.arange(x.size).reshape(len(axis), len(axis))
+    index = np.arange(x.size, dtype=np.uint32).reshape(len(axis), len(axis))
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    triangles = np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d))))
-    return np.column_stack((x, y, height(x, y))), normals(x, y), triangles
+    return x, y, np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d))))
+
+
+def level(t: int, half: float, pitch: float, middle: Iterable[float]) -> Message:
+    """`palpation_msgs/SurfaceMesh` at `t` [ns] of a level square about `middle` in world [m]."""
+    x, y, triangles = grid(half, pitch)
+    vertices = np.column_stack((x, y, np.zeros_like(x))) + np.array(tuple(middle))
+    up = np.tile((0.0, 0.0, 1.0), x.size).astype(np.float32)
+    return SurfaceMesh(header(t, "world"), vertices.astype(np.float32).ravel(), up, triangles.ravel(), np.empty(0, np.float32))
 
 
 def depth_image(K: Array, X_AC: Array, shape: tuple[int, int], floor: float) -> Array:

@@ -9,8 +9,9 @@ import numpy as np
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import HeardMessage, Rig, Source
+from palpate.check.shapes import level
 from palpate_bus.contract import MS
-from palpate_bus.messages import CameraTrigger, SurfaceMesh
+from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.frames import Array
@@ -22,6 +23,7 @@ FRAME = "camera_depth_optical_frame"
 FRAMES = 5
 HALF = 0.15
 """Half the side of the plane [m]."""
+PITCH = 0.01
 TOLERANCE_M = 0.01
 
 
@@ -41,14 +43,7 @@ def depths(message: Any) -> Array:
 
 def plane(centre: Array) -> Source:
     """A level square about `centre`, in world."""
-    grid = np.linspace(-HALF, HALF, 31)
-    x, y = np.meshgrid(grid, grid)
-    vertices = np.column_stack((x.ravel() + centre[0], y.ravel() + centre[1], np.full(x.size, centre[2])))
-    index = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    triangles = np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d)))).astype(np.uint32)
-    flat, up = vertices.astype(np.float32).ravel(), np.tile((0.0, 0.0, 1.0), x.size).astype(np.float32)
-    return lambda t: SurfaceMesh(header(t, "world"), flat, up, triangles.ravel(), np.empty(0, np.float32))
+    return lambda t: level(t, HALF, PITCH, centre)
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

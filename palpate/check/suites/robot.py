@@ -184,6 +184,10 @@ def _holds(rig: Rig, heard: list[HeardMessage]) -> HeardMessage | None:
     return next((item for item in heard if item.message.mode == RobotStatus.MODE_SAFE_HOLD), None)
 
 
+def _how(hold: HeardMessage | None) -> str:
+    return "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+
+
 def _expiry(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     report.expect("a release and a command make it active", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
@@ -219,7 +223,7 @@ def _provoke(rig: Rig, report: ConformanceReport, what: str, torque: Any, cause:
     heard = rig.run(0.1, commanding(rig, torque))["robot/status"]
     heard += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
     hold = _holds(rig, heard)
-    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    got = _how(hold)
     report.expect(
         f"{what} makes it hold", hold is not None and hold.message.cause == cause, f"MODE_SAFE_HOLD, cause {cause}", got
     )
@@ -239,7 +243,7 @@ def _stop(rig: Rig, report: ConformanceReport) -> None:
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
     heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))["robot/status"]
     hold = _holds(rig, heard)
-    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    got = _how(hold)
     ok = hold is not None and hold.message.cause == RobotStatus.CAUSE_STOP_REQUESTED
     report.expect("an operator's stop makes it hold", ok, "MODE_SAFE_HOLD, CAUSE_STOP_REQUESTED", got)
 
@@ -248,7 +252,7 @@ def _emergency(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
     hold = _holds(rig, heard)
-    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    got = _how(hold)
     report.expect("the supervisor's emergency stop makes it hold", hold is not None, "MODE_SAFE_HOLD", got)
 
 
@@ -308,7 +312,7 @@ def _lost(rig: Rig, report: ConformanceReport) -> None:
     rig.lose("control")
     heard = rig.run(0.1 + rig.slack / 1e9, quiet(rig))["robot/status"]
     hold = _holds(rig, heard)
-    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    got = _how(hold)
     causes = (RobotStatus.CAUSE_COMMANDER_LOST, RobotStatus.CAUSE_COMMAND_EXPIRED)
     report.expect("the loss of control makes it hold", hold is not None and hold.message.cause in causes, "MODE_SAFE_HOLD", got)
 

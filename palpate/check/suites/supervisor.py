@@ -8,9 +8,10 @@ import numpy as np
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, HeardMessage, Rig
+from palpate.check.shapes import level
 from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
-from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
+from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench
 from palpate_bus.messages.stamps import header
 from palpate_models import lbr
 from palpate_models.frames import Array, apply, inverse
@@ -65,16 +66,8 @@ class PlayedArm:
 
     def surface(self, t: int, depth: float) -> Any:
         """A level patch below which the sphere is `depth` [m]."""
-        centre = tool_pose(self.q, self.robot)[:3, 3]
-        axis = np.linspace(-0.1, 0.1, 21)
-        x, y = (part.ravel() for part in np.meshgrid(axis, axis))
-        z = np.full_like(x, depth - self.robot.indenter_radius_m)
-        vertices = (centre + np.column_stack((x, y, z))).astype(np.float32)
-        normals = np.tile(np.array((0.0, 0.0, 1.0), np.float32), (len(x), 1))
-        index = np.arange(x.size, dtype=np.uint32).reshape(21, 21)
-        a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-        triangles = np.vstack((np.column_stack((a, b, c)), np.column_stack((a, c, d))))
-        return SurfaceMesh(header(t, "world"), vertices.ravel(), normals.ravel(), triangles.ravel(), np.empty(0, np.float32))
+        x, y, z = tool_pose(self.q, self.robot)[:3, 3]
+        return level(t, 0.1, 0.01, (x, y, z + depth - self.robot.indenter_radius_m))
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
