@@ -51,7 +51,7 @@ def test_nothing_to_show_says_what_to_do(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
     done = CliRunner().invoke(app, [])
     assert done.exit_code == 2
-    assert "no run is on: start one with `palpate run`" in done.output
+    assert "start one with `palpate run`, or give a results folder" in done.output
     done = CliRunner().invoke(app, [str(tmp_path / "nothing")])
     assert done.exit_code == 2
     assert "neither a .rrd nor a .mcap file" in done.output

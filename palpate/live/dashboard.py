@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import refuse
+from palpate.live.options import ChosenRun
 
 DEFAULT_PORT = 9876
 PICTURE_PX = (1500, 940)
@@ -23,9 +24,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
     ] = DEFAULT_PORT,
     native: Annotated[bool, typer.Option("--native", help="Use rerun's own window, not the browser.")] = False,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open the browser.")] = False,
-    chosen: Annotated[
-        str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")
-    ] = None,
+    chosen: ChosenRun = None,
     leave: Annotated[bool, typer.Option("--leave", help="End with the run; by default the picture stays until Ctrl+C.")] = False,
     picture: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Write a picture of a recorded run at the time --at; needs Chromium.")
@@ -40,7 +39,8 @@ def dashboard(  # noqa: PLR0913 - the options of a command
     While it shows a live run, keys in its terminal are an operator's controls: s soft stop (the arm retreats and waits),
     e emergency stop (the driver holds), r release.
     """
-    from palpate.live.viewing import NothingToShow, recording, the_run, view, watch
+    from palpate.live.viewing import NothingToShow, recording, view, watch
+    from palpate_bus.runs.joining import NoBus, named_runs
     from palpate_bus.settings import BusConfigError
     from palpate_dashboard.picture import NoPicture, film, take
     from palpate_models.load import ScenarioError
@@ -59,10 +59,11 @@ def dashboard(  # noqa: PLR0913 - the options of a command
             if film_file:
                 film(Path(source), film_file, port, PICTURE_PX, tell)
         elif source is None:
-            watch(the_run(chosen), port, native, show, leave, console)
+            run = named_runs(chosen, "or give a results folder, a .rrd or a .mcap file")[-1]
+            watch(run, port, native, show, leave, console)
         else:
             view(recording(Path(source), console), port, native, show, console)
-    except (NothingToShow, NoPicture, BusConfigError, ScenarioError, OSError, ValueError) as error:
+    except (NoBus, NothingToShow, NoPicture, BusConfigError, ScenarioError, OSError, ValueError) as error:
         refuse(error)
     except KeyboardInterrupt:
         raise typer.Exit from None

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-Named = Annotated[str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")]
+from palpate.live.options import ChosenRun
 
 
 def stop(
@@ -14,7 +14,7 @@ def stop(
     soft: Annotated[
         bool, typer.Option("--soft", help="Retreat along the normal and wait, instead of holding where it is.")
     ] = False,
-    run: Named = None,
+    run: ChosenRun = None,
 ) -> None:
     """Stop a run at once: the arm holds safely until `palpate release`. Without --run, every run on this machine stops."""
     from palpate.live.operator import request
@@ -25,7 +25,7 @@ def stop(
 def release(
     end: Annotated[bool, typer.Option("--end", help="End the examination: the arm goes home.")] = False,
     reason: Annotated[str, typer.Option(help="Why, for the record.")] = "palpate release",
-    run: Named = None,
+    run: ChosenRun = None,
 ) -> None:
     """Release a stop: the examination continues where it was, or with --end the arm goes home and the run ends."""
     from palpate.live.operator import request
@@ -33,14 +33,14 @@ def release(
     request("end" if end else "release", reason, run)
 
 
-def pause(run: Named = None) -> None:
+def pause(run: ChosenRun = None) -> None:
     """Pause simulated time, within half a simulated second. No safety stop: the arm does not retreat. Not with --wallclock."""
     from palpate.live.operator import request
 
     request("pause", "palpate pause", run)
 
 
-def resume(run: Named = None) -> None:
+def resume(run: ChosenRun = None) -> None:
     """Resume a paused run."""
     from palpate.live.operator import request
 
@@ -49,7 +49,7 @@ def resume(run: Named = None) -> None:
 
 def step(
     ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milliseconds.")] = 1,
-    run: Named = None,
+    run: ChosenRun = None,
 ) -> None:
     """Advance a paused run by some milliseconds."""
     from palpate.live.operator import request

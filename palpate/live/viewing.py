@@ -15,7 +15,7 @@ from time import sleep
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from palpate_bus.runs.announcement import Run, live, matching
+from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
 from palpate_dashboard import replay
 from palpate_dashboard.follow import follow
@@ -25,18 +25,7 @@ from palpate_models.load import load_scenario
 
 
 class NothingToShow(RuntimeError):
-    """No run and no recording. Says what to do."""
-
-
-def the_run(chosen: str | None) -> Run:
-    """The newest run that is on, or the newest that `chosen` names. Raises NothingToShow."""
-    found = matching(chosen)
-    if found:
-        return found[-1]
-    if runs := live():
-        names = ", ".join(f"{run.name} ({run.pid})" for run in runs)
-        raise NothingToShow(f"--run {chosen}: no run on this machine is called so; there are {names}")
-    raise NothingToShow("no run is on: start one with `palpate run`, or give a results folder, a .rrd or a .mcap file")
+    """Nothing that can be shown. Says what to do."""
 
 
 def watch(run: Run, port: int, native: bool, show: bool, leave: bool, console: Console) -> None:

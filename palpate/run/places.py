@@ -19,7 +19,8 @@ from palpate.command_line import refuse
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
-from palpate_bus.runs import announcement as runs
+from palpate_bus.runs.announcement import Run
+from palpate_bus.runs.joining import NoBus, named_runs
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.handover import ROLES
 
@@ -88,14 +89,14 @@ def write_places(out: Path, places: Mapping[str, ServicePlace]) -> None:
     (out / FILE).write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
 
 
-def read_places(run: runs.Run) -> dict[str, ServicePlace]:
+def read_places(run: Run) -> dict[str, ServicePlace]:
     """The places of a run; none when it started all its services itself and keeps no place."""
     file = Path(run.out) / FILE
     rows = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     return {role: ServicePlace(tuple(row["command"]), row["environment"], row["awaited"]) for role, row in rows.items()}
 
 
-def place_to_join(role: str, run: runs.Run) -> ServicePlace:
+def place_to_join(role: str, run: Run) -> ServicePlace:
     """The place of a role that `run` was told to leave out. Raises PlaceError when it was not."""
     awaited = {name: place for name, place in read_places(run).items() if place.awaited}
     if not awaited:
@@ -105,7 +106,7 @@ def place_to_join(role: str, run: runs.Run) -> ServicePlace:
     return awaited[role]
 
 
-def place_to_take(role: str, run: runs.Run) -> ServicePlace:
+def place_to_take(role: str, run: Run) -> ServicePlace:
     """The place of a service of `run` that may change hands. Raises PlaceError when it may not."""
     if role not in ROLES:
         raise PlaceError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
@@ -129,26 +130,17 @@ def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[st
     return ("python", "-m", f"palpate_{role}", word)
 
 
-def live_run(name: str | None) -> runs.Run:
-    """The newest live run, or the newest that `name` means. Raises PlaceError that names those there are."""
-    found = runs.matching(name)
-    if not found:
-        there = ", ".join(run.name for run in runs.live()) or "none"
-        raise PlaceError(f"no run{f' {name}' if name else ''} is on; on this machine: {there}")
-    return found[-1]
-
-
 def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
     """Replaces this process by another program; `environment` is added to this process's own."""
     program = sys.executable if command[0] == "python" else command[0]
     os.execvpe(program, [program, *command[1:]], {**os.environ, **environment})
 
 
-def enter(find: Callable[[str, runs.Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
+def enter(find: Callable[[str, Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
     """Becomes the process of the place that `find` finds in the run. Raises typer.Exit where there is none."""
     try:
-        place = find(role, live_run(run))
+        place = find(role, named_runs(run)[-1])
         command = command_for(role, place, service)
-    except (PlaceError, ChoiceError) as error:
+    except (NoBus, PlaceError, ChoiceError) as error:
         refuse(error)
     become(command, place.environment)

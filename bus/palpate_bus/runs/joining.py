@@ -41,19 +41,24 @@ class BusTarget:
 def find_all(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> list[BusTarget]:
     """Every bus that the user may mean, at least one. Raises NoBus, and BusConfigError for settings that cannot work."""
     settings = Settings.read()
-    named = settings.connect or settings.router or settings.zenoh_config
-    if connect or (chosen is None and named):
+    elsewhere = settings.connect or settings.router or settings.zenoh_config
+    if connect or (chosen is None and elsewhere):
         options = BusOptions(connect=tuple(connect)) if connect else BusOptions.from_settings(settings)
         return [BusTarget(options, settings.domain if domain is None else domain)]
-    found = matching(chosen)
-    if found:
-        return [BusTarget(run.options(), run.domain if domain is None else domain, run) for run in found]
+    found = named_runs(chosen, "or name a bus, for instance of containers: PALPATE_ROUTER=tcp/HOST:7447")
+    return [BusTarget(run.options(), run.domain if domain is None else domain, run) for run in found]
+
+
+def named_runs(chosen: str | None, otherwise: str = "") -> list[Run]:
+    """The runs of this machine that the user means, oldest first, at least one.
+
+    Raises NoBus; where no run is on at all, it says what can be done, and `otherwise`.
+    """
+    if found := matching(chosen):
+        return found
     if chosen is not None:
         raise NoBus(f"no run {chosen!r} is on; on are: {_names(live()) or 'none'}")
-    raise NoBus(
-        f"no run is on (looked in {folder()}); start one with `palpate run`, or name a bus, for instance of containers: "
-        "PALPATE_ROUTER=tcp/HOST:7447"
-    )
+    raise NoBus(f"no run is on (looked in {folder()}); start one with `palpate run`{f', {otherwise}' if otherwise else ''}")
 
 
 def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> BusTarget:
