@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
+
+from palpate.command_line import refuse
 
 if TYPE_CHECKING:
     from palpate_models.scenario import Scenario
 
-EXIT_BAD_INPUT = 2
 DENSE = 2000
 """Continuous states that a dense Jacobian can do: at this number it has 32 MB."""
 NAMES_CHECKED = 1000
@@ -23,11 +23,6 @@ NAMES_CHECKED = 1000
 MESHES = (".obj", ".stl", ".ply")
 
 app = typer.Typer(name="fmu", help="The abdomen as an FMU; FMUs of any kind looked at.", no_args_is_help=True)
-
-
-def _fail(console: Console, message: str) -> NoReturn:
-    console.print(f"[bold red]palpate:[/] {escape(message)}", highlight=False, soft_wrap=True)
-    raise typer.Exit(EXIT_BAD_INPUT)
 
 
 def _scenario(name: str, settings: list[str]) -> Scenario:
@@ -84,7 +79,7 @@ def build(
                 ),
             )
     except (ScenarioError, MeshError, ExportError, CompileError, ValueError, OSError) as error:
-        _fail(console, str(error))
+        refuse(error)
     if not quiet:
         places = ", ".join(names)
         console.print(f"{out}: FMI {fmi}.0, {out.stat().st_size / 1e6:.1f} MB, for {places}", highlight=False, soft_wrap=True)
@@ -115,7 +110,7 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
         with zipfile.ZipFile(file) as archive:
             places = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")})
     except Exception as error:
-        _fail(Console(stderr=True), f"{file}: not an FMU: {error}")
+        refuse(f"{file}: not an FMU: {error}")
     kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
     console.print(f"[bold]{description.modelName}[/] FMI {description.fmiVersion}, {', '.join(kinds)}", highlight=False)
     console.print(f"{description.description or ''}\nplatforms: {', '.join(places) or 'none (sources only)'}", highlight=False)
@@ -157,7 +152,7 @@ def simulate(
             probing = probe(fmu, at, depth, speed, hold) if abdomen else None
         names = () if probing else run_and_plot(file, out)
     except FmuError as error:
-        _fail(console, f"{error} (this machine is {native()})")
+        refuse(f"{error} (this machine is {native()})")
     if probing is None:
         console.print(f"{out}: {', '.join(names)}", highlight=False)
         return

@@ -6,56 +6,35 @@ Between a joint state and the torque that answers it there is then no transport 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Final
 
 from palpate_bus.implementations import create
 from palpate_bus.messages.codec import Message
 from palpate_bus.service import Inbox, Service
 from palpate_models.scenario import Scenario
 
+JOINTS: Final = "joint_states"
+SETPOINT: Final = "planning/setpoint"
+
 
 class _Inbox:
-    """Control's inbox: joint states from this process, set-points from the bus."""
+    """Control's inbox: joint states of `t` [ns] from here, the set-points since the state before, all else from the bus."""
 
-    def __init__(self) -> None:
-        self.t = 0
-        self.joints: Message | None = None
-        self.outer: Inbox | None = None
-
-    def _bus(self) -> Inbox:
-        assert self.outer is not None
-        return self.outer
+    def __init__(self, t: int, joints: Message, setpoints: list[Message], bus: Inbox) -> None:
+        self._t, self._joints, self._bus = t, joints, bus
+        self._new = {JOINTS: [joints], SETPOINT: setpoints}
 
     def latest(self, topic: str) -> Message | None:
-        return self.joints if topic == "joint_states" else self._bus().latest(topic)
+        return self._joints if topic == JOINTS else self._bus.latest(topic)
 
     def new(self, topic: str) -> Iterable[Message]:
-        return [self.joints] if topic == "joint_states" else self._bus().new(topic)
+        return self._new[topic] if topic in self._new else self._bus.new(topic)
 
     def stamp(self, topic: str) -> int | None:
-        return self.t if topic == "joint_states" else self._bus().stamp(topic)
+        return self._t if topic == JOINTS else self._bus.stamp(topic)
 
     def lost(self, role: str) -> bool:
-        return self._bus().lost(role)
-
-
-class _Kept:
-    """Set-points that came between two states of the arm, so that none is passed over."""
-
-    def __init__(self, outer: Inbox, setpoints: list[Message]) -> None:
-        self._outer, self._setpoints = outer, setpoints
-
-    def latest(self, topic: str) -> Message | None:
-        return self._outer.latest(topic)
-
-    def new(self, topic: str) -> Iterable[Message]:
-        return self._setpoints if topic == "planning/setpoint" else self._outer.new(topic)
-
-    def stamp(self, topic: str) -> int | None:
-        return self._outer.stamp(topic)
-
-    def lost(self, role: str) -> bool:
-        return self._outer.lost(role)
+        return self._bus.lost(role)
 
 
 class InnerLoop:
@@ -63,20 +42,16 @@ class InnerLoop:
 
     def __init__(self, control: Service) -> None:
         self._control = control
-        self._inbox = _Inbox()
         self._setpoints: list[Message] = []
 
     def listen(self, inbox: Inbox) -> None:
         """Keeps the tick's set-points; call it on every tick."""
-        self._setpoints.extend(inbox.new("planning/setpoint"))
+        self._setpoints.extend(inbox.new(SETPOINT))
 
     def command(self, t: int, inbox: Inbox, joints: Message) -> Any | None:
         """The torque command at `t` [ns] for these joint states."""
-        self._inbox.t, self._inbox.joints = t, joints
-        self._inbox.outer = _Kept(inbox, self._setpoints)
-        command = self._control.step(t, self._inbox)["control/joint_torque"]
-        self._setpoints = []
-        return command
+        setpoints, self._setpoints = self._setpoints, []
+        return self._control.step(t, _Inbox(t, joints, setpoints, inbox))["control/joint_torque"]
 
 
 def load_control(scenario: Scenario) -> Service:
