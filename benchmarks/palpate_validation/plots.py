@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from palpate_validation.check import Draw
@@ -34,6 +33,5 @@ def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.
     """Draws and writes a PNG; `size_in` [inch]. The folder must exist."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=size_in, layout="constrained")
-        FigureCanvasAgg(figure)
         draw(figure)
         figure.savefig(path, dpi=dpi, metadata={"Software": None})

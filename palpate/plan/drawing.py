@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from palpate.plan.prospect import Prospect
@@ -18,7 +17,6 @@ MM = 1e3
 def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospect) -> None:
     """Writes the picture: the body from above, its head at the top, its left to the right. Raises OSError."""
     figure = Figure(figsize=(8.5, 8.0), dpi=110, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     front = phantom.normals[:, 2] > 0.1
     x, y, z = phantom.vertices[front].T * MM

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -166,7 +165,6 @@ def draw_map(
         return
     drawing = Drawing(message, findings, truth)
     figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
-    FigureCanvasAgg(figure)
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)
     grid = figure.add_gridspec(2, 3)
     _draw_force(figure, grid, drawing, samples)

@@ -9,7 +9,6 @@ from typing import Final, Literal
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator, PercentFormatter
 
@@ -46,7 +45,6 @@ MANY: Final = 400
 
 def _figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), facecolor="none")
-    FigureCanvasSVG(figure)
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     return figure
 
