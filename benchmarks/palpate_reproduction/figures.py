@@ -8,14 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.report.archive import Evidence
-from palpate.report.figures import FORCE_COLOURS, INK, QUIET, STIFFNESS_COLOURS, Drawing, colour_bar, panel_title
+from palpate.report.figures import INK, QUIET, Drawing, colour_bar, panel_title
 from palpate.report.scoring import Truth
 from palpate_reproduction.render import Viewpoint, picture
 from palpate_reproduction.scene import Moment, Stage
@@ -118,16 +117,16 @@ def phases(path: Path, stage: Stage, shown: Sequence[tuple[str, Moment, bool]]) 
 def force_map(path: Path, evidence: Evidence, samples_xy: NDArray[np.float64]) -> None:
     """Figure 7: normal force over the surface, in the plane and in space."""
     drawing = Drawing(evidence.stiffness_map, evidence.findings, None)
-    norm = Normalize(0.0, float(drawing.force[drawing.map.scanned].max()))
+    layer = drawing.force_layer
     figure = _figure(10.5, 4.6)
     grid = figure.add_gridspec(1, 2)
     flat = figure.add_subplot(grid[0, 0])
-    image = drawing.plane(flat, drawing.force, FORCE_COLOURS, norm)
+    image = drawing.plane(flat, layer)
     flat.plot(samples_xy[:, 0] * 1e3, samples_xy[:, 1] * 1e3, ".", ms=1.4, color="white", alpha=0.5)
     panel_title(flat, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", f"{len(samples_xy)} samples (dots)")
-    colour_bar(figure, image, flat, "force [N]")
+    colour_bar(image, flat, layer.label)
     solid = figure.add_subplot(grid[0, 1], projection="3d")
-    drawing.space(solid, drawing.force, drawing.force, FORCE_COLOURS, norm, "force [N]")
+    drawing.space(solid, drawing.force, layer, layer.label)
     panel_title(solid, "b", "The same in 3-D", "height and colour are force")
     _save(figure, path)
 
@@ -142,15 +141,10 @@ def correlation(path: Path, evidence: Evidence, truth: Truth | None) -> float:
         raise ValueError("the run knows no truth to compare with")
     figure = _figure(10.5, 4.6)
     left, right = figure.subplots(1, 2)
-    norm = drawing.apparent_norm
-    image = drawing.plane(left, drawing.true, STIFFNESS_COLOURS, norm)
-    drawing.outlines(left, truth=True)
-    panel_title(left, "a", "The model", "true apparent stiffness; dashed: where the lump is felt, solid: finding")
-    colour_bar(figure, image, left, "[N]")
-    image = drawing.plane(right, drawing.map.apparent, STIFFNESS_COLOURS, norm)
-    drawing.outlines(right, truth=False, labels=True)
-    panel_title(right, "b", "The palpation", "estimated apparent stiffness; solid: finding")
-    colour_bar(figure, image, right, "[N]")
+    small = "true apparent stiffness; dashed: where the lump is felt, solid: finding"
+    drawing.panel(left, drawing.stiffness_layer(drawing.true), "a", "The model", small, truth=True)
+    small = "estimated apparent stiffness; solid: finding"
+    drawing.panel(right, drawing.stiffness_layer(drawing.map.apparent), "b", "The palpation", small, labels=True)
     _save(figure, path)
     known = drawing.map.scanned & np.isfinite(drawing.true)
     return float(np.corrcoef(np.log(drawing.true[known]), np.log(drawing.map.apparent[known]))[0, 1])

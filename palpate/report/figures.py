@@ -6,7 +6,7 @@ Seen from the front, the patient's head up: the patient's right is on the viewer
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,6 +25,7 @@ from palpate_models.frames import Array
 INK = "#1b2a33"
 QUIET = "#6b7a83"
 FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS = "viridis", "inferno", "cividis"
+WHERE_FELT = "dashed: where a lump is felt; solid: finding"
 _FINDING, _TRUE = "#18e0d0", "#ffffff"
 _SMALL = 8.5
 APPARENT = "force of the standard press"
@@ -35,6 +36,17 @@ def drawable(message: Any) -> bool:
     """Whether a `palpation_msgs/StiffnessMap` has a scanned triangle."""
     triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
     return bool(np.asarray(message.scanned, dtype=bool)[triangles].all(axis=1).any())
+
+
+class Layer(NamedTuple):
+    """A quantity over the map."""
+
+    values: Array
+    """At the nodes, shape (n,); NaN where it is not known."""
+    cmap: str
+    norm: Normalize
+    label: str
+    """Of its colour bar."""
 
 
 class Drawing:
@@ -69,8 +81,35 @@ class Drawing:
         values = np.concatenate(shown)
         return LogNorm(float(np.quantile(values, 0.002)), float(np.quantile(values, 0.998)))
 
-    def plane(self, axes: Axes, values: Array, cmap: str, norm: Normalize) -> ScalarMappable:
-        """The map seen from the front, with quadrants, where `values` are known."""
+    @property
+    def force_layer(self) -> Layer:
+        """Normal force at the common depth."""
+        norm = Normalize(0.0, float(self.force[self.map.scanned].max()))
+        return Layer(self.force, FORCE_COLOURS, norm, "force [N]")
+
+    @property
+    def spread_layer(self) -> Layer:
+        """Half width of the 90 % band of the apparent stiffness, over its middle."""
+        half = 100 * half_width(self.map.lower, self.map.upper)
+        norm = Normalize(0.0, float(np.quantile(half[self.map.scanned], 0.995)))
+        return Layer(half, UNCERTAINTY_COLOURS, norm, "± [%]")
+
+    def stiffness_layer(self, values: Array) -> Layer:
+        """Apparent stiffness [N], estimated or true."""
+        return Layer(values, STIFFNESS_COLOURS, self.apparent_norm, "[N]")
+
+    def panel(
+        self, axes: Axes, layer: Layer, letter: str, words: str, small: str, *, truth: bool = False, labels: bool = False
+    ) -> None:
+        """A quantity seen from the front, with the outlines of findings, a heading and a colour bar."""
+        image = self.plane(axes, layer)
+        self.outlines(axes, truth, labels)
+        panel_title(axes, letter, words, small)
+        colour_bar(image, axes, layer.label)
+
+    def plane(self, axes: Axes, layer: Layer) -> ScalarMappable:
+        """A quantity seen from the front, with quadrants, where it is known."""
+        values, cmap, norm, _ = layer
         known = np.isfinite(values)[self.triangles].all(axis=1)
         tri = Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles[known])
         image = axes.tripcolor(tri, np.nan_to_num(values), cmap=cmap, norm=norm, shading="gouraud", rasterized=True)
@@ -133,13 +172,13 @@ class Drawing:
             )
             contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
 
-    def space(self, axes: Any, height: Array, values: Array, cmap: str, norm: Normalize, label: str) -> None:
-        """The map as a surface in space: `height` above the xy plane, coloured by `values`."""
+    def space(self, axes: Any, height: Array, layer: Layer, label: str) -> None:
+        """The map as a surface in space: `height` above the xy plane, coloured by a quantity."""
         z = height.copy()
         surface = axes.plot_trisurf(Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles), z, linewidth=0)
-        surface.set_cmap(cmap)
-        surface.set_norm(norm)
-        surface.set_array(values[self.triangles].mean(axis=1))
+        surface.set_cmap(layer.cmap)
+        surface.set_norm(layer.norm)
+        surface.set_array(layer.values[self.triangles].mean(axis=1))
         surface.set_edgecolor("none")
         surface.set_antialiased(False)
         axes.view_init(elev=30, azim=-62)
@@ -174,38 +213,26 @@ def draw_map(
 
 
 def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -> None:
-    scanned = drawing.map.scanned
-    norm = Normalize(0.0, float(drawing.force[scanned].max()))
+    layer = drawing.force_layer
     flat = figure.add_subplot(grid[0, 0])
-    image = drawing.plane(flat, drawing.force, FORCE_COLOURS, norm)
     flat.plot(samples.position[:, 0] * 1e3, samples.position[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
-    drawing.outlines(flat, truth=False)
-    panel_title(flat, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm depth", f"{len(samples.time)} samples (dots)")
-    colour_bar(figure, image, flat, "force [N]")
+    depth_mm, count = drawing.depth * 1e3, len(samples.time)
+    drawing.panel(flat, layer, "a", f"Normal force at {depth_mm:.0f} mm depth", f"{count} samples (dots)")
     solid = figure.add_subplot(grid[0, 1], projection="3d")
-    drawing.space(solid, drawing.force, drawing.force, FORCE_COLOURS, norm, "force [N]")
+    drawing.space(solid, drawing.force, layer, layer.label)
     solid.set_box_aspect((1, 1, 0.72), zoom=1.14)
     panel_title(solid, "b", "Normal force in 3-D", "height and colour are force")
     spread = figure.add_subplot(grid[0, 2])
-    half = 100 * half_width(drawing.map.lower, drawing.map.upper)
-    image = drawing.plane(spread, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
-    drawing.outlines(spread, truth=False)
-    panel_title(spread, "c", "Uncertainty of the apparent stiffness", "half width of the 90 % band")
-    colour_bar(figure, image, spread, "± [%]")
+    drawing.panel(spread, drawing.spread_layer, "c", "Uncertainty of the apparent stiffness", "half width of the 90 % band")
 
 
 def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
-    norm = drawing.apparent_norm
-    estimate = drawing.map.apparent
+    layer = drawing.stiffness_layer(drawing.map.apparent)
     flat = figure.add_subplot(grid[1, 0])
-    image = drawing.plane(flat, estimate, STIFFNESS_COLOURS, norm)
-    drawing.outlines(flat, truth=False, labels=True)
-    panel_title(
-        flat, "d", "Apparent stiffness, estimated", f"{APPARENT}; background {drawing.background:.1f} N; finding outlined"
-    )
-    colour_bar(figure, image, flat, "[N]")
+    small = f"{APPARENT}; background {drawing.background:.1f} N; finding outlined"
+    drawing.panel(flat, layer, "d", "Apparent stiffness, estimated", small, labels=True)
     solid = figure.add_subplot(grid[1, 1], projection="3d")
-    drawing.space(solid, drawing.xyz[:, 2], estimate, STIFFNESS_COLOURS, norm, "z [mm]")
+    drawing.space(solid, drawing.xyz[:, 2], layer, "z [mm]")
     solid.set_box_aspect((1, 1, 0.45), zoom=1.14)
     panel_title(solid, "e", "The same on the abdomen", "perceived surface")
     true = figure.add_subplot(grid[1, 2])
@@ -213,10 +240,7 @@ def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
         true.set_axis_off()
         true.text(0.5, 0.5, "truth not known", ha="center", va="center", color=QUIET, fontsize=13)
         return
-    image = drawing.plane(true, drawing.true, STIFFNESS_COLOURS, norm)
-    drawing.outlines(true, truth=True)
-    panel_title(true, "f", "Apparent stiffness, true", "dashed: where a lump is felt; solid: finding")
-    colour_bar(figure, image, true, "[N]")
+    drawing.panel(true, drawing.stiffness_layer(drawing.true), "f", "Apparent stiffness, true", WHERE_FELT, truth=True)
 
 
 def panel_title(axes: Any, letter: str, words: str, small: str) -> None:
@@ -226,8 +250,10 @@ def panel_title(axes: Any, letter: str, words: str, small: str) -> None:
     place(0.0, 1.02, small, transform=axes.transAxes, fontsize=9, color=QUIET)
 
 
-def colour_bar(figure: Figure, image: ScalarMappable, axes: Axes, label: str) -> None:
+def colour_bar(image: ScalarMappable, axes: Axes, label: str) -> None:
     """A colour bar beside `axes`; on a logarithmic scale with round numbers."""
+    figure = axes.get_figure()
+    assert figure is not None
     bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02)
     bar.set_label(label, fontsize=_SMALL, color=INK)
     if isinstance(image.norm, LogNorm):

@@ -12,19 +12,18 @@ from matplotlib.figure import Figure
 
 from palpate.report.archive import Evidence
 from palpate.report.figures import (
-    FORCE_COLOURS,
     INK,
     QUIET,
     STIFFNESS_COLOURS,
-    UNCERTAINTY_COLOURS,
+    WHERE_FELT,
     Drawing,
+    Layer,
     colour_bar,
     drawable,
     panel_title,
 )
 from palpate.report.scoring import Truth
 from palpate_bus.messages import ExamState
-from palpate_models.band import half_width
 from palpate_models.frames import Array
 
 MEASURED: Final = "#c2410c"
@@ -79,31 +78,24 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     if message is None or not drawable(message):
         return None
     drawing = Drawing(message, evidence.findings, None)
-    scanned = drawing.map.scanned
     figure = _figure(15.5, 5.0)
     left, middle, right = figure.subplots(1, 3)
-    image = drawing.plane(left, drawing.force, FORCE_COLOURS, Normalize(0.0, float(drawing.force[scanned].max())))
     left.plot(samples_xy[:, 0] * 1e3, samples_xy[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
     left.plot(skipped_xy[:, 0] * 1e3, skipped_xy[:, 1] * 1e3, "x", ms=6, mew=1.6, color="#f43f5e")
-    drawing.outlines(left, truth=False)
     skipped = f", {len(skipped_xy)} targets skipped (crosses)" if len(skipped_xy) else ""
-    panel_title(left, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", f"{len(samples_xy)} samples (dots){skipped}")
-    colour_bar(figure, image, left, "force [N]")
-    image = drawing.plane(middle, drawing.map.apparent / drawing.background, STIFFNESS_COLOURS, _ratio_norm(drawing))
-    drawing.outlines(middle, truth=False, labels=True)
-    panel_title(middle, "b", "Apparent stiffness", "times the background; findings outlined")
-    colour_bar(figure, image, middle, "times background")
-    half = 100 * half_width(drawing.map.lower, drawing.map.upper)
-    image = drawing.plane(right, half, UNCERTAINTY_COLOURS, Normalize(0.0, float(np.quantile(half[scanned], 0.995))))
-    drawing.outlines(right, truth=False)
-    panel_title(right, "c", "How sure", "half width of the 90 % band of the apparent stiffness")
-    colour_bar(figure, image, right, "± [%]")
+    small = f"{len(samples_xy)} samples (dots){skipped}"
+    drawing.panel(left, drawing.force_layer, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", small)
+    words, small = "Apparent stiffness", "times the background; findings outlined"
+    drawing.panel(middle, _ratio_layer(drawing), "b", words, small, labels=True)
+    drawing.panel(right, drawing.spread_layer, "c", "How sure", "half width of the 90 % band of the apparent stiffness")
     return _png(figure)
 
 
-def _ratio_norm(drawing: Drawing) -> LogNorm:
-    ratio = (drawing.map.apparent / drawing.background)[drawing.map.scanned]
-    return LogNorm(float(np.quantile(ratio, 0.002)), max(2.0, float(np.quantile(ratio, 0.998))))
+def _ratio_layer(drawing: Drawing) -> Layer:
+    """Apparent stiffness over that of the background."""
+    ratio = drawing.map.apparent / drawing.background
+    low, high = np.quantile(ratio[drawing.map.scanned], (0.002, 0.998))
+    return Layer(ratio, STIFFNESS_COLOURS, LogNorm(float(low), max(2.0, float(high))), "times background")
 
 
 def record(evidence: Evidence, limit_n: float) -> bytes | None:
@@ -148,7 +140,7 @@ def force_depth(evidence: Evidence) -> bytes | None:
         evidence.depth[held] * 1e3, evidence.force[held], c=evidence.time[held], s=2, cmap="viridis", rasterized=True
     )
     plain(axes, "measured normal force [N]", "measured depth [mm]")
-    colour_bar(figure, image, axes, "simulated time [s]")
+    colour_bar(image, axes, "simulated time [s]")
     return _png(figure)
 
 
@@ -162,16 +154,12 @@ def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
         return None
     figure = _figure(15.5, 5.0)
     left, middle, right = figure.subplots(1, 3)
-    image = drawing.plane(left, drawing.true, STIFFNESS_COLOURS, drawing.apparent_norm)
-    drawing.outlines(left, truth=True)
-    panel_title(left, "d", "Apparent stiffness, true", "dashed: where a lump is felt; solid: finding")
-    colour_bar(figure, image, left, "[N]")
+    drawing.panel(left, drawing.stiffness_layer(drawing.true), "d", "Apparent stiffness, true", WHERE_FELT, truth=True)
     error = 100 * (drawing.map.apparent / drawing.true - 1)
     reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
-    image = drawing.plane(middle, error, "RdBu_r", Normalize(-reach, reach))
-    drawing.outlines(middle, truth=True)
-    panel_title(middle, "e", "Error of the estimate", "estimated over true apparent stiffness, less one")
-    colour_bar(figure, image, middle, "[%]")
+    layer = Layer(error, "RdBu_r", Normalize(-reach, reach), "[%]")
+    small = "estimated over true apparent stiffness, less one"
+    drawing.panel(middle, layer, "e", "Error of the estimate", small, truth=True)
     _depth_errors(right, evidence)
     return _png(figure)
 
