@@ -27,6 +27,7 @@ BARE = ""
 EXTRA_OF = {
     "palpate": "run",
     "palpate.__init__": "study",  # names of the interface, which are imported when they are asked for
+    "palpate.command_line": "cli",
     "palpate.interface": "library",
     "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
