@@ -38,7 +38,7 @@ def drawable(message: Any) -> bool:
     return bool(np.asarray(message.scanned, dtype=bool)[triangles].all(axis=1).any())
 
 
-class Layer(NamedTuple):
+class MapQuantity(NamedTuple):
     """A quantity over the map."""
 
     values: Array
@@ -82,24 +82,24 @@ class Drawing:
         return LogNorm(float(np.quantile(values, 0.002)), float(np.quantile(values, 0.998)))
 
     @property
-    def force_layer(self) -> Layer:
+    def force_layer(self) -> MapQuantity:
         """Normal force at the common depth."""
         norm = Normalize(0.0, float(self.force[self.map.scanned].max()))
-        return Layer(self.force, FORCE_COLOURS, norm, "force [N]")
+        return MapQuantity(self.force, FORCE_COLOURS, norm, "force [N]")
 
     @property
-    def spread_layer(self) -> Layer:
+    def spread_layer(self) -> MapQuantity:
         """Half width of the 90 % band of the apparent stiffness, over its middle."""
         half = 100 * half_width(self.map.lower, self.map.upper)
         norm = Normalize(0.0, float(np.quantile(half[self.map.scanned], 0.995)))
-        return Layer(half, UNCERTAINTY_COLOURS, norm, "± [%]")
+        return MapQuantity(half, UNCERTAINTY_COLOURS, norm, "± [%]")
 
-    def stiffness_layer(self, values: Array) -> Layer:
+    def stiffness_layer(self, values: Array) -> MapQuantity:
         """Apparent stiffness [N], estimated or true."""
-        return Layer(values, STIFFNESS_COLOURS, self.apparent_norm, "[N]")
+        return MapQuantity(values, STIFFNESS_COLOURS, self.apparent_norm, "[N]")
 
     def panel(
-        self, axes: Axes, layer: Layer, letter: str, words: str, small: str, *, truth: bool = False, labels: bool = False
+        self, axes: Axes, layer: MapQuantity, letter: str, words: str, small: str, *, truth: bool = False, labels: bool = False
     ) -> None:
         """A quantity seen from the front, with the outlines of findings, a heading and a colour bar."""
         image = self.plane(axes, layer)
@@ -107,7 +107,7 @@ class Drawing:
         panel_title(axes, letter, words, small)
         colour_bar(image, axes, layer.label)
 
-    def plane(self, axes: Axes, layer: Layer) -> ScalarMappable:
+    def plane(self, axes: Axes, layer: MapQuantity) -> ScalarMappable:
         """A quantity seen from the front, with quadrants, where it is known."""
         values, cmap, norm, _ = layer
         known = np.isfinite(values)[self.triangles].all(axis=1)
@@ -172,7 +172,7 @@ class Drawing:
             )
             contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
 
-    def space(self, axes: Any, height: Array, layer: Layer, label: str) -> None:
+    def space(self, axes: Any, height: Array, layer: MapQuantity, label: str) -> None:
         """The map as a surface in space: `height` above the xy plane, coloured by a quantity."""
         z = height.copy()
         surface = axes.plot_trisurf(Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles), z, linewidth=0)

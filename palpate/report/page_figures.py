@@ -17,7 +17,7 @@ from palpate.report.figures import (
     STIFFNESS_COLOURS,
     WHERE_FELT,
     Drawing,
-    Layer,
+    MapQuantity,
     colour_bar,
     drawable,
     panel_title,
@@ -91,11 +91,11 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     return _png(figure)
 
 
-def _ratio_layer(drawing: Drawing) -> Layer:
+def _ratio_layer(drawing: Drawing) -> MapQuantity:
     """Apparent stiffness over that of the background."""
     ratio = drawing.map.apparent / drawing.background
     low, high = np.quantile(ratio[drawing.map.scanned], (0.002, 0.998))
-    return Layer(ratio, STIFFNESS_COLOURS, LogNorm(float(low), max(2.0, float(high))), "times background")
+    return MapQuantity(ratio, STIFFNESS_COLOURS, LogNorm(float(low), max(2.0, float(high))), "times background")
 
 
 def record(evidence: Evidence, limit_n: float) -> bytes | None:
@@ -157,7 +157,7 @@ def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
     drawing.panel(left, drawing.stiffness_layer(drawing.true), "d", "Apparent stiffness, true", WHERE_FELT, truth=True)
     error = 100 * (drawing.map.apparent / drawing.true - 1)
     reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
-    layer = Layer(error, "RdBu_r", Normalize(-reach, reach), "[%]")
+    layer = MapQuantity(error, "RdBu_r", Normalize(-reach, reach), "[%]")
     small = "estimated over true apparent stiffness, less one"
     drawing.panel(middle, layer, "e", "Error of the estimate", small, truth=True)
     _depth_errors(right, evidence)
