@@ -9,6 +9,7 @@ import sys
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
+from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -16,7 +17,7 @@ import typer
 
 from palpate.command_line import EXIT_BAD_INPUT
 
-HELP = "Autonomous robotic palpation as a co-simulation of independent processes on an Eclipse zenoh bus."
+HELP = "A robot arm feels for lumps in a simulated abdomen. You can replace each part of it with a program of your own."
 GROUPS = {
     "Examine": {
         "run": "palpate.run.command:run",
@@ -132,9 +133,17 @@ def _add(app: typer.Typer, word: str) -> None:
         print(f"palpate: {error}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
     if isinstance(command, typer.Typer):
+        for own in command.registered_commands:
+            own.help = own.help or _flowing(own.callback)
         app.add_typer(command, name=word)
     else:
-        app.command(word)(command)
+        app.command(word, help=_flowing(command))(command)
+
+
+def _flowing(command: object) -> str:
+    """A command's docstring with each paragraph on a line of its own, for a terminal of any width to break."""
+    paragraphs = (getdoc(command) or "").split("\n\n")
+    return "\n\n".join(part if part.startswith(" ") else part.replace("\n", " ") for part in paragraphs)
 
 
 def _lacking(word: str, error: ModuleNotFoundError) -> NoReturn:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from difflib import get_close_matches
+from importlib.machinery import PathFinder
 from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, distribution, entry_points
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from traceback import extract_tb
 from typing import Any
@@ -147,6 +148,23 @@ def _check_file(role: str, path: Path) -> None:
         raise ChoiceError(f"services.{role} = {str(path)!r}: is not Python: {error}") from error
     if "create" not in _defined(tree):
         raise ChoiceError(f"services.{role} = {str(path)!r}: the file has no function create(scenario)")
+    for line, name in _imported(tree):
+        if not _importable(name, path.parent):
+            raise ChoiceError(f"services.{role} = {str(path)!r}: line {line}: the module {name} is not installed")
+
+
+def _imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and top-level package of what a module cannot do without: not what it tries to import, or imports in a function."""
+    for node in tree.body:
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name.partition(".")[0]) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.lineno, node.module.partition(".")[0]
+
+
+def _importable(name: str, beside: Path) -> bool:
+    """Whether there is such a package, installed or in the folder `beside`. Imports nothing."""
+    return name in sys.modules or find_spec(name) is not None or PathFinder.find_spec(name, [str(beside)]) is not None
 
 
 def _defined(tree: ast.Module) -> set[str]:

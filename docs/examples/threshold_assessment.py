@@ -17,6 +17,7 @@ class Threshold(Service):
 
     def __init__(self, exam):
         self.X_AW, self.spacing, self.places, self.forces = inverse(np.array(exam.X_WA)), exam.exam.spacing_m, [], []
+        self.told = False
 
     def step(self, t, inbox):
         """Listens to the examination; once it is over, says what was stiff."""
@@ -24,7 +25,8 @@ class Threshold(Service):
             if state.steady:  # in contact, at depth
                 self.places.append((state.surface_point.x, state.surface_point.y, state.surface_point.z))
                 self.forces.append(state.normal_force)
-            if state.phase in (ExamState.PHASE_ASSESS, ExamState.PHASE_ABORTED):
+            if state.phase in (ExamState.PHASE_ASSESS, ExamState.PHASE_ABORTED) and not self.told:
+                self.told = True
                 return {"assessment/findings": Findings(header(t, "abdomen"), self.findings(), [], final=True)}
         return {}
 

@@ -21,12 +21,20 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
     lines = []
     for item in error.errors():
         field = [str(part) for part in item["loc"]]
-        path = ".".join(field) or "scenario"
-        what = item["msg"]
+        what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "want ")
         if item["type"] == "extra_forbidden":
             what = f"there is no such field{did_you_mean(field[-1], _fields(model.model_json_schema()))}"
+        elif item["type"] in _NO_SECTION:
+            what = "want a section, a mapping of fields"
+        elif item["type"] == "missing":
+            what = f"lacks {field.pop()}"
+        path = ".".join(field) or "scenario"
         lines.append(f"{_origin(name, text, settings, field)}: {path} = {item['input']!r}: {what}")
     return "\n".join(lines)
+
+
+_NO_SECTION = frozenset(("model_type", "model_attributes_type", "dict_type"))
+"""What pydantic calls a value in place of a section."""
 
 
 def _fields(schema: dict[str, Any]) -> set[str]:
@@ -36,10 +44,11 @@ def _fields(schema: dict[str, Any]) -> set[str]:
 
 def _origin(name: str, text: str, settings: Sequence[str], field: Sequence[str]) -> str:
     """Where a field got its value: the last setting that wrote it, else the file with the line."""
-    for setting in reversed(settings):
-        words = setting.partition("=")[0].split(".")
-        if words == list(field[: len(words)]):
-            return f"--set {words[0] if len(words) == 1 else '.'.join(words)}"
+    written = [setting.partition("=")[0].split(".") for setting in reversed(settings)]
+    to_it = [words for words in written if words == list(field[: len(words)])]
+    within = [words for words in written if field and words[: len(field)] == list(field)]  # of a section that is wrong as a whole
+    for words in (*to_it, *within):
+        return f"--set {'.'.join(words)}"
     line = _line(yaml.compose(text, yaml.SafeLoader), field)
     return name if line is None else f"{name}, line {line}"
 

@@ -70,6 +70,10 @@ def _read(source: str) -> tuple[str, str]:
         name = f"{source}.yaml"
         return resources.files("palpate_models").joinpath("scenarios", name).read_text(encoding="utf-8"), name
     path = Path(source)
+    if path.is_dir():
+        raise ScenarioError(f"{source}: is a folder; want a YAML file, such as the scenario.yaml of a run")
+    if path.suffix in (".yaml", ".yml") and not path.exists():
+        raise ScenarioError(f"{source}: there is no such file")
     if not path.is_file():
         raise ScenarioError(
             f"{source}: no such scenario; known are {', '.join(scenario_names())}, or give the path of a YAML file"
@@ -108,6 +112,11 @@ def parse_yaml(text: str, name: str) -> Any:
         return yaml.load(text, _Loader)
     except _TwiceError as error:
         raise ScenarioError(f"{name}: {error}") from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = "" if mark is None else f", line {mark.line + 1}, column {mark.column + 1}"
+        why = ", ".join(part for part in (error.problem, error.context) if part)
+        raise ScenarioError(f"{name}{where}: not YAML: {why}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError for 2001-13-45, RecursionError for deep nesting
         raise ScenarioError(f"{name}: not YAML: {error}") from error
 

@@ -22,7 +22,8 @@ A scenario is a YAML file; what it does not mention has the default. `palpate sc
 
 A field's name ends with its unit: `_m` metres, `_mm` millimetres, `_n` newtons, `_rad` radians, `_deg` degrees, `_s` seconds,
 `_mps` metres a second, `_kg` kilograms, `_px` pixels; without one it is a plain number, a name or a yes or no. An unknown field
-is refused, with the line it stands on and the field that was probably meant.
+is refused, with the line it stands on and the field that was probably meant. [V] marks a figure that was read in the source named
+there, [A] one that is assumed.
 """
 _ELSEWHERE: Final = {
     "errors": "All fields with their levels and sources: [errors.md](errors.md).",

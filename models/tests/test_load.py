@@ -31,7 +31,9 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
             r"mine\.yaml, line 3: exam\.depht_m = 0\.01: there is no .*mean depth_m\?",
         ),
         ("exam: {pattern: zigzag}", r"exam\.pattern = 'zigzag': .*lines, raster, snake"),
-        ("phantom: {lesions: [{contrast: 4}]}", r"phantom\.lesions\.0\.centre_m"),
+        ("phantom: {lesions: [{contrast: 4}]}", r"phantom\.lesions\.0 = .*centre_m"),
+        ("seed: 1\nexam: 3\n", r"mine\.yaml, line 2: exam = 3: .*section"),
+        ("seed: 1\nexam: {region_m: [0.1, 0.1}\n", r"mine\.yaml, line 2, column \d+: not YAML"),
         ("- exam", r"want a mapping of fields, not list"),
         ("exam: {", r"not YAML"),
         ("exam:\n  depth_m: 0.01\n  depth_m: 0.02\n", r"mine\.yaml: line 3: field depth_m stands twice"),
@@ -47,6 +49,18 @@ def test_what_cannot_be_is_named(text: str, words: str, tmp_path: Path) -> None:
 def test_a_value_is_blamed_on_the_setting_that_wrote_it() -> None:
     with pytest.raises(ScenarioError, match=r"^--set exam\.depth_m: exam\.depth_m = 5: .*less than"):
         load_scenario("healthy", ["exam.speed_mps=0.02", "exam.depth_m=5"])
+
+
+def test_a_section_is_blamed_on_what_was_set_within_it() -> None:
+    with pytest.raises(ScenarioError, match=r"^--set phantom\.mesh: phantom = "):
+        load_scenario("lump", ["seed=1", "phantom.mesh=belly.stl"])
+
+
+def test_a_file_that_is_not_there_and_a_folder_are_no_names(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"mine\.yaml: there is no such file"):
+        load_scenario(str(tmp_path / "mine.yaml"))
+    with pytest.raises(ScenarioError, match="is a folder"):
+        load_scenario(str(tmp_path))
 
 
 def test_a_scenario_that_is_not_there_is_guessed() -> None:

@@ -12,6 +12,7 @@ from palpate_models.phantom import PhantomModel
 from palpate_models.scenario import Scenario
 
 MM = 1e3
+CONTOURS = "#c9d1d4"
 
 
 def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospect) -> None:
@@ -20,7 +21,8 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     axes = figure.add_subplot()
     front = phantom.normals[:, 2] > 0.1
     x, y, z = phantom.vertices[front].T * MM
-    axes.tricontour(x, y, z, levels=10, colors="#c9d1d4", linewidths=0.8)
+    axes.tricontour(x, y, z, levels=10, colors=CONTOURS, linewidths=0.8)
+    axes.plot([], [], color=CONTOURS, linewidth=0.8, label="equal height of the skin")
     used = np.array([i not in planned.skipped for i in range(len(planned.scan.targets))])
     for stroke in planned.strokes:
         axes.plot(*(stroke.T * MM), color="#7a8c94", linewidth=1.2, zorder=2)

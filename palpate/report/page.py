@@ -45,7 +45,7 @@ def read_report(folder: Path) -> Report:
         return Report.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise EvidenceError(
-            f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
+            f"{path} is not there: give the results folder of a run; where the run broke off without a report, add --recover"
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error

@@ -16,6 +16,8 @@ from palpate.report.results import assemble, print_findings, truth_of_run, write
 from palpate.report.rows import Report
 from palpate.run.roles import write_scenario_files
 from palpate.run.space import another_folder, megabytes_of
+from palpate_bus.contract import contract
+from palpate_bus.contract.conformance import violations
 from palpate_conductor.result import RunResult
 from palpate_models.scenario import Scenario
 
@@ -30,14 +32,25 @@ def conclude(
         print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
     else:
         print_findings(Console(), report)
+    for sentence in _unfit(result):
+        say(f"{sentence}; see docs/topics.md, and palpate check assessment")
     if page is not None and (trouble or not quiet):
-        console.print(f"to read: {page} ({megabytes_of(page.parent):.0f} MB in {page.parent})", highlight=False, soft_wrap=True)
+        megabytes = megabytes_of(page.parent)
+        size = f"{megabytes:.0f} MB" if megabytes >= 1 else "under 1 MB"
+        console.print(f"to read: {page} ({size} in {page.parent})", highlight=False, soft_wrap=True)
     if trouble:
         say(trouble)
     if result.failure:
         fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
     if trouble:
         raise typer.Exit(EXIT_FAILED)
+
+
+def _unfit(result: RunResult) -> list[str]:
+    """What in the last map and findings is not as the contract has it, such as a confidence of 80, a sentence each."""
+    topics, collected = contract().topics, result.collected
+    last = {"assessment/map": collected.stiffness_map, "assessment/findings": collected.findings}
+    return [fault for name, message in last.items() if message is not None for fault in violations(topics[name], message)]
 
 
 def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:

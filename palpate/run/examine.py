@@ -61,18 +61,22 @@ class How:
     resume: Path | None
 
 
-def _observers(scenario: Scenario, how: How, console: Console) -> tuple[str, ...]:
+def _observers(scenario: Scenario, how: How) -> tuple[str, ...]:
     """Recorder and dashboard, unless nothing is recorded; the dashboard only where its libraries are."""
     if how.record == "none":
         return ()
+    if _dashboard_lacks(scenario):
+        return tuple(role for role in OBSERVERS if role != "dashboard")
+    return OBSERVERS
+
+
+def _dashboard_lacks(scenario: Scenario) -> str:
+    """What keeps the dashboard from drawing, and what to install; empty where nothing does."""
     try:
         check_libraries("dashboard", choice(scenario, "dashboard"))
     except ChoiceError as error:
-        why = str(error).partition(": ")[2]
-        later = f"the dashboard can draw this run later, from its recording: {escape(why)}"
-        console.print(f"[dim]{later}[/]", highlight=False, soft_wrap=True)
-        return tuple(role for role in OBSERVERS if role != "dashboard")
-    return OBSERVERS
+        return str(error).partition(": ")[2]
+    return ""
 
 
 def resume(how: How) -> None:
@@ -94,19 +98,16 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
     _refuse_contradictions(scenario, how)
     try:
         absent = Absent(how.without, how.wait_s, partial(console.print, highlight=False, soft_wrap=True))
-        observers = _observers(scenario, how, Console(stderr=True, quiet=quiet))
+        observers = _observers(scenario, how)
         groups = placement((*workers(scenario), *observers), how.group, how.processes)
     except (PlaceError, PlacementError) as error:
         refuse(error)
     folder = how.out or usual_folder(scenario.name)
-    if not quiet:
-        console.print(f"[bold]{scenario.name}[/] seed {scenario.seed}, results in {folder}", highlight=False)
-        console.print(f"[dim]{what_it_takes(scenario.exam, how.record)}[/]", highlight=False, soft_wrap=True)
-        if not how.composed:
-            console.print("[dim]to look at it from another terminal: palpate doctor, palpate topic list[/]", highlight=False)
     try:
         with results_folder(folder, overwrite=how.overwrite):
             check_room(folder, scenario.exam, how.record)
+            if not quiet:
+                _announce(console, scenario, how, folder)
             with RunDisplay(console, quiet, expected_duration(scenario.exam)) as display, given({"PALPATE_RECORD": how.record}):
                 tell = WatchedRoom(folder, display.tell, say).tell
                 with going_on(None if before is None else before.checkpoint):
@@ -118,6 +119,17 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
         refuse(error)
     except RunFailed as error:
         fail(error)
+
+
+def _announce(console: Console, scenario: Scenario, how: How, folder: Path) -> None:
+    console.print(f"[bold]{scenario.name}[/] seed {scenario.seed}, results in {folder}", highlight=False)
+    hints = [what_it_takes(scenario.exam, how.record)]
+    if not how.composed:
+        hints.append("to look at it from another terminal: palpate doctor, palpate topic list")
+    if how.record != "none" and (why := _dashboard_lacks(scenario)):
+        hints.append(f"for palpate dashboard, now or of the finished run, {why}")
+    for hint in hints:
+        console.print(f"[dim]{escape(hint)}[/]", highlight=False, soft_wrap=True)
 
 
 def examine_again(scenario: Scenario, how: How, count: int) -> None:

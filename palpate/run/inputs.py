@@ -28,7 +28,9 @@ def usable(
     """
     try:
         return examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
-    except (ScenarioError, MeshError, PatternError, ChoiceError) as error:
+    except MeshError as error:
+        refuse(f"{name}: {error}")
+    except (ScenarioError, PatternError, ChoiceError) as error:
         refuse(error)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -125,6 +126,10 @@ def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceP
     return ServiceProcess(role, tuple(command), {**before, **{k: str(v) for k, v in environment.items()}})
 
 
+_LOGGED = re.compile(r"^\d{4}-\d\d-\d\d [\d:,.]+ \S+ [A-Z]+ ")
+"""What a service's log puts before a sentence: time, role and level."""
+
+
 def how(code: int, log: Path) -> str:
     """How a process ended, in words: its signal, or its exit status `code` and the last line of its log."""
     if code < 0:
@@ -133,7 +138,7 @@ def how(code: int, log: Path) -> str:
     with suppress(OSError):
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     hint = "" if code else ": does it call palpate_bus.run.main?"
-    said = next((line.strip() for line in reversed(lines) if line.strip()), f"it said nothing{hint}")
+    said = next((_LOGGED.sub("", line.strip()) for line in reversed(lines) if line.strip()), f"it said nothing{hint}")
     return f"left with status {code}: {said}"
 
 

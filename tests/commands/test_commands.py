@@ -11,7 +11,6 @@ from importlib.metadata import version
 
 import pytest
 import typer
-from rich.console import Console
 from typer.testing import CliRunner
 
 from palpate import commands
@@ -86,19 +85,16 @@ def test_a_command_that_lacks_its_libraries_names_what_to_install(monkeypatch: p
     assert said == ["palpate: the command fmu needs the module fmpy; pip install 'palpate[fmu]'"]
 
 
-def test_a_run_does_without_the_dashboard_where_its_libraries_are_not(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_does_without_the_dashboard_where_its_libraries_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     def lacking(role: str, choice: str) -> None:
         raise ChoiceError(f"services.{role} = {choice!r}: the module rerun is not installed; pip install 'palpate[dashboard]'")
 
     how = examine.How(None, False, True, (), None, False, False, 0.0, (), 1.0, "normal", False, None, False, False, None)
-    console = Console(stderr=True)
-    assert examine._observers(load_scenario("clean"), how, console) == ("dashboard", "recorder")
+    assert examine._observers(load_scenario("clean"), how) == ("dashboard", "recorder")
     monkeypatch.setattr(examine, "check_libraries", lacking)
-    assert examine._observers(load_scenario("clean"), how, console) == ("recorder",)
-    assert "pip install 'palpate[dashboard]'" in capsys.readouterr().err
-    assert examine._observers(load_scenario("clean"), replace(how, record="none"), console) == ()
+    assert examine._observers(load_scenario("clean"), how) == ("recorder",)
+    assert "pip install 'palpate[dashboard]'" in examine._dashboard_lacks(load_scenario("clean"))
+    assert examine._observers(load_scenario("clean"), replace(how, record="none")) == ()
 
 
 def test_the_version_is_that_of_the_package() -> None:

@@ -57,6 +57,7 @@ def test_a_name_that_is_none_is_refused_with_scenario_field_value_and_what_is_al
         ("", "no function create"),
         ("def create(:", "is not Python"),
         ("x = 1", "no function create"),
+        ("import os\nfrom nosuch.part import x\ndef create(scenario): ...\n", "line 2: the module nosuch is not installed"),
     ],
 )
 def test_a_file_that_is_no_service_is_refused(tmp_path: Path, text: str | None, said: str) -> None:

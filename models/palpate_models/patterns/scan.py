@@ -50,7 +50,7 @@ def scan_of(exam: Exam, surface: Surface) -> Scan:
     except Exception as error:
         raise PatternError(PATTERN.told(exam.pattern, error)) from error
     if not isinstance(made, Scan):
-        raise PatternError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan")
+        raise PatternError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan of {__name__}")
     lines = [np.asarray(line, dtype=np.float64) for line in made.lines]
     for k, line in enumerate(lines):
         if line.ndim != 2 or line.shape[1] != 2 or not len(line) or not np.isfinite(line).all():

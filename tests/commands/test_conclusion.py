@@ -1,0 +1,25 @@
+"""The end of an examination."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conductor_messages import SETTINGS, collected, result
+from rich.console import Console
+
+from palpate.run.conclusion import conclude
+from palpate.run.roles import write_scenario_files
+from palpate_models.load import load_scenario
+
+
+@pytest.mark.parametrize(("confidence", "told"), [(0.8, False), (80.0, True)])
+def test_findings_that_break_the_contract_are_told(
+    confidence: float, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = load_scenario("clean", SETTINGS, seed=3)
+    write_scenario_files(scenario, tmp_path)
+    gathered = collected()
+    gathered.findings.findings[0].confidence = confidence
+    conclude(Console(quiet=True), tmp_path, scenario, result(gathered), quiet=True)
+    assert ("findings.confidence" in capsys.readouterr().err) is told
