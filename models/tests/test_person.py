@@ -281,5 +281,5 @@ def test_bad_input_is_refused(fields: dict[str, Any], said: str) -> None:
 
 
 def test_bad_input_of_a_scenario_names_the_field() -> None:
-    with pytest.raises(ScenarioError, match=r"person\.yaml, line 2: phantom\.draw.*depth_m = 0 to 0\.2"):
+    with pytest.raises(ScenarioError, match=r"--set phantom\.draw\.depth_m: phantom\.draw.*depth_m = 0 to 0\.2"):
         load_scenario("person", ["phantom.draw.depth_m=[0, 0.2]"])

@@ -129,7 +129,12 @@ def test_ctrl_c_during_the_start_is_a_line() -> None:
     """The signal is there before the interpreter is, and before the environment is fixed."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        started = subprocess.Popen([sys.executable, "-m", "palpate", "plan"], stderr=subprocess.PIPE, text=True)
+        started = subprocess.Popen(
+            [sys.executable, "-m", "palpate", "plan"],
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - a shell ignores it in the background
+        )
         started.send_signal(signal.SIGINT)
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
