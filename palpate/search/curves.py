@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import typer
 from matplotlib.figure import Figure
+from statsmodels.stats.proportion import proportion_confint
 
 from palpate_models.frames import Array
 
@@ -22,18 +23,8 @@ TUNING: Final = 1000
 """Seeds below this are tuning patients."""
 SPECIFICITY: Final = 0.95
 NEAR_M: Final = 0.020
-Z95: Final = 1.96
 OURS: Final = "informed"
 _BOOTSTRAPS: Final = 2000
-
-
-def wilson(k: int, n: int) -> tuple[float, float]:
-    """The 95 % interval of a share, k of n (Wilson 1927)."""
-    if not n:
-        return 0.0, 1.0
-    p, z = k / n, Z95
-    middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(float((middle - half) / (1 + z * z / n)), 0.0), min(float((middle + half) / (1 + z * z / n)), 1.0)
 
 
 def thresholds(trials: pd.DataFrame) -> pd.Series:
@@ -130,8 +121,10 @@ def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
 
 def share(k: int, n: int) -> str:
     """A share, k of n, with its 95 % interval."""
-    low, high = wilson(k, n)
-    return f"{k} of {n}: {100 * k / max(n, 1):.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+    if not n:
+        return "none of them"
+    low, high = proportion_confint(k, n, method="wilson")
+    return f"{k} of {n}: {100 * k / n:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
 
 
 def _words(values: tuple[float, float, float], form: str) -> str:
@@ -150,8 +143,8 @@ def drawn(found: pd.DataFrame, trials: pd.DataFrame) -> Figure:
         presses = np.arange(1, budget + 1)
         shares = np.array([(right.presses <= k).sum() for k in presses])
         (line,) = by_press.plot(presses, shares / n, label=str(name), **style)
-        bands = np.array([wilson(int(k), n) for k in shares])
-        by_press.fill_between(presses, *bands.T, color=line.get_color(), alpha=0.15 if name == OURS else 0.06, lw=0)
+        low, high = proportion_confint(shares, n, method="wilson")
+        by_press.fill_between(presses, low, high, color=line.get_color(), alpha=0.15 if name == OURS else 0.06, lw=0)
         grid = np.linspace(0, float(found.seconds.max()), 200)
         by_second.plot(grid, [(right.seconds <= t).mean() * len(right) / n if len(right) else 0.0 for t in grid], **style)
         apart = trials[(trials.policy == name) & trials.seed.isin(mine.seed)].groupby("press").apart_m.median()
