@@ -84,7 +84,8 @@ def again(scenario: Scenario, collected: Collected, known: Known, row: str) -> S
     (service,) = load_services(scenario, ("assessment",))
     assess(service, gathered)
     assert known.felt is not None
-    return score(found_of(gathered.findings), map_of(gathered.stiffness_map), known.felt)
+    assert gathered.findings is not None
+    return score(found_of(gathered.findings.findings), map_of(gathered.stiffness_map), known.felt)
 
 
 def line(name: str, scores: Sequence[Scores]) -> str:

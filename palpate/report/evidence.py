@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot
 from typing import Any
@@ -117,11 +118,11 @@ def unassessed_of(message: Any) -> dict[str, float]:
     return {reason: float(area[codes == code].sum()) for reason, code in reasons.items() if (codes == code).any()}
 
 
-def found_of(findings: Any | None) -> list[Found]:
-    """`palpation_msgs/Findings`."""
+def found_of(areas: Sequence[Any]) -> list[Found]:
+    """Findings or candidates, each a `palpation_msgs/Finding`."""
     return [
         Found(np.array((f.centroid.x, f.centroid.y, f.centroid.z)), f.area, f.ratio, (f.ratio_lower, f.ratio_upper))
-        for f in ([] if findings is None else findings.findings)
+        for f in areas
     ]
 
 

@@ -79,7 +79,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     depth = _depth(known)
     scores = None
     if known.felt is not None and final is not None:
-        scores = scoring.score(found_of(final), found, known.felt)
+        scores = scoring.score(found_of(final.findings), found, known.felt, found_of(final.candidates))
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
     runs = (*result.earlier, c)
     forces = [peak_force(m) for run in runs for m in run.indentation]

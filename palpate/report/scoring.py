@@ -1,7 +1,8 @@
 """Scores of findings and map against what can truly be felt. The examination sees nothing of this.
 
 A finding matches a lump when their areas overlap by a Dice coefficient of MATCHING_DICE, or its centroid lies in the lump's area;
-each counts once, so that most match and overlap best. All is compared at the places that the tool truly touched, in the xy plane
+each counts once, so that most match and overlap best. A candidate, which the map shows no area of, matches by its centroid, and
+only a lump that no finding matches. All is compared at the places that the tool truly touched, in the xy plane
 of the abdomen frame A; areas are on the skin. The same rule holds everywhere.
 """
 
@@ -119,16 +120,21 @@ class Scores:
     findings: tuple[FindingScore, ...]
     coverage_90_on_guarding: float | None = None
     """The coverage where guarding is felt."""
+    candidates: tuple[FindingScore, ...] = ()
+    """Of the areas that were weighed and not reported: no figure above counts them."""
 
 
-def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores:
-    """Scores of findings and of the map that holds their areas. Without a map a finding is no more than a place."""
+def score(found: Sequence[Found], found_map: Map | None, truth: Truth, candidates: Sequence[Found] = ()) -> Scores:
+    """Scores of findings, of the map that holds their areas, and of candidates, the most probable first.
+
+    Without a map a finding is no more than a place, as a candidate always is.
+    """
     felt = truth.felt
     owner = np.full(len(felt.raster), -1) if found_map is None else _owner(found_map, felt.raster)
     places = truth.touched.places(felt.raster)
     masks = [owner == i for i in range(len(found))]
     dice = np.array([[_dice(felt, mask, places, lump) for lump in felt.lumps] for mask in masks])
-    partner = _match(found, dice, truth)
+    partner = _match(found, dice, _within(found, truth))
     excess = felt.excess(places)
     guarded = felt.inside(felt.guarded, places)
     rows = []
@@ -158,6 +164,7 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth) -> Scores
         coverage_90_in_lumps=in_lumps,
         coverage_90_on_guarding=guarding,
         findings=tuple(rows),
+        candidates=_candidate_scores(candidates, set(partner.values()), truth),
     )
 
 
@@ -190,13 +197,29 @@ def _dice(felt: Felt, mask: Mask, places: Array, lump: Lump) -> float:
     return 2 * both / (float(felt.cells[mask].sum()) + lump.area)
 
 
-def _match(found: Sequence[Found], dice: Array, truth: Truth) -> dict[int, int]:
-    """Which lump each matched finding matches."""
+def _within(found: Sequence[Found], truth: Truth) -> Mask:
+    """Whether the centroid of each area lies in the area of each lump, shape (findings, lumps)."""
     lumps = truth.felt.lumps
     if not found or not lumps:
-        return {}
+        return np.zeros((len(found), len(lumps)), dtype=bool)
     centroids = truth.touched.places(np.array([f.centroid[:2] for f in found]))
-    within = np.stack([truth.felt.inside(lump.inside, centroids) for lump in lumps], axis=1)
+    return np.stack([truth.felt.inside(lump.inside, centroids) for lump in lumps], axis=1)
+
+
+def _candidate_scores(candidates: Sequence[Found], taken: set[int], truth: Truth) -> tuple[FindingScore, ...]:
+    """Scores of candidates: each matches the first lump about its centroid that no finding and no earlier candidate has."""
+    rows = []
+    for candidate, within in zip(candidates, _within(candidates, truth), strict=True):
+        lump = next((int(j) for j in np.flatnonzero(within) if int(j) not in taken), None)
+        taken = taken | {lump} if lump is not None else taken
+        rows.append(_finding_score(candidate, lump, None, None, on_guarding=False, truth=truth))
+    return tuple(rows)
+
+
+def _match(found: Sequence[Found], dice: Array, within: Mask) -> dict[int, int]:
+    """Which lump each matched finding matches."""
+    if not within.size:
+        return {}
     fits = (dice >= MATCHING_DICE) | within
     rows, columns = linear_sum_assignment(-(fits + 1e-3 * dice))
     return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if fits[i, j]}

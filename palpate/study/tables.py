@@ -151,9 +151,16 @@ def _findings(outcome: Outcome) -> Iterator[Row]:
     report = outcome.report
     if report is None:
         return
-    scores: Sequence[FindingScore | None] = [None] * len(report.findings) if report.scores is None else report.scores.findings
-    for index, (finding, score) in enumerate(zip(report.findings, scores, strict=True)):
-        yield _finding(outcome, index, (finding, True), score)
+    scores = report.scores
+    findings = _scored(report.findings, () if scores is None else scores.findings)
+    candidates = _scored(report.candidates, () if scores is None else scores.candidates)
+    for index, (finding, score) in enumerate((*findings, *candidates)):
+        yield _finding(outcome, index, (finding, index < len(report.findings)), score)
+
+
+def _scored(rows: Sequence[FindingRow], scores: Sequence[FindingScore]) -> list[tuple[FindingRow, FindingScore | None]]:
+    """Each row with its score; None where nothing could be scored."""
+    return list(zip(rows, scores or (None,) * len(rows), strict=True))
 
 
 def _finding(outcome: Outcome, index: int, found: tuple[FindingRow, bool], score: FindingScore | None) -> Row:

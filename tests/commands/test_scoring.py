@@ -244,6 +244,19 @@ def test_without_a_map_a_finding_is_a_place_in_a_lumps_area_or_beside_it() -> No
     assert s.place_error_m == pytest.approx(0.01, abs=3e-4)
 
 
+def test_a_candidate_matches_a_lump_that_no_finding_has() -> None:
+    other = (CENTRE + np.array((0.08, 0.06)), 0.015)
+    true, reported = truth([(CENTRE, RADIUS), other]), [(CENTRE, RADIUS)]
+    nowhere = (CENTRE + np.array((0.0, 0.08)), RADIUS)
+    weighed = found([(CENTRE + 0.002, RADIUS), other, (other[0] + 0.001, 0.01), nowhere])
+    s = scoring.score(found(reported), found_map(reported), true, weighed)
+    assert [row.lump for row in s.findings] == [0]
+    assert [row.lump for row in s.candidates] == [None, 1, None, None]
+    assert s.candidates[1].place_error_m == pytest.approx(0.0, abs=1e-3)
+    without = scoring.score(found(reported), found_map(reported), true)
+    assert (s.matched, s.missed, s.false_findings) == (without.matched, without.missed, without.false_findings) == (1, 1, 0)
+
+
 def test_surface_error_is_along_the_normal() -> None:
     body = TrueBody(*plane(slope=0.75), np.eye(4))
     off = body.vertices + np.array((0.0, 0.0, 0.001))

@@ -5,6 +5,7 @@ Cases are examined for real, by the quick tier.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -21,6 +22,8 @@ import pytest
 import yaml
 from toy_study import TOY, study
 
+from palpate.report.rows import FindingRow
+from palpate.report.scoring import FindingScore
 from palpate.study.digest import digest
 from palpate.study.folder import manifest_of, open_folder, outcomes_of
 from palpate.study.manifest import Case, cases_of
@@ -161,6 +164,26 @@ def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path
     lumps = pd.read_parquet(tmp_path / "lumps.parquet")
     assert len(lumps) == 1, "the lump of clean, which was not found"
     assert not lumps["found"].any()
+
+
+def test_candidates_are_in_the_tables(folder: Path, tmp_path: Path) -> None:
+    outcome = read_outcome(folder, CASES[0].case_id)
+    assert outcome is not None
+    report = outcome.report
+    assert report is not None
+    assert report.scores is not None
+    area = FindingRow(centroid_m=(0, 0, 0), quadrant="umbilical", area_m2=1e-3, ratio=1.4, ratio_90=(1.1, 1.8), confidence=0.3)
+    score = FindingScore(0, None, 0.002, 0.002, 0.1, None, None, None, on_guarding=False)
+    scores = dataclasses.replace(report.scores, findings=(), candidates=(score, dataclasses.replace(score, lump=None)))
+    weighed = [area, area.model_copy(update={"confidence": 0.1})]
+    report = report.model_copy(update={"findings": [], "candidates": weighed, "scores": scores})
+    write_tables(tmp_path, "toy", [outcome.model_copy(update={"report": report})])
+    rows = pd.read_parquet(tmp_path / "findings.parquet").to_dict("records")
+    assert [(row["reported"], row["confidence"], row["lump"]) for row in rows] == [(False, 0.3, 0), (False, 0.1, -1)]
+    (lump,) = pd.read_parquet(tmp_path / "lumps.parquet").to_dict("records")
+    assert (lump["found"], lump["confidence"]) == (False, 0.3)
+    (case,) = pd.read_parquet(tmp_path / "cases.parquet").to_dict("records")
+    assert case["score"] == 0.3
 
 
 def test_a_service_that_is_changed_in_mid_study_is_not_examined_with(tmp_path: Path) -> None:

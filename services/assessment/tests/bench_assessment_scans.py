@@ -216,7 +216,7 @@ def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
 def scored(data: Scan) -> Scores:
     """The scores of what the service makes of a scan."""
     stiffness_map, findings, _ = examine(data)
-    return score(found_of(findings), None if stiffness_map is None else map_of(stiffness_map), truth_of(data.scenario))
+    return score(found_of(findings.findings), None if stiffness_map is None else map_of(stiffness_map), truth_of(data.scenario))
 
 
 def scenario_with(lesions: tuple[Lesion, ...], seed: int) -> Scenario:

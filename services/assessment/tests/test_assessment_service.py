@@ -45,7 +45,7 @@ def examined(small: Scan) -> Examined:
 
 def test_finds_the_lesion(truth: Truth, examined: Examined) -> None:
     stiffness_map, findings, samples = examined
-    s = score(found_of(findings), map_of(stiffness_map), truth)
+    s = score(found_of(findings.findings), map_of(stiffness_map), truth)
     assert (s.matched, s.missed, s.false_findings) == (1, 0, 0)
     assert s.place_error_m is not None
     assert s.place_error_m < 0.005

@@ -36,7 +36,7 @@ def measure(depth_mm: float, seed: int = 0, settings: tuple[str, ...] = ()) -> d
     scans.Tissue = tissue  # type: ignore[misc, assignment]
     data, truth = scans.scan(scenario), scans.truth_of(scenario)
     stiffness_map, findings, _ = scans.examine(data)
-    found = scans.found_of(findings)
+    found = scans.found_of(findings.findings)
     s = scans.score(found, scans.map_of(stiffness_map), truth)
     lesion = np.asarray(scenario.phantom.lesions[0].centre_m)
     return {
