@@ -6,7 +6,7 @@ Backgrounds are Gaussian fields of one length each, scanned as `felt_scans` does
 With the true covariance S of the samples and the bump b of a lump, t = b' S^-1 y / sqrt(b' S^-1 b) is the best test for that
 lump (Kay 1998, "Detection theory", ch. 4); its greatest over places and radii is the ideal observer's, as he does not know
 either. The assessment says the greatest logit of its candidates. Both are judged by the area under the ROC curve (AUC), with its
-95 % interval (Hanley and McNeil 1982).
+95 % interval (Hanley and McNeil 1982), and by the lumps found where each gives 2 % of the healthy patients a finding (Wilson).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 from scipy.stats import mannwhitneyu
+from statsmodels.stats.proportion import proportion_confint
 
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.calibration import learned
@@ -35,16 +36,20 @@ LENGTHS_M: Final = (0.015, 0.05, 0.15)
 NATURAL_SD: Final = 0.2
 """Standard deviation of the logarithm, between places of one person (docs/persons.md)."""
 LEVEL_N: Final = 2.5
-CONTRASTS: Final = (1.3, 2.0)
+CONTRASTS: Final = (1.3, 3.0)
 """Felt contrast of the lumps, evenly spread in its logarithm."""
+CLASSES: Final = ((1.3, 1.5), (1.5, 2.0), (2.0, 3.0))
+"""Felt contrasts by which they are told apart."""
+FALSE_ALARMS: Final = 0.02
+"""Healthy patients with a finding."""
 RADII_M: Final = (0.012, 0.026)
 ERRORS: Final = ScanErrors(stroke_m=3e-4, field_m=8e-4, breathing_m=5e-4, tare_n=0.05)
 """As typical errors and breathing leave them in whole examinations."""
 _CENTRES_M: Final = np.arange(-0.09, 0.0901, 0.01)
 
 
-def patient(length: float, seed: int) -> FeltPatient:
-    """A patient whose background varies over `length` [m]; those of odd seeds have a lump."""
+def patient(length: float, seed: int) -> tuple[FeltPatient, float]:
+    """A patient whose background varies over `length` [m], and the felt contrast of the lump, which odd seeds have, else 1."""
     rng = generator(seed, "ideal-observer")
     axis = np.arange(-HALF_M, HALF_M + 1e-9, PITCH_M)
     places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -54,8 +59,8 @@ def patient(length: float, seed: int) -> FeltPatient:
     background = LEVEL_N * np.exp(NATURAL_SD * unit * noise[border:-border, border:-border])
     x, y = rng.uniform(-0.07, 0.07, 2).tolist()
     lump = Bump(x, y, float(rng.uniform(*RADII_M)))(places).reshape(background.shape)
-    contrast = np.exp(rng.uniform(*np.log(CONTRASTS))) if seed % 2 else 1.0
-    return FeltPatient(background * contrast**lump, background)
+    contrast = float(np.exp(rng.uniform(*np.log(CONTRASTS)))) if seed % 2 else 1.0
+    return FeltPatient(background * contrast**lump, background), contrast
 
 
 def ideal(o: Observations, length: float) -> float:
@@ -89,26 +94,36 @@ def auc(scores: Array, diseased: NDArray[np.bool_]) -> tuple[float, float]:
     return area, float(np.sqrt(variance / (len(sick) * len(well))))
 
 
+def row(scores: Array, contrasts: Array) -> list[str]:
+    """An observer's AUC, and how many lumps of each class it finds, of patients with these felt contrasts (n,)."""
+    area, error = auc(scores, contrasts > 1)
+    threshold = np.quantile(scores[contrasts == 1], 1 - FALSE_ALARMS)
+    words = [f"{area:.2f} ({max(area - 1.96 * error, 0):.2f} to {min(area + 1.96 * error, 1):.2f})"]
+    for low, high in CLASSES:
+        found = scores[(contrasts >= low) & (contrasts < high)] > threshold
+        ends = proportion_confint(found.sum(), len(found), method="wilson") if len(found) else (0.0, 1.0)
+        words.append(f"{found.sum()} of {len(found)}: {100 * ends[0]:.0f} to {100 * ends[1]:.0f} %")
+    return words
+
+
 def main() -> None:
-    """Prints both observers' AUC for each length of the background."""
+    """Prints what both observers make of each length of the background."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--patients", type=int, default=40, help="for each length")
     parser.add_argument("--first-seed", type=int, default=0)
     args = parser.parse_args()
-    print("| background varies over | patients | ideal observer | the assessment | distance |\n|---|---|---|---|---|")
+    classes = " | ".join(f"{low:g} to {high:g}" for low, high in CLASSES)
+    print(f"| background varies over | observer | AUC | found, {classes} |\n|---|---|---|{'---|' * len(CLASSES)}")
     for length in LENGTHS_M:
-        seeds = range(args.first_seed, args.first_seed + args.patients)
-        scores = []
-        for seed in seeds:
-            observations = observe(felt_samples(patient(length, seed), ERRORS, seed), learned())
+        scores, contrasts = [], []
+        for seed in range(args.first_seed, args.first_seed + args.patients):
+            made, contrast = patient(length, seed)
+            observations = observe(felt_samples(made, ERRORS, seed), learned())
             assert observations is not None
             scores.append((ideal(observations, length), ours(observations)))
-        diseased = np.array([seed % 2 == 1 for seed in seeds])
-        (best, best_se), (own, own_se) = (auc(column, diseased) for column in np.array(scores).T)
-        words = [
-            f"{a:.2f} ({max(a - 1.96 * s, 0):.2f} to {min(a + 1.96 * s, 1):.2f})" for a, s in ((best, best_se), (own, own_se))
-        ]
-        print(f"| {1e3 * length:.0f} mm | {len(seeds)} | {words[0]} | {words[1]} | {best - own:.2f} |", flush=True)
+            contrasts.append(contrast)
+        for name, column in zip(("ideal", "the assessment"), np.array(scores).T, strict=True):
+            print(f"| {1e3 * length:.0f} mm | {name} | {' | '.join(row(column, np.array(contrasts)))} |", flush=True)
 
 
 if __name__ == "__main__":

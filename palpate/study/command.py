@@ -111,3 +111,20 @@ def merge_parts(
     from palpate.study.perform import merge_study
 
     merge_study(parts, out or parts[0])
+
+
+@app.command("scenario")
+def scenario_of_case(
+    case: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A case of a study, such as out/study/release-test/cases/ID.json.")
+    ],
+) -> None:
+    """Print the scenario of a case, to examine its patient again with everything a run shows.
+
+    [bold]Example[/]
+
+      palpate study scenario cases/ID.json > patient.yaml && palpate run patient.yaml --composed
+    """
+    from palpate.study.perform import print_scenario
+
+    print_scenario(case)

@@ -26,6 +26,8 @@ from palpate.study.spec import Method, Study, StudyError, checked_study, load_st
 from palpate.study.statistics.reading import TablesError
 from palpate.study.workers import Workers, WorkersError, cluster, cores, threads
 from palpate_bus.implementations import ChoiceError
+from palpate_models.load import dump_scenario
+from palpate_models.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,16 @@ def merge_study(parts: Sequence[Path], folder: Path) -> None:
     except StudyError as error:
         refuse(error)
     _conclude(folder, manifest)
+
+
+def print_scenario(case: Path) -> None:
+    """Prints the scenario of a case, given by the file of its outcome. Ends the command for a file that is none."""
+    try:
+        outcome = Outcome.model_validate_json(case.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it does not hold an outcome of this version"
+        refuse(f"{case} is no case of a study ({why}): want a file such as out/study/NAME-SPLIT/cases/ID.json")
+    print(dump_scenario(Scenario.model_validate(outcome.case.scenario)), end="")
 
 
 def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | None) -> Study:

@@ -33,6 +33,7 @@ from palpate.study.shards import Shard, merge
 from palpate.study.spec import StudyError
 from palpate.study.tables import write_tables
 from palpate.study.workers import cluster, threads
+from palpate_models.load import load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 CASES = cases_of(study())
@@ -164,6 +165,22 @@ def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path
     lumps = pd.read_parquet(tmp_path / "lumps.parquet")
     assert len(lumps) == 1, "the lump of clean, which was not found"
     assert not lumps["found"].any()
+
+
+def test_a_case_can_be_examined_again(folder: Path, tmp_path: Path) -> None:
+    path = case_file(folder, CASES[1].case_id)
+    printed = subprocess.run(
+        [sys.executable, "-m", "palpate", "study", "scenario", str(path)], check=True, capture_output=True, text=True
+    )
+    patient = tmp_path / "patient.yaml"
+    patient.write_text(printed.stdout)
+    again = CASES[1].model_copy(update={"scenario": load_scenario(str(patient)).model_dump(mode="json")})
+    first, second = (read_outcome(place, CASES[1].case_id) for place in (folder, examined(tmp_path / "again", [again])))
+    assert first is not None
+    assert second is not None
+    assert first.report is not None
+    assert second.report is not None
+    assert first.report.run_hash == second.report.run_hash
 
 
 def test_candidates_are_in_the_tables(folder: Path, tmp_path: Path) -> None:
