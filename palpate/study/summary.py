@@ -18,6 +18,7 @@ from palpate.study.spec import load_study, study_names
 from palpate.study.statistics.analysis import Analysis, analyse
 from palpate.study.statistics.calibration import CalibrationRow
 from palpate.study.statistics.comparison import Comparison, compare
+from palpate.study.statistics.contrast import ContrastRow
 from palpate.study.statistics.detectability import Surface
 from palpate.study.statistics.effort import Spread
 from palpate.study.statistics.errors import ErrorsRow
@@ -56,6 +57,8 @@ class MethodRow(Row):
 
     rates: Rates
     populations: dict[str, Rates]
+    contrasts: dict[str, ContrastRow]
+    """By class of felt contrast."""
     auc: Estimate | None
     froc_mean: Estimate | None
     froc: dict[str, Estimate]
@@ -165,6 +168,7 @@ def _method(a: Analysis) -> MethodRow:
     return MethodRow(
         rates=a.rates,
         populations=a.populations,
+        contrasts=a.contrasts,
         auc=None if a.roc is None else a.roc.auc,
         froc_mean=None if a.froc is None else a.froc.mean,
         froc={} if a.froc is None else {f"{rate:g}": value for rate, value in a.froc.at.items()},

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from palpate.study.statistics.calibration import FindingCalibration, calibration
+from palpate.study.statistics.contrast import ContrastRow, by_contrast
 from palpate.study.statistics.detectability import FELT, MADE, Surface, observed, surface
 from palpate.study.statistics.effort import COVERED, MEASURED, Spread, coverage, spread
 from palpate.study.statistics.errors import FindingErrors, finding_errors
@@ -25,6 +26,7 @@ class Analysis:
     cases: pd.DataFrame
     rates: Rates
     populations: dict[str, Rates]
+    contrasts: dict[str, ContrastRow]
     roc: Roc | None
     froc: Froc | None
     felt: Surface | None
@@ -44,6 +46,7 @@ def analyse(variant: Variant, bootstrap: Bootstrap) -> Analysis:
         cases=variant.cases,
         rates=rates(variant, bootstrap),
         populations=by_population(variant, bootstrap),
+        contrasts=by_contrast(variant, bootstrap),
         roc=roc(variant, bootstrap),
         froc=froc(variant, bootstrap),
         felt=surface(variant, FELT, bootstrap),
