@@ -106,7 +106,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         depth_rms_error_m=depth.true_against_setpoint_m,
         depth=depth,
         surface_rms_error_m=_surface(scenario, c.surface, known.body),
-        assessed=final is not None and found is not None,
+        assessed=final is not None and (found is not None or (_draws_no_map(c) and len(steady) > 0)),
         findings=[finding_row(f) for f in ([] if final is None else final.findings)],
         candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
         unassessed_m2={} if c.stiffness_map is None else unassessed_of(c.stiffness_map),
@@ -116,6 +116,11 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         blame=result.blame,
         services=result.counters,
     )
+
+
+def _draws_no_map(c: Collected) -> bool:
+    """Whether the assessment is one that tells findings alone; ours tells samples before its map, and no map of too few."""
+    return c.stiffness_map is None and not c.samples
 
 
 def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:

@@ -29,6 +29,9 @@ from palpate_bus.implementations import ChoiceError
 from palpate_models.load import dump_scenario
 from palpate_models.scenario import Scenario
 
+TOLD = 10
+"""Cases that did not complete that are told one by one."""
+
 
 @dataclass(frozen=True)
 class StudyOrder:
@@ -150,10 +153,13 @@ def _conclude(folder: Path, manifest: Manifest) -> None:
     except (StudyError, TablesError) as error:
         fail(error)
     Console().print(_in_words(found), highlight=False, soft_wrap=True)
-    for outcome in outcomes:
-        if not outcome.completed:
-            tried = f" (attempts: {'; '.join(failures(folder, outcome.case))})" if outcome.status == "failed" else ""
-            Console().print(f"{outcome.case.words}: {outcome.why}{tried}", highlight=False, markup=False, soft_wrap=True)
+    incomplete = [outcome for outcome in outcomes if not outcome.completed]
+    for outcome in incomplete[:TOLD]:
+        tried = f" (attempts: {'; '.join(failures(folder, outcome.case))})" if outcome.status == "failed" else ""
+        why = outcome.why or "nothing was assessed"
+        Console().print(f"{outcome.case.words}: {why}{tried}", highlight=False, markup=False, soft_wrap=True)
+    if len(incomplete) > TOLD:
+        Console().print(f"... and {len(incomplete) - TOLD} more that did not complete", highlight=False)
     Console().print(f"to read: {folder / 'study.html'}", highlight=False, soft_wrap=True)
     if found.failed:
         raise typer.Exit(EXIT_FAILED)

@@ -96,6 +96,15 @@ def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> No
     assert verdict(none).startswith(f"Not assessed: {none.samples} samples are too few for a map")
 
 
+def test_an_assessment_without_map_and_samples_has_assessed_what_was_touched() -> None:
+    scenario, nothing = load_scenario("clean"), Known(None, None, None)
+    threshold = collected()
+    threshold.stiffness_map, threshold.samples = None, []
+    assert assemble(scenario, result(threshold, failure=None), nothing).assessed
+    threshold.exam_states = [state for state in threshold.exam_states if not state.steady]
+    assert not assemble(scenario, result(threshold, failure=None), nothing).assessed
+
+
 def test_what_is_not_assessed_comes_first_and_a_region_that_is_stiff_all_over_is_told() -> None:
     nothing = assemble(load_scenario("clean"), result(collected(), failure=None), Known(None, None, None))
     report = nothing.model_copy(
