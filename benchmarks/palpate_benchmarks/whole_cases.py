@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +22,8 @@ from palpate.report.archive import EvidenceError
 from palpate.report.recover import recovered
 from palpate.run.roles import WORKERS
 from palpate_benchmarks.campaign import COMPLETE, WENT_WITHOUT, FaultCase, FaultFinding
-from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Struck, strike
+from palpate_benchmarks.fault_kinds import SCARCE_KINDS
+from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Blow, Struck, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.recordings import RecordingError
 from palpate_bus.runs.run_folder import remove_leftovers
@@ -41,6 +43,10 @@ KINDS: Final = ("kill", "freeze")
 PARTITION: Final = "partition"
 PARTITIONS_S: Final = (1, 5, 30)
 NETWORK: Final = "network"
+MACHINE: Final = "machine"
+STARVED_S: Final = (1, 5)
+SPINNING: Final = 8
+"""Processes a core that want all of its time while a machine is starved."""
 LONGEST_S: Final = 0.6
 """Drawn cases strike within so much simulated time of contact: a line is no longer."""
 _SAID: Final = re.compile(r".*(the conductor is gone|nothing heard of the conductor).*")
@@ -48,7 +54,7 @@ _SAID: Final = re.compile(r".*(the conductor is gone|nothing heard of the conduc
 
 def is_whole(case: FaultCase) -> bool:
     """Whether a case strikes a run from outside."""
-    return case.kind == PARTITION or (case.kind in KINDS and case.where not in WORKERS)
+    return case.kind in (PARTITION, *SCARCE_KINDS) or (case.kind in KINDS and case.where not in WORKERS)
 
 
 def fixed(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
@@ -58,8 +64,17 @@ def fixed(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> It
             for where in FIXED:
                 if not only or set(where.split(TOGETHER)) & set(only):
                     yield FaultCase(kind, where, mode == "wallclock")
-        if PARTITION in kinds and (not only or NETWORK in only):
-            yield from (FaultCase(PARTITION, f"{NETWORK}, {seconds} s", mode == "wallclock") for seconds in PARTITIONS_S)
+        for kind, where in _others():
+            if kind in kinds and (not only or where.split(",")[0] in only):
+                yield FaultCase(kind, where, mode == "wallclock")
+
+
+def _others() -> Iterator[tuple[str, str]]:
+    """Kind and place of the faults that are neither killed nor frozen processes."""
+    yield from (("memory", role) for role in ROLES)
+    yield "disk", "recorder"
+    yield from (("starve", f"{MACHINE}, {seconds} s") for seconds in STARVED_S)
+    yield from ((PARTITION, f"{NETWORK}, {seconds} s") for seconds in PARTITIONS_S)
 
 
 def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
@@ -75,30 +90,67 @@ def run_whole(case: FaultCase, folder: Path) -> FaultFinding:
     """Runs one case; its logs stay in a folder of its own under `folder`."""
     finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep", at_s=case.at_s)
     begin = time.monotonic()
-    roles = case.where.split(TOGETHER)
-
-    def blow(processes: Mapping[str, psutil.Process]) -> None:
-        number = signal.SIGKILL if case.kind == "kill" else signal.SIGSTOP
-        for role in roles:
-            processes[role].send_signal(number)
-        if case.kind == "freeze" and CONDUCTOR in roles:  # others are ended by their conductor
-            time.sleep(FREEZE_S)
-            for role in roles:
-                if processes[role].is_running():
-                    processes[role].send_signal(signal.SIGCONT)
-
     if case.kind == PARTITION:
-        seconds = float(case.where.split()[1])
-        struck = _parted(case, folder, seconds)
-        roles = ["transport"]
+        struck = _parted(case, folder, _seconds(case))
     else:
-        struck = strike((folder / case.name).resolve(), _runtime(case), blow, case.at_s)
+        struck = strike((folder / case.name).resolve(), _runtime(case), _blow(case), case.at_s)
     finding.wall_s = round(time.monotonic() - begin, 1)
     if struck is None:
         finding.ended = "the fault was never done: the run did not come to depth"
         return finding
-    _judge(finding, struck, roles)
+    _judge(finding, struck, _culprits(case))
     return finding
+
+
+def _culprits(case: FaultCase) -> list[str]:
+    """Words of which one has to be said of the cause."""
+    if case.kind == PARTITION:
+        return ["transport"]
+    return ["machine", "processor", "late", "expired"] if case.kind == "starve" else case.where.split(TOGETHER)
+
+
+def _blow(case: FaultCase) -> Blow:
+    """What does the damage of a case."""
+    if case.kind == "starve":
+        return lambda _: starve(_seconds(case))
+    if case.kind in SCARCE_KINDS:
+        what = {"memory": psutil.RLIMIT_AS, "disk": psutil.RLIMIT_FSIZE}[case.kind]
+        return lambda processes: _no_more(processes[case.where], what)
+    return lambda processes: _signal(case, processes)
+
+
+def _signal(case: FaultCase, processes: Mapping[str, psutil.Process]) -> None:
+    """Kills or freezes the roles of a case; what is frozen with the conductor wakes again."""
+    roles = case.where.split(TOGETHER)
+    number = signal.SIGKILL if case.kind == "kill" else signal.SIGSTOP
+    for role in roles:
+        processes[role].send_signal(number)
+    if case.kind == "freeze" and CONDUCTOR in roles:  # others are ended by their conductor
+        time.sleep(FREEZE_S)
+        for role in roles:
+            if processes[role].is_running():
+                processes[role].send_signal(signal.SIGCONT)
+
+
+def _no_more(process: psutil.Process, what: int) -> None:
+    """Lets a process have no more address space than it has, or lets none of its files grow."""
+    now = process.memory_info().vms if what == psutil.RLIMIT_AS else 0
+    process.rlimit(what, (now, psutil.RLIM_INFINITY))
+
+
+def starve(seconds: float) -> None:
+    """Keeps every core busy for some time [s] with processes that want all of it."""
+    words = [sys.executable, "-c", "while True: pass"]
+    spinning = [subprocess.Popen(words) for _ in range(SPINNING * len(os.sched_getaffinity(0)))]
+    time.sleep(seconds)
+    for process in spinning:
+        process.kill()
+        process.wait()
+
+
+def _seconds(case: FaultCase) -> float:
+    """How long the fault of a case lasts [s]."""
+    return float(case.where.split()[1])
 
 
 def _runtime(case: FaultCase) -> str:
@@ -136,7 +188,7 @@ def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
             failure, kept = str(error), False
     finding.kept = kept
     finding.sign = _first_word(struck) if CONDUCTOR in roles else str(failure or ", ".join(struck.said.get("lost", ())))
-    finding.ended = str(failure or (COMPLETE if finding.kind == PARTITION else WENT_WITHOUT))
+    finding.ended = str(failure or (COMPLETE if finding.kind in (PARTITION, "starve") else WENT_WITHOUT))
     words = f"{finding.sign} {finding.ended}"
     finding.named = any(re.search(rf"(?<![\w/]){role}(?!\w)", words) for role in roles)
     _measure(finding, struck)
@@ -173,7 +225,9 @@ def _measure(finding: FaultFinding, struck: Struck) -> None:
     finding.peak_force_before_n = round(max((force for stamp, force in forces if stamp < split), default=0.0), 2)
     after = [force for stamp, force in forces if stamp >= split]
     finding.peak_force_n = round(max(after), 2) if after else None
-    if any(status.mode == RobotStatus.MODE_SAFE_HOLD for _, status in statuses):
+    if finding.ended == COMPLETE:
+        finding.reaction = "none needed"
+    elif any(status.mode == RobotStatus.MODE_SAFE_HOLD for _, status in statuses):
         finding.reaction = "safe hold"
     elif states and states[-1][1].phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_RETURN, ExamState.PHASE_RETRACT):
         finding.reaction = "lifted off"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
 from palpate_benchmarks.campaign import FaultCase, FaultFinding, cases
 from palpate_benchmarks.struck import CONDUCTOR, ROLES, Struck
-from palpate_benchmarks.whole_cases import FIXED, _judge, drawn, fixed, is_whole
+from palpate_benchmarks.whole_cases import FIXED, _judge, _no_more, drawn, fixed, is_whole
 
 
 def test_the_conductor_and_the_recorder_are_struck_in_both_modes() -> None:
@@ -30,6 +33,25 @@ def test_the_network_is_parted_in_both_modes() -> None:
     assert [case.where for case in parted] == 2 * ["network, 1 s", "network, 5 s", "network, 30 s"]
     assert all(is_whole(case) for case in parted)
     assert not list(cases(["lockstep"], ["partition"], []))
+
+
+def test_scarcity_strikes_every_role_and_the_machine() -> None:
+    kinds = ["memory", "disk", "starve"]
+    listed = list(fixed(["lockstep"], kinds, []))
+    assert {case.where for case in listed if case.kind == "memory"} == set(ROLES)
+    assert {case.where for case in listed if case.kind == "disk"} == {"recorder"}
+    assert [case.where for case in listed if case.kind == "starve"] == ["machine, 1 s", "machine, 5 s"]
+    assert all(is_whole(case) for case in listed)
+    assert [case.kind for case in fixed(["lockstep"], kinds, ["machine"])] == ["starve", "starve"]
+
+
+def test_a_limit_of_memory_is_felt_by_the_process() -> None:
+    words = [sys.executable, "-c", "import sys\nprint(flush=True)\nsys.stdin.readline()\nbytes(10**9)"]
+    process = psutil.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    _no_more(process, psutil.RLIMIT_AS)
+    _, said = process.communicate("\n")
+    assert "MemoryError" in said
 
 
 def test_drawn_cases_follow_their_seed() -> None:
