@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from palpate.quick.patient import seen_lattice
+from palpate.run.outlook import Outlook
 from palpate.run.region import scan_over, surface_of
-from palpate.run.space import expected_duration
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.lbr import HOME
 from palpate_models.load import exam_input
@@ -60,7 +60,7 @@ def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
     contacts = [segment for segment in plan.segments if segment.contact]
     ways = [apply(inverse(X_WA), segment.path.p)[:, :2] for segment in contacts if not segment.touch]
     touches = [apply(inverse(X_WA), segment.path.p)[0, :2] for segment in contacts if segment.touch]
-    return Prospect(scan, tuple(ways), np.array(touches).reshape(-1, 2), plan.skipped, expected_duration(scenario.exam))
+    return Prospect(scan, tuple(ways), np.array(touches).reshape(-1, 2), plan.skipped, Outlook.of(scenario.exam).duration_s)
 
 
 __all__ = ["NoPathError", "Prospect", "prospect"]

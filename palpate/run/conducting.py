@@ -13,7 +13,6 @@ from palpate.command_line import refuse
 from palpate.run.conclusion import conclude
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
-from palpate.run.space import expected_duration
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.conduct import conduct
@@ -38,7 +37,7 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     except (ScenarioError, BusConfigError) as error:
         refuse(error)
     roles = (*workers(chosen), *observers)
-    with RunDisplay(console, quiet, expected_duration(chosen.exam)) as display:
+    with RunDisplay(console, quiet, chosen.exam) as display:
         timing = Timing(wallclock, 1.0 if realtime else None)
         result = conduct(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
     close_session(session)

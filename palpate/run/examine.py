@@ -29,7 +29,7 @@ from palpate.run.repeat import repeat
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
-from palpate.run.space import WatchedRoom, check_room, expected_duration, what_it_takes
+from palpate.run.space import WatchedRoom, check_room, what_it_takes
 from palpate_bus.implementations import ChoiceError, check_libraries
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError, Settings
@@ -108,7 +108,7 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
             check_room(folder, scenario.exam, how.record)
             if not quiet:
                 _announce(console, scenario, how, folder)
-            with RunDisplay(console, quiet, expected_duration(scenario.exam)) as display, given({"PALPATE_RECORD": how.record}):
+            with RunDisplay(console, quiet, scenario.exam) as display, given({"PALPATE_RECORD": how.record}):
                 tell = WatchedRoom(folder, display.tell, say).tell
                 with going_on(None if before is None else before.checkpoint):
                     result = _run(scenario, folder.resolve(), tell, how, observers, absent, groups)

@@ -1,4 +1,4 @@
-"""The progress display of a run: phase, progress, simulated time, real-time factor and force; and the keys that stop it."""
+"""The console of a run: what the arm does and why, how far it is and how long it takes still; and the keys that stop it."""
 
 from __future__ import annotations
 
@@ -7,45 +7,50 @@ from typing import Self
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from palpate_bus.messages import ExamState
+from palpate.run.narration import Narration
+from palpate.run.outlook import Outlook, in_words
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
 from palpate_bus.runs.operator_requests import WORDS
 from palpate_conductor.result import RunProgress
+from palpate_models.scenario import Exam
 
-PHASES = {
-    getattr(ExamState, f"PHASE_{name}"): name.lower()
-    for name in ("HOME", "LOOK", "PLAN", "APPROACH", "INDENT", "SCAN", "RETRACT", "RETURN", "ASSESS", "DONE", "ABORTED", "HELD")
-}
-"""Phase names by value."""
-MINUTE_S = 60.0
+EVERY = 0.1
+"""Where there is no terminal, a line is printed each time that so much of the scan is done."""
 
 
 class RunDisplay:
-    """A progress line on a terminal, and an operator's keys; plain lines at each phase otherwise; nothing when quiet."""
+    """What the arm does and why, a line for each part of the examination, and in a terminal progress and an operator's keys.
 
-    def __init__(self, console: Console, quiet: bool, expected_s: float | None = None) -> None:
-        """`expected_s`: about how long the examination takes, in simulated time [s]; from it the time left is told."""
-        self._expected_s = expected_s
+    Nothing when quiet.
+    """
+
+    def __init__(self, console: Console, quiet: bool, exam: Exam) -> None:
+        """`exam`: from how long it should take follows the time that is left."""
+        self._expected_s = Outlook.of(exam).duration_s
+        self._most = "at most" if exam.searched else "about"
+        self._narration = Narration(exam)
         self._console = console
         self._quiet = quiet
-        self._phase = -1
+        self._heard = False
+        self._told = 0.0
         self._troubles = 0
         self._stopped = ""
         self._keys = OperatorKeys()
         self._bar = Progress(
             SpinnerColumn(),
-            TextColumn("[bold]{task.fields[phase]:<8}"),
-            BarColumn(bar_width=30),
+            TextColumn("[bold]{task.fields[phase]:<9}"),
+            BarColumn(bar_width=20),
             TaskProgressColumn(),
             TextColumn("{task.fields[facts]}"),
+            TimeElapsedColumn(),
             console=console,
             transient=True,
             disable=quiet or not console.is_terminal,
         )
-        self._task = self._bar.add_task("run", total=1.0, phase="starting", facts="")
+        self._task = self._bar.add_task("run", total=1.0, phase="starting", facts="the services start: about 10 s")
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -64,31 +69,36 @@ class RunDisplay:
         exam = progress.collected.exam
         if exam is None:
             return
+        self._heard = True
+        news, part, left = self._narration.news(exam), self._narration.part(exam), self._left(progress)
         facts = (
-            f"t {progress.t / NS:6.1f} s   {progress.real_time_factor:4.2f} x real time   "
-            f"force {exam.normal_force:5.2f} N   depth {max(exam.depth, -0.0999) * 1e3:5.1f} mm{self._left(progress)}"
+            f"{left}   t {progress.t / NS:.0f} s   {progress.real_time_factor:.2f} x real time   "
+            f"{exam.normal_force:5.2f} N   {max(exam.depth, -0.0999) * 1e3:5.1f} mm"
         )
-        done = exam.target_index / exam.target_count if exam.target_count else 0.0
-        self._bar.update(self._task, completed=done, phase=PHASES[exam.phase], facts=facts)
-        if exam.phase != self._phase:
-            self._phase = exam.phase
-            if not self._quiet:
-                self._console.print(
-                    f"[dim]{progress.t / NS:8.2f} s[/dim]  {PHASES[exam.phase]:<9} {escape(exam.message)}", highlight=False
-                )
+        self._bar.update(self._task, completed=min(1.0, progress.t / NS / self._expected_s), phase=part, facts=facts)
+        if self._quiet:
+            return
+        if news is not None:
+            self._say(progress, *news)
+        elif not self._console.is_terminal and self._narration.done(exam) >= self._told + EVERY:
+            self._told = self._narration.done(exam)
+            self._say(progress, part, f"{self._told:.0%} done, {left}")
+
+    def _say(self, progress: RunProgress, part: str, sentence: str) -> None:
+        self._console.print(f"[dim]{progress.t / NS:8.2f} s[/dim]  {part:<9} {escape(sentence)}", highlight=False, soft_wrap=True)
 
     def _left(self, progress: RunProgress) -> str:
-        """About how long the run takes still, by the clock; nothing where that is not known."""
-        if self._expected_s is None or progress.real_time_factor <= 0:
+        """About how long the run takes still, by the clock."""
+        if progress.real_time_factor <= 0:
             return ""
         left = max(0.0, self._expected_s - progress.t / NS) / progress.real_time_factor
-        return f"   about {left / MINUTE_S:.0f} min left" if left > MINUTE_S else f"   about {left:.0f} s left"
+        return f"{self._most} {in_words(left)} left"
 
     def _obey(self, progress: RunProgress) -> None:
         """Passes on what an operator's keys say, and shows what the supervisor makes of it."""
         if self._bar.disable or progress.request is None:
             return
-        if self._phase < 0 and not self._keys.attached and self._keys.__enter__().attached:
+        if not self._heard and not self._keys.attached and self._keys.__enter__().attached:
             self._console.print(f"[dim]{HINT}[/]", highlight=False)
         for word in self._keys.pressed():
             progress.request(WORDS[word], "a key of palpate run")

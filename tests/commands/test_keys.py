@@ -13,6 +13,7 @@ from palpate_bus.messages import OperatorRequest
 from palpate_conductor.collector import Collected
 from palpate.run.progress import RunDisplay
 from palpate_conductor.result import RunProgress
+from palpate_models.scenario import Exam
 from rich.console import Console
 
 collected, asked = Collected(), []
@@ -20,7 +21,7 @@ def request(number, reason):
     asked.append(number)
     stops = number in (OperatorRequest.STOP, OperatorRequest.SOFT_STOP)
     collected.supervisor = SimpleNamespace(level=int(stops), reason="an operator" if stops else "")
-with RunDisplay(Console(stderr=True, width=200), False) as display:
+with RunDisplay(Console(stderr=True, width=200), False, Exam()) as display:
     while len(asked) < 3:
         display.tell(RunProgress(0, 1.0, collected, (), request))
         time.sleep(0.01)

@@ -15,9 +15,8 @@ from rich.console import Console
 from palpate.command_line import EXIT_FAILED
 from palpate.run.conclusion import conclude
 from palpate.run.folder import FolderError
-from palpate.run.progress import RunDisplay
-from palpate.run.space import WatchedRoom, another_folder, check_room, expected_duration, what_it_takes
-from palpate_bus.messages.stamps import NS
+from palpate.run.outlook import Outlook
+from palpate.run.space import WatchedRoom, another_folder, check_room, what_it_takes
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunProgress
 from palpate_models.load import load_scenario
@@ -49,7 +48,8 @@ def test_it_is_said_before_the_start_how_long_it_takes_and_how_much_it_writes() 
 
 
 def test_a_larger_region_and_points_take_longer() -> None:
-    assert expected_duration(Exam(region_m=(0.1, 0.1))) < expected_duration(Exam()) < expected_duration(Exam(mode=Mode.POINT))
+    small, whole, points = (Outlook.of(exam).duration_s for exam in (Exam(region_m=(0.1, 0.1)), Exam(), Exam(mode=Mode.POINT)))
+    assert small < whole < points
 
 
 def test_a_disk_that_fills_up_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,10 +92,3 @@ def test_findings_are_printed_even_if_no_folder_takes_them(
     out, err = capsys.readouterr()
     assert "RLQ" in out
     assert "nothing is kept but what is printed here" in err.replace("\n", "")
-
-
-def test_the_time_left_is_told_by_the_clock() -> None:
-    display = RunDisplay(Console(quiet=True), True, expected_s=400.0)
-    for t_s, said in ((100, "about 2 min left"), (360, "about 20 s left"), (450, "about 0 s left")):
-        assert display._left(RunProgress(t_s * NS, 2.0, Collected(), ())).strip() == said
-    assert RunDisplay(Console(quiet=True), True)._left(RunProgress(NS, 2.0, Collected(), ())) == ""

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from palpate_models.frames import Array
+from palpate_models.patterns.touches import touch_centres
 from palpate_models.scenario import Mode
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-TOUCHES_M = 0.07
-"""Largest distance of the touches before the scan: they fix offset, tilt and field of the perceived surface."""
 SAMPLE_M = 0.002
 """Spacing of the samples of a stroke."""
 JOIN_SPACINGS = 2.5
@@ -132,14 +131,10 @@ def strokes(
 
 def touches(xy: Array, usable: Bools) -> list[Stroke]:
     """Touches at usable targets, spread over all of them: near the centres of equal cells, the last one near the first target."""
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    counts = np.maximum(1, np.ceil((high - low) / TOUCHES_M - 1e-9)).astype(int)
-    columns, rows = (low[k] + (high[k] - low[k]) * (np.arange(counts[k]) + 0.5) / counts[k] for k in (0, 1))
-    centres = np.array([(x, y) for j, y in enumerate(rows) for x in columns[:: -1 if j % 2 else 1]])
-    if np.linalg.norm(centres[-1] - xy[0]) > np.linalg.norm(centres[0] - xy[0]):
-        centres = centres[::-1]
     candidates = np.flatnonzero(usable)
-    nearest = [candidates[np.argmin(np.linalg.norm(xy[candidates] - c, axis=1))] for c in centres] if len(candidates) else []
+    if not len(candidates):
+        return []
+    nearest = [candidates[np.argmin(np.linalg.norm(xy[candidates] - c, axis=1))] for c in touch_centres(xy)]
     return [Stroke(xy[[i]], np.array([i]), np.zeros(1, np.int64), touch=True) for i in dict.fromkeys(nearest)]
 
 
