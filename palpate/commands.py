@@ -5,6 +5,7 @@ plotting library, and `palpate --help` imports none of them: it reads what each 
 from __future__ import annotations
 
 import ast
+import shutil
 import sys
 from importlib import import_module
 from importlib.metadata import version
@@ -71,6 +72,10 @@ EXTRAS = {
     "fuzz": "fuzz",
 }
 """What installs the libraries of a command that the default examination does not need."""
+MARGIN = 1
+"""Columns that Typer leaves free on each side of a command's help."""
+INDENT = "  "
+"""Of an example."""
 COMMANDS = {word: where for group in GROUPS.values() for word, where in group.items()}
 
 
@@ -85,8 +90,11 @@ def main() -> None:
         _lacking(word, error)
 
 
-def app_for(word: str) -> typer.Typer:
-    """The app that has the command `word` alone; for a word that is not in the table, one that can only list them all."""
+def app_for(word: str, columns: int | None = None) -> typer.Typer:
+    """The app that has the command `word` alone; for a word that is not in the table, one that can only list them all.
+
+    Its help is laid out for so many columns, by default those of the terminal.
+    """
     app = typer.Typer(
         name="palpate",
         help=HELP,
@@ -97,7 +105,7 @@ def app_for(word: str) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     if word in COMMANDS:
-        _add(app, word)
+        _add(app, word, columns or shutil.get_terminal_size().columns)
         return app
     for group, commands in GROUPS.items():
         for name, where in commands.items():
@@ -123,7 +131,7 @@ def _listed() -> None:
     """Stands for a command in the list of commands."""
 
 
-def _add(app: typer.Typer, word: str) -> None:
+def _add(app: typer.Typer, word: str, columns: int) -> None:
     module, _, attribute = COMMANDS[word].partition(":")
     try:
         command = getattr(import_module(module), attribute)
@@ -134,16 +142,31 @@ def _add(app: typer.Typer, word: str) -> None:
         sys.exit(EXIT_BAD_INPUT)
     if isinstance(command, typer.Typer):
         for own in command.registered_commands:
-            own.help = own.help or _flowing(own.callback)
+            own.help = own.help or _flowing(own.callback, columns)
         app.add_typer(command, name=word)
     else:
-        app.command(word, help=_flowing(command))(command)
+        app.command(word, help=_flowing(command, columns))(command)
 
 
-def _flowing(command: object) -> str:
-    """A command's docstring with each paragraph on a line of its own, for a terminal of any width to break."""
+def _flowing(command: object, columns: int) -> str:
+    """A command's docstring with each paragraph on a line of its own, for a terminal of any width to break, and its examples."""
     paragraphs = (getdoc(command) or "").split("\n\n")
-    return "\n\n".join(part if part.startswith(" ") else part.replace("\n", " ") for part in paragraphs)
+    words = [part.replace("\n", " ") for part in paragraphs if not part.startswith(" ")]
+    examples = [part.strip() for part in paragraphs if part.startswith(" ")]
+    return "\n\n".join([*words, _examples(examples, columns)] if examples else words)
+
+
+def _examples(examples: list[str], columns: int) -> str:
+    """Commands with what each does beside it, or below it where so many columns are too few for that."""
+    lines = [example.partition("  ")[::2] for example in examples]
+    widest = max(len(line) for line, _ in lines)
+    told = [(line, words.strip()) for line, words in lines]
+    beside = [f"{INDENT}{line:<{widest}}  {words}".rstrip() for line, words in told]
+    if max(map(len, beside)) <= columns - 2 * MARGIN:
+        laid = beside
+    else:
+        laid = [part for line, words in told for part in (INDENT + line, *([3 * INDENT + words] if words else []))]
+    return "\n".join(f"[dim][/]{line}" for line in laid)  # an empty style, since Typer takes the indentation of a paragraph away
 
 
 def _lacking(word: str, error: ModuleNotFoundError) -> NoReturn:

@@ -134,10 +134,13 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
 def simulate(
     file: Annotated[Path, typer.Argument(help="An FMU; an abdomen is probed, any other one run as it is.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="PNG to write; a CSV is written next to it.")] = Path("probing.png"),
-    at: Annotated[tuple[float, float], typer.Option(help="Where to press, x and y in the abdomen frame [m].")] = (0.0, 0.05),
-    depth: Annotated[float, typer.Option(min=0.001, max=0.03, help="How deep [m].")] = 0.010,
-    speed: Annotated[float, typer.Option(min=0.001, max=0.2, help="How fast [m/s].")] = 0.02,
-    hold: Annotated[float, typer.Option(min=0, max=60, help="How long it is held [s].")] = 1.0,
+    at: Annotated[tuple[float, float], typer.Option(help="Where to press: x and y in the abdomen frame, in metres.")] = (
+        0.0,
+        0.05,
+    ),
+    depth: Annotated[float, typer.Option(min=0.001, max=0.03, help="How deep, in metres.")] = 0.010,
+    speed: Annotated[float, typer.Option(min=0.001, max=0.2, help="How fast, in m/s.")] = 0.02,
+    hold: Annotated[float, typer.Option(min=0, max=60, help="How long it is held, in seconds.")] = 1.0,
 ) -> None:
     """Press into an abdomen, hold and withdraw, and plot the force against the depth; run any other FMU and plot its outputs."""
     from palpate_fmu.compiling import native

@@ -25,6 +25,9 @@ Made by `make docs` from the definitions in [`bus/palpation_msgs/msg`](../../bus
 carries which message, how often and in which frame: [topics](../topics.md).
 """
 
+PAGE_COLUMNS = 200
+"""Of an example on the page, with what it does beside it."""
+
 
 def commands_page() -> str:
     """Every command with its arguments and options."""
@@ -32,7 +35,7 @@ def commands_page() -> str:
     for group, words in GROUPS.items():
         parts.append(f"## {group}\n")
         for word in words:
-            for path, command in walked(typer.main.get_command(app_for(word))):
+            for path, command in walked(typer.main.get_command(app_for(word, PAGE_COLUMNS))):
                 parts += _command(path, command)
     return "\n".join(parts).rstrip() + "\n"
 

@@ -14,8 +14,8 @@ def replay(  # noqa: PLR0913 - the options of a command
         str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Run this service again: tissue, tissue=fmu, ...")
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, help="Simulated seconds per second.")] = 1.0,
-    begin: Annotated[float, typer.Option("--from", min=0.0, help="Simulated time to begin at [s].")] = 0.0,
-    length: Annotated[float | None, typer.Option("--for", min=0.0, help="How long to play [s].")] = None,
+    begin: Annotated[float, typer.Option("--from", min=0.0, help="Simulated time to begin at, in seconds.")] = 0.0,
+    length: Annotated[float | None, typer.Option("--for", min=0.0, help="How long to play, in simulated seconds.")] = None,
     topics: Annotated[list[str] | None, typer.Option("--topic", help="Play these topics only; may be repeated.")] = None,
     listen: Annotated[
         str | None, typer.Option(help="Endpoint to play at; by default what PALPATE_LISTEN and PALPATE_ROUTER say.")
@@ -36,15 +36,15 @@ def replay(  # noqa: PLR0913 - the options of a command
 
       palpate replay out/lump-20260101-120000           plays the run on the bus, in real time
 
-      palpate replay recording.mcap --rate 4 --hold             four times as fast, then stays on the bus
+      palpate replay recording.mcap --rate 4 --hold     four times as fast, then stays on the bus
 
-      palpate replay RUN --service control                      runs the controller on the recorded inputs and compares
+      palpate replay RUN --service control              runs the controller on the recorded inputs and compares
 
-      palpate replay RUN --service tissue=fmu --tolerance 1e-4  another implementation of a role
+      palpate replay RUN --service tissue=fmu --tolerance 1e-4    another implementation of a role
 
-      palpate replay RUN --service tissue --from 9 --for 0.3 --update-refs tissue.mcap     cuts a reference
+      palpate replay RUN --service tissue --for 0.3 --update-refs tissue.mcap    cuts a reference
 
-      palpate replay tissue.mcap --service tissue --update-refs tissue.mcap                renews it
+      palpate replay tissue.mcap --service tissue --update-refs tissue.mcap      renews it
     """
     from palpate.replay.perform import Passage, Playing, play, run_again, write_reference
 

@@ -50,7 +50,12 @@ class RunDisplay:
             transient=True,
             disable=quiet or not console.is_terminal,
         )
-        self._task = self._bar.add_task("run", total=1.0, phase="starting", facts="the services start: about 10 s")
+        self._task = self._bar.add_task(
+            "run",
+            total=1.0,
+            phase="starting",
+            facts="the services start: some seconds, a minute or more on a first run, which compiles",
+        )
 
     def __enter__(self) -> Self:
         self._bar.start()

@@ -11,6 +11,7 @@ from importlib.metadata import version
 
 import pytest
 import typer
+from rich.text import Text
 from typer.testing import CliRunner
 
 from palpate import commands
@@ -123,6 +124,18 @@ def test_options_are_alike_everywhere(word: str) -> None:
             assert "-q" in options["--quiet"].opts, path
         for name, option in options.items():
             assert not re.search(r"\bms\b|[Mm]illisecond", option.help or ""), f"{path} {name}: times are in seconds"
+
+
+@pytest.mark.parametrize("word", sorted(COMMANDS))
+def test_help_reads_well_in_a_terminal_of_80_columns(word: str) -> None:
+    for path, command in walked(typer.main.get_command(app_for(word, 80))):
+        for line in command.help.splitlines():
+            plain = Text.from_markup(line).plain
+            if plain.startswith(" "):  # an example; what is no example flows
+                assert len(plain) <= 78, f"{path}: {plain}"
+        for option in command.params:
+            told = getattr(option, "help", "") or ""
+            assert Text.from_markup(told).plain == told, f"{path} {option.name}: brackets are not printed"
 
 
 def test_ctrl_c_during_the_start_is_a_line() -> None:
