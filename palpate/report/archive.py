@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from palpate.truth.pressed import Pressed
 from palpate.truth.touched import Touched
-from palpate_bus.messages import codec
+from palpate_assessment.seen_breath import BreathingShares, depth_seen
+from palpate_bus.messages import SurfaceMotion, codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected
 from palpate_models.frames import Array
@@ -59,6 +60,8 @@ class Evidence:
     """ExamState.PHASE_*, shape (n,)."""
     depth: Array
     """Measured [m], along the inward normal from the perceived rest surface; negative before contact."""
+    depth_seen: Array
+    """The same by the breath that was seen afterwards instead of its forecast [m], as the assessment has it."""
     setpoint: Array
     """[m]"""
     force: Array
@@ -121,6 +124,7 @@ def write_evidence(
         "phase": np.array([s.phase for s in states], dtype=np.uint8),
         **{name: np.array([getattr(s, field) for s in states], dtype=np.float32) for name, field in _FLOATS.items()},
         **{name: np.array([getattr(s, name) for s in states], dtype=bool) for name in _FLAGS},
+        "depth_seen": _depth_seen(c).astype(np.float32),
         "visited": np.array([s.target_index for s in states], dtype=np.uint32),
         "skipped": np.array([s.targets_skipped for s in states], dtype=np.uint32),
         "target_count": np.array(max((s.target_count for s in states), default=0)),
@@ -140,6 +144,19 @@ def write_evidence(
     if pressed is not None:
         columns |= {f"pressed_{name}": values for name, values in vars(pressed).items()}
     np.savez_compressed(path, **columns)
+
+
+def _depth_seen(c: Collected) -> Array:
+    """Depths of the exam states by the breath that was seen [m], shape (n,)."""
+    told = np.array([(nanoseconds(s.header.stamp) / NS, s.depth, s.wall_displacement) for s in c.exam_states]).reshape(-1, 3)
+    time, depth, followed = told.T
+    motions = [m for m in c.motions if m.state in (SurfaceMotion.QUIET, SurfaceMotion.SPOILED)]
+    if c.surface is None or not motions:
+        return np.asarray(depth)
+    shares = BreathingShares(np.asarray(c.surface.vertices, dtype=float).reshape(-1, 3), np.asarray(c.surface.breathing))
+    places = np.array([(s.surface_point.x, s.surface_point.y, s.surface_point.z) for s in c.exam_states])
+    exposed, displacement = np.array([(nanoseconds(m.header.stamp) / NS, m.displacement) for m in motions]).T
+    return depth_seen(time, depth, followed, shares(places), (exposed, displacement))
 
 
 _FLOATS: Final = {"depth": "depth", "setpoint": "depth_setpoint", "force": "normal_force"}

@@ -6,6 +6,7 @@ What goes on with DIR has its results in DIR/resumed, and what goes on with that
 from __future__ import annotations
 
 import tempfile
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from palpate.report.evidence import points
 from palpate_assessment.sampling import columns
 from palpate_assessment.service import AssessmentService
 from palpate_bus.messages.geometry import vector
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.settings import variable
 from palpate_conductor.collector import Collected
 from palpate_models.checkpoint import Checkpoint
@@ -110,7 +111,12 @@ def _reached(runs: list[BrokenOff]) -> Checkpoint:
 def _after(run: BrokenOff, earlier: Checkpoint | None) -> Checkpoint:
     known, c = exam_input(run.scenario), run.collected
     assessment = AssessmentService(known, earlier)
+    if c.surface is not None:
+        assessment.perceive(c.surface)
+    motions = deque(c.motions)
     for state in c.exam_states:
+        while motions and nanoseconds(motions[0].header.stamp) <= nanoseconds(state.header.stamp):
+            assessment.hear(motions.popleft())
         assessment.take(state)
     X_AW = inverse(np.array(known.X_WA))
     if c.surface is None or c.targets is None:  # it had not looked yet

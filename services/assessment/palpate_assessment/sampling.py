@@ -41,6 +41,8 @@ class ContactState:
     """Number of the latest descent."""
     depth_uncertainty: float = 0.0
     """One sigma of the depth [m]."""
+    followed: float = 0.0
+    """How far the set-point, and the depth with it, followed the skin by the breath [m]."""
 
 
 @dataclass(frozen=True)

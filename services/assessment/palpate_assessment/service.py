@@ -12,8 +12,9 @@ from palpate_assessment.calibration import learned
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
+from palpate_assessment.seen_breath import SeenBreath
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
+from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
@@ -23,7 +24,7 @@ from palpate_models.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.phantom import quadrant
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.scenario import ExamInput, Following, Scenario
 
 FRAME = contract().topics["assessment/map"].frame or ""
 PITCH = 0.005
@@ -41,6 +42,8 @@ TOLD_AT_ONCE = 50
 NOTICED_S = 1.0
 """A patient who moves is noticed within this time."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
+SEEN = frozenset({SurfaceMotion.QUIET, SurfaceMotion.SPOILED})
+"""What perception says of the wall when it has seen it, and where it was expected."""
 FINISHED = frozenset({ExamState.PHASE_ASSESS, ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
 
 
@@ -56,6 +59,7 @@ class AssessmentService(Service):
         self._R_AW, self._p_AW = self._X_AW[:3, :3], self._X_AW[:3, 3]
         self._reach = float(np.clip(0.8 * exam.exam.spacing_m, 0.006, 0.020))
         self._sampler = Sampler()
+        self._breath = SeenBreath()
         self.samples: list[ForceSample] = [] if before is None else samples_of(before.felt)
         """What was felt so far."""
         self._untold = list(self.samples)
@@ -72,13 +76,14 @@ class AssessmentService(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Samples as they come, a map every few seconds, and once the scan is over the final map and the findings."""
         for surface in inbox.new("perception/surface"):
-            self._perceive(surface)
+            self.perceive(surface)
+        for motion in inbox.new("perception/motion"):
+            self.hear(motion)
         phase = None
         new, self._untold = self._untold[:TOLD_AT_ONCE], self._untold[TOLD_AT_ONCE:]
         for state in inbox.new("exam/state"):
             phase = int(state.phase)
-            if (sample := self.take(state)) is not None:
-                new.append(sample)
+            new += self.take(state)
         outbox: dict[str, Message | list[Message]] = {}
         if new:
             outbox["assessment/samples"] = [sample_message(s) for s in new]
@@ -89,16 +94,22 @@ class AssessmentService(Service):
             outbox |= self._grow(t)
         return outbox
 
-    def take(self, state: Message) -> ForceSample | None:
-        """Takes the next `exam/state`; returns the sample that it completes, if any."""
+    def hear(self, motion: Message) -> None:
+        """Takes the next `perception/motion`."""
+        if motion.state in SEEN and self._exam.breathing is not Following.IGNORE:
+            self._breath.hear(nanoseconds(motion.header.stamp) / NS, float(motion.displacement))
+
+    def take(self, state: Message) -> list[ForceSample]:
+        """Takes the next `exam/state`; returns the samples that are complete now. The last ones are at the end of the scan."""
         if state.patient_moved:
             self._forget_motion(nanoseconds(state.header.stamp) / NS)
-            return None
+            return []
         self._moved_at = None
-        sample = self._sampler.add(self._state(state))
-        if sample is not None:
-            self.samples.append(sample)
-        return sample
+        self._breath.take(self._state(state))
+        settled = self._breath.settled(at_once=state.phase in FINISHED)
+        new = [sample for one in settled if (sample := self._sampler.add(one)) is not None]
+        self.samples += new
+        return new
 
     def finish(self) -> Mapping[str, Any]:
         """How much was assessed."""
@@ -109,14 +120,16 @@ class AssessmentService(Service):
             "findings": 0 if final is None else len(final.findings),
         }
 
-    def _perceive(self, message: Message) -> None:
+    def perceive(self, message: Message) -> None:
+        """Takes a `perception/surface`. Raises ValueError for one in another frame than the contract's."""
         wanted = contract().topics["perception/surface"].frame
         if message.header.frame_id != wanted:
             raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
+        p_A = apply(self._X_AW, np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3))
+        self._breath.perceive(p_A, np.asarray(message.breathing, dtype=np.float64))
         if self._surface is not None and self.samples:
             return  # a look at a patient who has moved: all is told where the first look saw it
-        p_W = np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3)
-        self._surface = apply(self._X_AW, p_W)
+        self._surface = p_A
         self._coarse = self._grid(GROWING_PITCH)
 
     def _grid(self, pitch: float) -> MapGrid:
@@ -136,12 +149,14 @@ class AssessmentService(Service):
             force_limited=bool(message.force_limited),
             stroke=int(message.stroke),
             depth_uncertainty=float(message.depth_uncertainty),
+            followed=float(message.wall_displacement),
         )
 
     def _forget_motion(self, t: float) -> None:
         """The patient was seen to have moved at `t` [s]: what was felt just before, and is felt from now on, lies elsewhere."""
         if self._moved_at is None:
             self._moved_at = t
+            self._breath.forget()
             self.samples = [sample for sample in self.samples if sample.time < t - NOTICED_S]
 
     def _due(self, t: int) -> bool:

@@ -24,6 +24,8 @@ class Collected:
 
     exam_states: list[Any] = field(default_factory=list)
     indentation: list[Any] = field(default_factory=list)
+    motions: list[Any] = field(default_factory=list)
+    """How perception saw the wall move."""
     exam_time: int = -1
     """Simulated time [ns] of the newest exam state, -1 before the first: by its number: no clock can spoil that."""
     samples: list[Any] = field(default_factory=list)
@@ -68,6 +70,7 @@ class Collector(Service):
         seen = inbox.stamp("exam/state")
         c.exam_time = -1 if seen is None else seen
         c.indentation.extend(inbox.new("truth/indentation"))
+        c.motions.extend(inbox.new("perception/motion"))
         c.samples.extend(inbox.new("assessment/samples"))
         for status in inbox.new("robot/status"):
             last = c.status_changes[-1] if c.status_changes else None

@@ -1,0 +1,106 @@
+"""Depth by the breath that was seen.
+
+Planning counts depth from where it expects the wall, displaced by f = m(x) w'(t), with the shape m of the breathing motion and
+perception's forecast w', for the images of now come a tenth of a second later. The assessment can wait for them: they show
+w(t), and
+
+    d = d' + m(x) w(t) - f
+
+is the depth d' as it would have been told had it been known then.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from palpate_assessment.sampling import ContactState
+from palpate_models.frames import Array
+
+LONGEST_S: Final = 0.5
+"""Images further apart tell nothing of the time between them, and a state waits no longer for the next."""
+IMAGES: Final = 40
+"""So many images are remembered, 4 s of them."""
+
+
+def depth_seen(time: Array, depth: Array, followed: Array, share: Array, images: tuple[Array, Array]) -> Array:
+    """Depths [m] at times [s] by the displacements that images show, shape (n,) each; as they were told where none are near.
+
+    `followed`: how far the set-point followed the wall there [m]; `share`: m there; `images`: times of exposure [s], ascending,
+    and displacements of the wall where it moves most [m], shape (k,) each.
+    """
+    exposed, displacement = images
+    if len(exposed) < 2:
+        return depth
+    after = np.clip(np.searchsorted(exposed, time), 1, len(exposed) - 1)
+    between = (exposed[after - 1] <= time) & (time <= exposed[after]) & (exposed[after] - exposed[after - 1] <= LONGEST_S)
+    return np.where(between, depth + share * np.interp(time, exposed, displacement) - followed, depth)
+
+
+class BreathingShares:
+    """How far breathing moves each place of the perceived surface, 1 where it moves the wall most."""
+
+    def __init__(self, vertices: Array, breathing: Array) -> None:
+        """Vertices [m], shape (n, 3), and their share of the motion, (n,); empty where the wall is not known to move."""
+        self._vertices, self._breathing = cKDTree(vertices), breathing
+
+    def __call__(self, points: Array) -> Array:
+        """The share at points of the surface [m], in the frame of the vertices, shape (k, 3) -> (k,)."""
+        if not len(self._breathing):
+            return np.zeros(len(points))
+        return np.asarray(self._breathing[self._vertices.query(points)[1]])
+
+
+class SeenBreath:
+    """Holds states back until the breath of their moment has been seen."""
+
+    def __init__(self) -> None:
+        self._exposed: deque[float] = deque(maxlen=IMAGES)
+        self._displacement: deque[float] = deque(maxlen=IMAGES)
+        self._shares: BreathingShares | None = None
+        self._waiting: list[ContactState] = []
+
+    def perceive(self, vertices: Array, breathing: Array) -> None:
+        """Takes the perceived surface, in A: vertices and their shares as `BreathingShares` has them."""
+        self._shares = BreathingShares(vertices, breathing)
+
+    def hear(self, exposed: float, displacement: float) -> None:
+        """An image exposed at a time [s] shows the wall displaced so far where it moves most [m]."""
+        self._exposed.append(exposed)
+        self._displacement.append(displacement)
+
+    def take(self, state: ContactState) -> None:
+        """Takes the next state."""
+        self._waiting.append(state)
+
+    def forget(self) -> None:
+        """What waits is of no use any more."""
+        self._waiting.clear()
+
+    def settled(self, at_once: bool = False) -> list[ContactState]:
+        """States that need not wait any longer, in order: their breath was seen, no image comes, or all are wanted `at_once`."""
+        if not self._waiting:
+            return []
+        newest = self._waiting[-1].time
+        until = newest - LONGEST_S if self._follows(newest) and not at_once else newest
+        until = max(until, self._exposed[-1]) if self._exposed else until
+        count = sum(state.time <= until for state in self._waiting)
+        ready, self._waiting = self._waiting[:count], self._waiting[count:]
+        return self._seen(ready)
+
+    def _follows(self, t: float) -> bool:
+        """Whether images can be expected to tell more."""
+        return self._shares is not None and bool(self._exposed) and t - self._exposed[-1] <= LONGEST_S
+
+    def _seen(self, states: Sequence[ContactState]) -> list[ContactState]:
+        if self._shares is None or not states:
+            return list(states)
+        time, depth, followed = np.array([(state.time, state.depth, state.followed) for state in states]).T
+        share = self._shares(np.array([state.position for state in states]))
+        depths = depth_seen(time, depth, followed, share, (np.array(self._exposed), np.array(self._displacement)))
+        return [replace(state, depth=float(d)) for state, d in zip(states, depths, strict=True)]
