@@ -16,7 +16,7 @@ from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session
 from palpate_conductor.conduct import conduct
 from palpate_conductor.handover import ROLES
 from palpate_conductor.outcome import Patience
-from palpate_conductor.result import RunResult, Tell
+from palpate_conductor.result import RunProgress, RunResult, Tell
 from palpate_conductor.timing import Timing
 from palpate_conductor.tree import FrameTree
 from palpate_models.load import exam_input
@@ -54,6 +54,13 @@ def run_distributed(
         _check_shares(processes[role], absent)
     files = write_scenario_files(scenario, out)
     local = LocalProcesses(groups, out, files, timing, kept(observers), secure)
+    begun = False
+
+    def told(progress: RunProgress) -> None:
+        nonlocal begun
+        begun = True
+        tell(progress)
+
     try:
         options = local.bus["conductor"]
         session = open_session(replace(options, drop_wait_us=WALL_CLOCK_DROP_WAIT_US) if timing.wallclock else options)
@@ -75,14 +82,14 @@ def run_distributed(
         try:
             tree = FrameTree(exam_input(scenario))
             with local.as_conductor():
-                result = conduct(session, roles, tell, local.ended, timing, patience, begin, tree)
+                result = conduct(session, roles, told, local.ended, timing, patience, begin, tree)
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
             return result
         finally:
             close_session(session)
     finally:
-        local.stop()
+        local.stop(at_once=not begun)
 
 
 def _check(process: ServiceProcess, scenario: Scenario) -> None:

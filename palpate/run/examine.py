@@ -19,7 +19,7 @@ from palpate.run.composed import run_composed
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import FolderError, results_folder, usual_folder
+from palpate.run.folder import FolderError, results_folder, unless_begun, usual_folder
 from palpate.run.options import Record
 from palpate.run.placement import Groups, PlacementError, placement
 from palpate.run.places import Absent, PlaceError
@@ -110,8 +110,13 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
                 _announce(console, scenario, how, folder)
             with RunDisplay(console, quiet, scenario.exam) as display, given({"PALPATE_RECORD": how.record}):
                 tell = WatchedRoom(folder, display.tell, say).tell
-                with going_on(None if before is None else before.checkpoint):
+                with (
+                    unless_begun(folder, lambda: display.begun),
+                    going_on(None if before is None else before.checkpoint),
+                ):
                     result = _run(scenario, folder.resolve(), tell, how, observers, absent, groups)
+                    if result.unbegun:
+                        raise KeyboardInterrupt
                 if before is not None:
                     result = replace(result, run_hash=None, earlier=before.earlier)
             conclude(console, folder, scenario, result, quiet, how.as_json)

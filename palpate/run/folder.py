@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -25,6 +25,17 @@ class FolderError(ValueError):
 def usual_folder(scenario: str) -> Path:
     """Where the results of a scenario of this name go unless it is said where."""
     return Path("out") / f"{scenario}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+@contextmanager
+def unless_begun(path: Path, begun: Callable[[], bool]) -> Iterator[None]:
+    """Removes the folder again when Ctrl-C or a mistake ends what is within before it has `begun`: it holds no result then."""
+    try:
+        yield
+    except BaseException:
+        if not begun():
+            shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 @contextmanager

@@ -58,7 +58,9 @@ class Narration:
         return "search" if self._exam.searched else "scan"
 
     def done(self, state: Any) -> float:
-        """The part of the presses that are over, 0 to 1."""
+        """The part of the presses that are over, 0 to 1; a touch before them is at one of their targets too."""
+        if state.phase in STROKE and self._touching(state):
+            return 0.0
         whole = self._outlook.presses if self._exam.searched else state.target_count
         return min(1.0, state.target_index / whole) if whole else 0.0
 

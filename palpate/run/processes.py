@@ -273,9 +273,13 @@ class LocalProcesses:
                 self._ends[role] = how(code, self._log_files[role])
         return dict(self._ends)
 
-    def stop(self, patience_s: float = 5.0) -> None:
-        """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets."""
-        for send in (None, signal.SIGTERM, signal.SIGKILL):
+    def stop(self, patience_s: float = 5.0, *, at_once: bool = False) -> None:
+        """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets.
+
+        `at_once`: they have nothing to complete, and many are still importing, so that they do not hear the bus.
+        """
+        steps: tuple[signal.Signals | None, ...] = (None, signal.SIGTERM, signal.SIGKILL)
+        for send in steps[-1:] if at_once else steps:
             left = [child for child in dict.fromkeys(self.running.values()) if child.poll() is None]
             deadline = monotonic() + patience_s
             for child in left:

@@ -34,7 +34,8 @@ class RunDisplay:
         self._narration = Narration(exam)
         self._console = console
         self._quiet = quiet
-        self._heard = False
+        self.begun = False
+        """Whether the examination was heard of."""
         self._told = 0.0
         self._troubles = 0
         self._stopped = ""
@@ -74,7 +75,7 @@ class RunDisplay:
         exam = progress.collected.exam
         if exam is None:
             return
-        self._heard = True
+        self.begun = True
         news, part, left = self._narration.news(exam), self._narration.part(exam), self._left(progress)
         facts = (
             f"{left}   t {progress.t / NS:.0f} s   {progress.real_time_factor:.2f} x real time   "
@@ -103,7 +104,7 @@ class RunDisplay:
         """Passes on what an operator's keys say, and shows what the supervisor makes of it."""
         if self._bar.disable or progress.request is None:
             return
-        if not self._heard and not self._keys.attached and self._keys.__enter__().attached:
+        if not self.begun and not self._keys.attached and self._keys.__enter__().attached:
             self._console.print(f"[dim]{HINT}[/]", highlight=False)
         for word in self._keys.pressed():
             progress.request(WORDS[word], "a key of palpate run")

@@ -12,6 +12,7 @@ from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.run_name import name_run
 from palpate_bus.settings import Settings
+from palpate_models.explain import did_you_mean
 from palpate_models.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario import Scenario, Services
 from palpate_search.choice import PolicyError, findable
@@ -51,7 +52,8 @@ def settings_of(options: Sequence[str]) -> list[str]:
     for option in options:
         role, equals, name = option.partition("=")
         if not equals or role not in _ROLES:
-            raise ChoiceError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {', '.join(_ROLES)}")
+            roles = f"{', '.join(_ROLES)}{did_you_mean(role, _ROLES)}"
+            raise ChoiceError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {roles}")
         settings.append(f"services.{role}={json.dumps(name)}")
     return settings
 
@@ -64,7 +66,8 @@ def checked(scenario: Scenario) -> Scenario:
     services = {role: choice(scenario, role) for role in _ROLES}
     for role in scenario.services.model_extra or {}:
         if role not in _ROLES:
-            raise ChoiceError(f"{scenario.name}: services.{role}: the contract has no such role; it has {', '.join(_ROLES)}")
+            known = f"it has {', '.join(_ROLES)}{did_you_mean(role, _ROLES)}"
+            raise ChoiceError(f"{scenario.name}: services.{role}: the contract has no such role; {known}")
     for role, name in services.items():
         if (role, name) == ("tissue", NONE) or (name == "default" and _ROLES[role].optional and role not in workers(scenario)):
             continue

@@ -58,6 +58,17 @@ def test_the_part_counts_the_touches_and_then_is_the_scan() -> None:
     assert list(dict.fromkeys(parts)) == ["approach", *(f"touch {k + 1}/{TOUCHES}" for k in range(TOUCHES)), "scan"]
 
 
+def test_touches_are_no_progress_of_the_scan() -> None:
+    narration = Narration(EXAM)
+    shares = []
+    for s in examination():
+        s.target_index = 30
+        narration.news(s)
+        shares.append((narration.part(s).partition(" ")[0], narration.done(s)))
+    assert {share for name, share in shares if name == "touch"} == {0.0}
+    assert {share for name, share in shares if name == "scan"} == {30 / 45}
+
+
 def test_a_patient_who_moved_is_touched_again() -> None:
     looks = state(Phase.LOOK, "the patient has moved: looking again", TOUCHES + LINES)
     names = [name for name, _ in told([*examination(), looks, *examination(TOUCHES + LINES)])]

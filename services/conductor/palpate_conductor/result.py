@@ -33,6 +33,11 @@ class RunResult:
     interrupted: bool = False
     """Whether it was ended by Ctrl-C or SIGTERM; what it had measured until then is here all the same."""
 
+    @property
+    def unbegun(self) -> bool:
+        """Whether it was ended so before the examination began: there is nothing to report."""
+        return self.interrupted and self.collected.exam is None
+
 
 @dataclass(frozen=True)
 class RunProgress:
