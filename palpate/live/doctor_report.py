@@ -5,6 +5,7 @@ from __future__ import annotations
 from time import monotonic, sleep
 
 import typer
+from rich.console import Console
 from rich.markup import escape
 
 from palpate.live.connection import command, joined
@@ -37,7 +38,7 @@ def watch_violations(chosen: ChosenBus, as_json: bool) -> None:
 
 def report(chosen: ChosenBus, seconds: float, as_json: bool) -> None:
     """Listens for some seconds and prints the diagnosis. Raises typer.Exit with status 1 where something is wrong."""
-    with command(), joined(chosen) as bus:
+    with command(), joined(chosen) as bus, Console(stderr=True).status(f"listening for {seconds:g} s"):
         diagnosis = examine(bus, contract(), seconds)
     if as_json:
         print_json(diagnosis.as_json())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -91,11 +91,18 @@ def _beside(path: Path, role: str) -> str:
     raise RecordingError(f"{path}: no {name} in it or beside it; {role} needs the scenario of the run: --scenario FILE")
 
 
-def replay_service(case: GoldenCase, tolerance: Tolerance) -> dict[str, TopicResult]:
-    """Re-runs the service and compares all that it sends."""
+def replay_service(
+    case: GoldenCase, tolerance: Tolerance, tell: Callable[[int], None] = lambda _: None
+) -> dict[str, TopicResult]:
+    """Re-runs the service and compares all that it sends; `tell` hears how far it is [ns], with each message."""
+
+    def sent() -> Iterator[RecordedMessage]:
+        for message in rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end):
+            tell(message.stamp)
+            yield message
+
     expected = case.recording.messages(case.outputs, end=case.end)
-    sent = rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end)
-    results = compare(expected, sent, case.rules, tolerance, case.outputs)
+    results = compare(expected, sent(), case.rules, tolerance, case.outputs)
     facts = case.service.finish()
     del facts
     return results

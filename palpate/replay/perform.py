@@ -16,6 +16,7 @@ from palpate.command_line import fail, refuse
 from palpate.replay.compare import RELATIVE, Tolerance, TopicResult
 from palpate.replay.golden import GoldenCase, make_reference, prepare, replay_service
 from palpate.replay.play import Player, PlayError
+from palpate.time_left import TimeLeft
 from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.messages.stamps import NS
@@ -57,10 +58,13 @@ def play(file: Path, part: Passage, how: Playing) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     console = Console(stderr=True)
     try:
-        with Player(open_recording(file), how.rate, how.topics, how.listen, how.drive) as player:
+        recording = open_recording(file)
+        with Player(recording, how.rate, how.topics, how.listen, how.drive) as player:
             console.print(f"playing {file} at {how.rate:g} x {player.where}; Ctrl-C ends", highlight=False)
             try:
-                player.play(part.start, part.end(None))
+                end = min(part.end(None) or recording.last, recording.last)
+                with TimeLeft("playing", part.start, end) as bar:
+                    player.play(part.start, part.end(None), bar.reach)
                 console.print(
                     f"played {player.sent} messages up to {player.now / NS:.3f} s, {player.lag_ms:.1f} ms late at worst"
                 )
@@ -89,7 +93,9 @@ def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[s
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     try:
         case = prepare(file, service, scenario)
-        results = replay_service(case, parse_tolerance(tolerance))
+        allowed = parse_tolerance(tolerance)
+        with TimeLeft(f"running {case.role} again", 0, case.end) as bar:
+            results = replay_service(case, allowed, bar.reach)
     except (RecordingError, ChoiceError, ScenarioError, OSError) as error:
         refuse(error)
     if as_json:

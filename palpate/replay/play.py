@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from time import monotonic_ns, sleep
 from types import TracebackType
 from typing import Self
@@ -98,8 +98,10 @@ class Player:
             if acting and not self._drive:
                 raise PlayError(f"{', '.join(acting)} would act on {name}; --drive if that is meant")
 
-    def play(self, start: int = 0, until: int | None = None) -> None:
+    def play(self, start: int = 0, until: int | None = None, tell: Callable[[int], None] = lambda _: None) -> None:
         """Plays from `start` to `until` [ns]. Latched messages and what was last said before `start` come first.
+
+        `tell` hears how far it is [ns], with each message.
 
         Raises PlayError when a service comes alive that must not meet what is played.
         """
@@ -115,6 +117,7 @@ class Player:
                 self._tick()
             self._wait(epoch + round((message.stamp - start) / self._rate))
             self.now = message.stamp
+            tell(self.now)
             self._publishers[message.topic].put(message.payload, max(message.sequence, 1))
             self.sent += 1
 

@@ -30,7 +30,7 @@ def report(
 
     console = Console(stderr=True)
     try:
-        with nullcontext() if quiet or as_json else console.status("writing the report"):
+        with nullcontext() if quiet or as_json else console.status("writing the report: about ten seconds"):
             if recover:
                 scenario, result = recovered(folder)
                 shown = Console(stderr=as_json)

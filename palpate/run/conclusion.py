@@ -26,7 +26,7 @@ def conclude(
     console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
 ) -> None:
     """Writes the results, prints the findings, and leaves with status 3 when the run failed or its folder took no results."""
-    with nullcontext() if quiet else console.status("writing report and maps"):
+    with nullcontext() if quiet else console.status("writing report and maps: about ten seconds"):
         report, page, trouble = _written(folder, scenario, result)
     if as_json:
         print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
