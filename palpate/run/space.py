@@ -17,8 +17,8 @@ from palpate_models.scenario import Exam
 MB = 1_000_000
 REPORT_MB = 10
 """Report, page, map and evidence of a run, and its logs."""
-RECORDED_MB_PER_S: Final[dict[Record, float]] = {"none": 0.0, "normal": 0.26, "full": 1.63}
-"""Both recordings, a simulated second: of 79 s at full 129 MB, at normal 21 MB."""
+RECORDED_MB_PER_S: Final[dict[Record, float]] = {"none": 0.0, "normal": 0.3, "full": 2.5}
+"""Both recordings, a simulated second: of 51 s at full 126 MB, at normal 15 MB."""
 LOW_MB = 20
 """With less than this left the recordings are about to stop."""
 
