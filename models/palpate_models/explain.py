@@ -9,6 +9,8 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from palpate_models.section import UNITS
+
 
 def did_you_mean(word: str, known: Collection[str]) -> str:
     """The known word that is nearest, as a sentence that can follow another one; empty when none is near."""
@@ -27,7 +29,14 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
         elif item["type"] in _NO_SECTION:
             what = "want a section, a mapping of fields"
         elif item["type"] == "missing":
-            what = f"lacks {field.pop()}"
+            last = field.pop()
+            what = f"want at least {int(last) + 1} values" if last.isdigit() else f"lacks {last}"
+        elif item["type"] == "tuple_type":
+            what = "want a list of values in square brackets"
+        elif item["type"] == "too_long":
+            what = f"want at most {item['ctx']['max_length']} values"
+        elif item["type"] in _NUMBERS and (unit := _unit(field)):
+            what += f" (in {unit})"
         path = ".".join(field) or "scenario"
         lines.append(f"{_origin(name, text, settings, field)}: {path} = {item['input']!r}: {what}")
     return "\n".join(lines)
@@ -35,6 +44,16 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
 
 _NO_SECTION = frozenset(("model_type", "model_attributes_type", "dict_type"))
 """What pydantic calls a value in place of a section."""
+
+
+_NUMBERS = frozenset(("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_parsing", "float_type"))
+"""What pydantic calls a number out of its bounds, and a value in place of a number."""
+
+
+def _unit(field: Sequence[str]) -> str | None:
+    """The unit that the name of a field ends with: of `exam.region_m.0` metres."""
+    name = next((part for part in reversed(field) if not part.isdigit()), "")
+    return UNITS.get(name.rpartition("_")[2]) if "_" in name else None
 
 
 def _fields(schema: dict[str, Any]) -> set[str]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import fill
 from typing import Any, Final, get_args, get_origin
 
 from palpate_models.scenario import Scenario
-from palpate_models.section import Section
+from palpate_models.section import UNITS, Section
 
 PAGE: Final = Path("docs/scenario.md")
 _HEAD: Final = """# Fields of a scenario
@@ -20,10 +21,10 @@ A scenario is a YAML file; what it does not mention has the default. `palpate sc
 
     palpate run my_patient.yaml --set exam.depth_m=0.008 --set errors=none
 
-A field's name ends with its unit: `_m` metres, `_mm` millimetres, `_n` newtons, `_rad` radians, `_deg` degrees, `_s` seconds,
-`_mps` metres a second, `_kg` kilograms, `_px` pixels; without one it is a plain number, a name or a yes or no. An unknown field
-is refused, with the line it stands on and the field that was probably meant. [V] marks a figure that was read in the source named
-there, [A] one that is assumed.
+{units}
+
+Without a unit a field is a plain number, a name or a yes or no. An unknown field is refused, with the line it stands on and the
+field that was probably meant. [V] marks a figure that was read in the source named there, [A] one that is assumed.
 """
 _ELSEWHERE: Final = {
     "errors": "All fields with their levels and sources: [errors.md](errors.md).",
@@ -35,7 +36,10 @@ _BOUNDS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum":
 
 def page() -> str:
     """The page's text."""
-    return _HEAD + "".join(_section("", Scenario, Scenario()))
+    units = ", ".join(f"`_{end}` {unit}" for end, unit in UNITS.items())
+    return _HEAD.format(units=fill(f"A field's name ends with its unit: {units}.", 128)) + "".join(
+        _section("", Scenario, Scenario())
+    )
 
 
 def _section(path: str, model: type[Section], given: Section | None) -> Iterator[str]:

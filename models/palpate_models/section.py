@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -12,6 +12,18 @@ Length = Annotated[float, Field(gt=0, le=1)]
 """[m], of something about a patient: millimetres are refused."""
 Force = Annotated[float, Field(gt=0, le=100)]
 """[N]."""
+UNITS: Final = {
+    "m": "metres",
+    "mm": "millimetres",
+    "n": "newtons",
+    "rad": "radians",
+    "deg": "degrees",
+    "s": "seconds",
+    "mps": "metres a second",
+    "kg": "kilograms",
+    "px": "pixels",
+}
+"""What the last part of a field's name says of its unit."""
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 

@@ -78,3 +78,19 @@ def test_a_setting_is_read_like_a_file() -> None:
     assert load_scenario("healthy", ["exam.depth_m=8e-3"]).exam.depth_m == 0.008
     with pytest.raises(ScenarioError, match=r"--set exam=.*: line 1: field depth_m stands twice"):
         load_scenario("healthy", ["exam={depth_m: 0.01, depth_m: 0.02}"])
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("exam.depth_m=10", r"exam\.depth_m = 10: .* 0\.02 \(in metres\)"),
+        ("exam.region_m=[60, 60]", r"exam\.region_m\.0 = 60: .* 1 \(in metres\)"),
+        ("exam.speed_mps=fast", r"exam\.speed_mps = 'fast': .*\(in metres a second\)"),
+        ("exam.region_m=0.1", r"exam\.region_m = 0\.1: want a list"),
+        ("exam.region_m=[0.1]", r"exam\.region_m = \[0\.1\]: want at least 2 values"),
+        ("exam.region_m=[0.1, 0.1, 0.1]", r"exam\.region_m = .*: want at most 2 values"),
+    ],
+)
+def test_a_value_that_cannot_be_is_told_with_its_unit_and_how_many_are_wanted(setting: str, said: str) -> None:
+    with pytest.raises(ScenarioError, match=said):
+        load_scenario("healthy", [setting])

@@ -35,7 +35,7 @@ def plan(
 
     from palpate.command_line import refuse
     from palpate.plan.drawing import draw
-    from palpate.plan.prospect import NoPathError, prospect
+    from palpate.plan.prospect import NoPathError, summary, prospect
     from palpate.run.inputs import usable
     from palpate_models.pattern_choice import PatternError
     from palpate_models.phantom import build_phantom
@@ -49,13 +49,7 @@ def plan(
     except (NoPathError, PatternError, OSError) as error:
         refuse(error)
     console = Console()
-    targets, lines, strokes = len(planned.scan.targets), len(planned.scan.lines), len(planned.strokes)
-    said = [
-        f"{targets} targets in {lines} line{'s' if lines > 1 else ''}, felt in {strokes} stroke{'s' if strokes > 1 else ''}",
-        f"{planned.length_m:.2f} m in contact, {len(planned.touches)} touches before",
-        f"about {planned.duration_s:.0f} s of simulated time",
-    ]
-    console.print("; ".join(said), highlight=False, soft_wrap=True)
+    console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)
     for why, count in sorted(Counter(planned.skipped.values()).items()):
         console.print(f"{count} targets are left out: {why}", highlight=False, soft_wrap=True)
     console.print(f"drawn in {out}", highlight=False, soft_wrap=True)

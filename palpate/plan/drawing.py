@@ -29,7 +29,7 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     order = np.flatnonzero(used)
     targets = planned.scan.targets * MM
     dots = axes.scatter(targets[used, 0], targets[used, 1], c=order, cmap="viridis", s=22, zorder=3)
-    figure.colorbar(dots, ax=axes, label="order of the targets", shrink=0.75)
+    figure.colorbar(dots, ax=axes, label="number of the place" if scenario.exam.searched else "order of the targets", shrink=0.75)
     if len(planned.touches):
         x, y = planned.touches.T * MM
         axes.scatter(x, y, marker="o", s=130, facecolors="none", edgecolors="#d07000", label="touch", zorder=4)
@@ -47,7 +47,11 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     axes.set_xlabel("x, to the patient's left [mm]")
     axes.set_ylabel("y, to the head [mm]")
     axes.legend(loc="upper right", fontsize=9)
-    strokes = "1 stroke" if len(planned.strokes) == 1 else f"{len(planned.strokes)} strokes"
-    title = f"{scenario.name}: {Path(scenario.exam.pattern).stem}, {scenario.exam.mode}, {strokes}"
-    axes.set_title(f"{title}, about {planned.duration_s:.0f} s")
+    exam = scenario.exam
+    if exam.searched:
+        how = f"search, at most {exam.budget.presses} presses, at most"
+    else:
+        strokes = "1 stroke" if len(planned.strokes) == 1 else f"{len(planned.strokes)} strokes"
+        how = f"{Path(exam.pattern).stem}, {exam.mode}, {strokes}, about"
+    axes.set_title(f"{scenario.name}: {how} {planned.duration_s:.0f} s")
     figure.savefig(path)

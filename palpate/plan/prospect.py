@@ -15,7 +15,7 @@ from palpate_models.lbr import HOME
 from palpate_models.load import exam_input
 from palpate_models.patterns.scan import Scan
 from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Scenario
+from palpate_models.scenario import Exam, Mode, Scenario
 from palpate_planning.exam_planner import ExamPlanner, PerceivedAbdomen
 from palpate_planning.motion_planning import NoPathError
 from palpate_planning.surface import PerceivedSurface
@@ -63,4 +63,24 @@ def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
     return Prospect(scan, tuple(ways), np.array(touches).reshape(-1, 2), plan.skipped, Outlook.of(scenario.exam).duration_s)
 
 
-__all__ = ["NoPathError", "Prospect", "prospect"]
+def summary(exam: Exam, planned: Prospect) -> str:
+    """The plan as one line: how many targets or presses, how many touches, and how long it takes."""
+    targets, touches = len(planned.scan.targets), _counted(len(planned.touches), "touch", "touches")
+    if exam.searched:
+        return (
+            f"{targets} places to choose from, at most {exam.budget.presses} presses; {touches} before the search; "
+            f"at most {planned.duration_s:.0f} s of simulated time"
+        )
+    lines, strokes = _counted(len(planned.scan.lines), "line"), _counted(len(planned.strokes), "stroke")
+    slides = f"{planned.length_m:.2f} m of sliding" if exam.mode is Mode.CONTINUOUS else "pressed one by one"
+    return (
+        f"{targets} targets in {lines}, felt in {strokes}; {slides}, {touches} before; "
+        f"about {planned.duration_s:.0f} s of simulated time"
+    )
+
+
+def _counted(number: int, one: str, many: str = "") -> str:
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+__all__ = ["NoPathError", "Prospect", "summary", "prospect"]

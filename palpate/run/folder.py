@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.run_name import FILE as RUN
 
 LOCK = "run.lock"
@@ -42,7 +43,8 @@ def unless_begun(path: Path, begun: Callable[[], bool]) -> Iterator[None]:
 def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """Makes the folder, and holds its lock until the run is over. `overwrite` removes the results of an earlier run whole.
 
-    Raises FolderError for a folder that another run is writing into, that is not empty, or that cannot be made.
+    It is removed when a service cannot be made, so that the same command works once the cause is mended. Raises ChoiceError then,
+    and FolderError for a folder that another run is writing into, that is not empty, or that cannot be made.
     """
     if overwrite and path.is_dir() and any(path.iterdir()):
         if not any((path / name).exists() for name in OURS):
@@ -57,7 +59,11 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
             what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
             raise FolderError(f"--out {path}: there is {what} in it; name another folder, or --overwrite to remove it first")
-        yield path
+        try:
+            yield path
+        except ChoiceError:
+            shutil.rmtree(path, ignore_errors=True)
+            raise
 
 
 @contextmanager

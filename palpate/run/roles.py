@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from zipfile import ZipFile, is_zipfile
 
 from palpate.run.options import Record
 from palpate_bus import implementations
@@ -77,6 +78,7 @@ def checked(scenario: Scenario) -> Scenario:
             raise ChoiceError(f"{scenario.name}: {error}") from error
         if implementations.is_file(name):
             services[role] = str(Path(name).resolve())
+    _check_fmu(scenario)
     search = scenario.search
     if scenario.exam.searched:
         try:
@@ -84,6 +86,24 @@ def checked(scenario: Scenario) -> Scenario:
         except PolicyError as error:
             raise ChoiceError(f"{scenario.name}: {error}") from error
     return scenario.model_copy(update={"services": Services.model_validate(services), "search": search})
+
+
+def _check_fmu(scenario: Scenario) -> None:
+    """Raises ChoiceError for an FMU, or a map of its variables, that is not there, or a file that is no FMU."""
+    for field, given in (("fmu", scenario.tissue.fmu), ("fmu_map", scenario.tissue.fmu_map)):
+        if given and not Path(given).is_file():
+            raise ChoiceError(f"{scenario.name}: tissue.{field} = {given!r}: there is no such file")
+    if (given := scenario.tissue.fmu) and not _is_fmu(Path(given)):
+        raise ChoiceError(
+            f"{scenario.name}: tissue.fmu = {given!r}: this is not an FMU, which is a zip archive with modelDescription.xml in it"
+        )
+
+
+def _is_fmu(path: Path) -> bool:
+    if not is_zipfile(path):
+        return False
+    with ZipFile(path) as archive:
+        return "modelDescription.xml" in archive.namelist()
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -51,3 +52,11 @@ def test_a_pattern_of_ones_own_is_drawn_with_what_is_out_of_reach(tmp_path: Path
     assert "18 targets in 1 line, felt in" in called.output
     assert "of simulated time" in called.output
     assert np.asarray(Image.open(picture).convert("L")).std() > 10
+
+
+def test_the_plan_of_a_search_tells_its_budget_and_no_strokes(tmp_path: Path) -> None:
+    small = ["--set", "exam.region_m=[0.06, 0.06]", "--set", "exam.pattern=search", "--set", "exam.budget.presses=10"]
+    called = CliRunner().invoke(app_for("plan"), ["plan", "clean", *small, "--out", str(tmp_path / "plan.png")])
+    assert called.exit_code == 0, called.output
+    assert re.search(r"\d+ places to choose from, at most 10 presses; .*; at most \d+ s", called.output)
+    assert "stroke" not in called.output

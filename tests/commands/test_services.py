@@ -102,6 +102,28 @@ def test_nothing_starts_with_a_service_that_there_is_not(words: list[str], tmp_p
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("content", "said"), [(None, "there is no such file"), ("hello", "this is not an FMU")])
+def test_nothing_starts_with_an_fmu_that_is_none(content: str | None, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.fmu"
+    if content:
+        file.write_text(content)
+    settings = ["--service", "tissue=fmu", "--set", f"tissue.fmu={file}"]
+    called = CliRunner().invoke(app_for("run"), ["run", "--composed", *settings, "--out", str(tmp_path / "out")])
+    assert called.exit_code == EXIT_BAD_INPUT, called.output
+    assert said in called.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_service_that_cannot_be_made_leaves_no_folder_behind(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("def create(scenario):\n    return scenario.nothing\n")
+    settings = ["--composed", "--record", "none", "--service", f"assessment={file}"]
+    called = CliRunner().invoke(app_for("run"), ["run", "clean", *settings, "--out", str(tmp_path / "out")])
+    assert called.exit_code == EXIT_BAD_INPUT, called.output
+    assert "line 2: AttributeError" in called.output
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_file_takes_the_place_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(EXAMPLE.parent)
     scenario = chosen(f"assessment={EXAMPLE.name}")

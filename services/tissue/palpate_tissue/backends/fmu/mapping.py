@@ -20,8 +20,10 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
+from palpate_bus.implementations import ChoiceError
 
-class MapError(ValueError):
+
+class MapError(ChoiceError):
     """A map that does not fit the contract or the FMU. Names the entry and what is allowed."""
 
 
