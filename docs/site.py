@@ -2,8 +2,9 @@
 
     python docs/site.py out/site-pages && mkdocs build --strict
 
-So links between pages hold as they stand in the repository. A link to a folder leads to its README. A link to a file that the
-site does not have, such as source code, becomes the words alone. The notebooks of docs/notebooks are carried out, and become
+So links between pages hold as they stand in the repository. A link to a folder leads to its README. A link whose words are the
+name of a page's file gets the page's title for words. A link to a file that the site does not have, such as source code, becomes
+the words alone. The notebooks of docs/notebooks are carried out, and become
 pages with what they printed and drew.
 """
 
@@ -68,6 +69,12 @@ def carry_out(notebook: Path, into: Path) -> None:
     FilesWriter(build_directory=str(into)).write(text, resources, notebook_name=notebook.stem)
 
 
+def title(page: Path) -> str:
+    """The first heading of a page, up to a colon or comma."""
+    heading = next(line for line in (ROOT / page).read_text(encoding="utf-8").splitlines() if line.startswith("# "))
+    return re.split("[:,]", heading.removeprefix("# "))[0]
+
+
 def within_the_site(page: Path, pages: set[Path]) -> str:
     """The text of a page, with links to pages only."""
 
@@ -76,13 +83,15 @@ def within_the_site(page: Path, pages: set[Path]) -> str:
         if re.match(r"[a-z]+:", where):
             return found[0]
         target = (ROOT / page.parent / where).resolve().relative_to(ROOT)
+        if target in pages and words.endswith(".md"):
+            words = title(target)
         if target / "README.md" in pages:
             return f"[{words}]({where.rstrip('/')}/README.md{anchor})"
         if target == Path("README.md"):
             return f"[{words}]({Path(where).parent / 'index.md'}{anchor})"
         if target.parent == NOTEBOOKS:
             return f"[{words}]({Path(where).with_suffix('.md')}{anchor})"
-        return found[0] if target in pages else words
+        return f"[{words}]({where}{anchor})" if target in pages else words
 
     text = DIAGRAM.sub("*The page in the repository draws this as a diagram.*\n", (ROOT / page).read_text(encoding="utf-8"))
     return LINK.sub(link, text)

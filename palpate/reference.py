@@ -58,7 +58,7 @@ def _command(path: str, command: Any) -> Iterator[str]:
         yield "\n".join(f"    {line.strip()}" for line in examples.splitlines() if line.strip()) + "\n"
     rows = [row for parameter in command.params if (row := _parameter(parameter))]
     if rows:
-        yield "| | default | |\n|---|---|---|"
+        yield "| argument or option | default | meaning |\n|---|---|---|"
         yield "\n".join(rows) + "\n"
 
 

@@ -12,6 +12,7 @@ import pytest
 from palpate_bus.implementations import create
 from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
+from palpate_tissue.backend import TissueBackend
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -61,3 +62,6 @@ def test_a_tissue_of_ones_own_pushes_back_in_the_service_and_in_the_hand() -> No
     vertex, pressed = springs.deepest
     assert pressed == pytest.approx(0.010, abs=1e-6)
     assert vertex == top
+    places, normals = model.vertices[[top]], model.normals[[top]]
+    at_once, step_by_step = springs.press(places, normals, radius), TissueBackend.press(springs, places, normals, radius)
+    np.testing.assert_allclose(at_once[0], step_by_step[0], rtol=1e-9)

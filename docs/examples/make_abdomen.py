@@ -1,4 +1,4 @@
-"""Your own mesh: half an ellipsoid on a flat back, as my_abdomen.stl, in metres and in the abdomen frame."""
+"""Your own mesh: half an ellipsoid on a flat back, in metres and in the abdomen frame."""
 
 import sys
 

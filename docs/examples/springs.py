@@ -1,9 +1,10 @@
-"""A tissue of your own: a bed of springs, one under each point of the skin, which know nothing of each other."""
+"""A tissue of your own: a bed of independent springs, one under each point of the skin."""
 
 import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
+from palpate_models import press
 from palpate_models.breathing import BreathingCurve
 from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
@@ -12,10 +13,10 @@ from palpate_tissue.service import TissueService
 
 
 class Springs(TissueBackend):
-    """A point that is displaced by u along its normal pushes back with k A u: its modulus k, its area A."""
+    """A point of modulus k and area A, displaced by u along its normal, pushes back with k A u."""
 
     def step(self, t_s, p_A, v_A, radius, w_A=None):
-        """Force on the sphere at p_A [N], and its torque about the centre [N m], in the abdomen frame."""
+        """Force on the sphere at p_A [N] and its torque about the centre [N m], abdomen frame."""
         lifted = self.excursion(t_s) * self.model.breathing  # outward, by the breath
         from_centre = self.model.vertices + lifted[:, None] * self.model.normals - p_A
         along = np.einsum("ij,ij->i", from_centre, self.model.normals)
@@ -28,18 +29,26 @@ class Springs(TissueBackend):
 
     def idle(self, t_s):
         """No sphere anywhere: it only breathes."""
-        self._inward, self._contacts, self.touching = -self.excursion(t_s) * self.model.breathing, np.empty(0, np.intp), False
+        self._inward = -self.excursion(t_s) * self.model.breathing
+        self._contacts, self.touching = np.empty(0, np.intp), False
 
     def settle(self):
         """Springs have no memory."""
         self.idle(0.0)
+
+    def press(self, places, normals, radius):
+        """The standard presses of the scoring. Without memory only their full depth matters."""
+        still = np.zeros(3)
+        spheres = places + (radius - press.DEPTH_M) * normals
+        forces = [self.step(0.0, p, still, radius)[0] @ n for p, n in zip(spheres, normals, strict=True)]
+        return press.apparent_stiffness(np.array(forces)[:, None])
 
     contacts = property(lambda self: self._contacts)
     inward = property(lambda self: self._inward)
 
     @property
     def deepest(self):
-        """Of the points in contact, the one that is displaced most, and by how much [m]."""
+        """The point in contact that is displaced most, and by how much [m]."""
         vertex = int(self._contacts[np.argmax(self._inward[self._contacts])])
         return vertex, float(self._inward[vertex])
 
@@ -47,6 +56,7 @@ class Springs(TissueBackend):
 def create(scenario):
     """The service of the role `tissue`."""
     model = build_phantom(scenario.phantom, scenario.seed)
-    springs = Springs(model, BreathingCurve(scenario.phantom.breathing, scenario.seed), contract().roles["tissue"].period / NS)
+    breathing = BreathingCurve(scenario.phantom.breathing, scenario.seed)
+    springs = Springs(model, breathing, dt=contract().roles["tissue"].period / NS)
     springs.settle()
     return TissueService(springs, model, true_pose(scenario), {})

@@ -1,4 +1,4 @@
-"""Your own assessment: whatever takes more than twice the force of the softest tenth is stiff."""
+"""Your own assessment: what takes more than twice the force of the softest tenth is stiff."""
 
 import numpy as np
 
@@ -16,30 +16,33 @@ class Threshold(Service):
     role = "assessment"
 
     def __init__(self, exam):
-        self.X_AW, self.spacing, self.places, self.forces = inverse(np.array(exam.X_WA)), exam.exam.spacing_m, [], []
-        self.told = False
+        self.X_AW, self.spacing = inverse(np.array(exam.X_WA)), exam.exam.spacing_m
+        self.places, self.forces, self.done = [], [], False
 
     def step(self, t, inbox):
         """Listens to the examination; once it is over, says what was stiff."""
         for state in inbox.new("exam/state"):
             if state.steady:  # in contact, at depth
-                self.places.append((state.surface_point.x, state.surface_point.y, state.surface_point.z))
+                point = state.surface_point
+                self.places.append((point.x, point.y, point.z))
                 self.forces.append(state.normal_force)
-            if state.phase in (ExamState.PHASE_ASSESS, ExamState.PHASE_ABORTED) and not self.told:
-                self.told = True
-                return {"assessment/findings": Findings(header(t, "abdomen"), self.findings(), [], final=True)}
+            if state.phase in (ExamState.PHASE_ASSESS, ExamState.PHASE_ABORTED) and not self.done:
+                self.done = True
+                findings = Findings(header(t, "abdomen"), self.findings(), [], final=True)
+                return {"assessment/findings": findings}
         return {}
 
     def findings(self):
-        """One finding, of all places that took more than twice the force of the softest tenth."""
-        places, ratio = apply(self.X_AW, np.array(self.places)), np.array(self.forces) / np.quantile(self.forces, 0.1)
+        """One finding: all places that took more than twice the force of the softest tenth."""
+        places = apply(self.X_AW, np.array(self.places))
+        ratio = np.array(self.forces) / np.quantile(self.forces, 0.1)
         stiff = places[ratio > 2.0]
         if not len(stiff):
             return []
-        cells = np.unique(np.round(stiff[:, :2] / self.spacing), axis=0)
         x, y, z = map(float, stiff.mean(axis=0))
         level = float(np.median(ratio[ratio > 2.0]))
-        return [Finding(Point(x, y, z), quadrant(x, y), len(cells) * self.spacing**2, level, 2.0, level, 0.5)]
+        area = self.spacing**2 * len(np.unique(np.round(stiff[:, :2] / self.spacing), axis=0))
+        return [Finding(Point(x, y, z), quadrant(x, y), area, level, 2.0, level, 0.5)]
 
 
 def create(scenario):
