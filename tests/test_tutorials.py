@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from palpate.commands import app_for
 from palpate_bus.implementations import create
 from palpate_models.load import load_scenario
 from palpate_models.phantom import build_phantom
@@ -65,3 +67,8 @@ def test_a_tissue_of_ones_own_pushes_back_in_the_service_and_in_the_hand() -> No
     places, normals = model.vertices[[top]], model.normals[[top]]
     at_once, step_by_step = springs.press(places, normals, radius), TissueBackend.press(springs, places, normals, radius)
     np.testing.assert_allclose(at_once[0], step_by_step[0], rtol=1e-9)
+
+
+def test_a_tissue_of_ones_own_does_what_the_other_parts_expect() -> None:
+    called = CliRunner().invoke(app_for("check"), ["check", "tissue", "--service", str(EXAMPLES / "springs.py"), "--failures"])
+    assert called.exit_code == 0, called.output

@@ -17,15 +17,19 @@ class Springs(TissueBackend):
 
     def step(self, t_s, p_A, v_A, radius, w_A=None):
         """Force on the sphere at p_A [N] and its torque about the centre [N m], abdomen frame."""
+        normals = self.model.normals
         lifted = self.excursion(t_s) * self.model.breathing  # outward, by the breath
-        from_centre = self.model.vertices + lifted[:, None] * self.model.normals - p_A
-        along = np.einsum("ij,ij->i", from_centre, self.model.normals)
+        from_centre = self.model.vertices + lifted[:, None] * normals - p_A
+        along = np.einsum("ij,ij->i", from_centre, normals)
         inside = radius**2 - np.einsum("ij,ij->i", from_centre, from_centre)
-        pressed = np.where(inside > 0, along + np.sqrt(along**2 + np.maximum(inside, 0)), 0.0)
-        self._inward, self._contacts = pressed - lifted, np.flatnonzero(inside > 0)
+        below = np.sqrt(np.maximum(inside + along**2, 0))  # centre to underside, along the normal
+        held = inside > 0
+        pressed = np.where(held, along + below, 0.0)
+        self._inward, self._contacts = pressed - lifted, np.flatnonzero(held)
         self.touching = bool(len(self._contacts))
-        push = (self.model.stiffness * self.model.areas * pressed)[:, None] * self.model.normals
-        return push.sum(axis=0), np.cross(from_centre, push).sum(axis=0)
+        force = self.model.stiffness * self.model.areas * pressed / np.where(held, below, 1.0)
+        to_centre = pressed[:, None] * normals - from_centre  # no friction: it pushes this way
+        return force @ to_centre, np.zeros(3)
 
     def idle(self, t_s):
         """No sphere anywhere: it only breathes."""
