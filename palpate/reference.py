@@ -51,11 +51,11 @@ def walked(command: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 def _command(path: str, command: Any) -> Iterator[str]:
     told = re.sub(r"\[/?(?:bold|dim)?\]", "", cleandoc(command.help or ""))
-    words, _, examples = told.partition("Examples\n")
+    words, *examples = re.split(r"^Examples?\n", told, maxsplit=1, flags=re.MULTILINE)
     yield f"### palpate {path}\n"
     yield words.strip() + "\n"
     if examples:
-        yield "\n".join(f"    {line.strip()}" for line in examples.splitlines() if line.strip()) + "\n"
+        yield "\n".join(f"    {line.strip()}" for line in examples[0].splitlines() if line.strip()) + "\n"
     rows = [row for parameter in command.params if (row := _parameter(parameter))]
     if rows:
         yield "| argument or option | default | meaning |\n|---|---|---|"

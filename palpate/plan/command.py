@@ -35,7 +35,7 @@ def plan(
 
     from palpate.command_line import refuse
     from palpate.plan.drawing import draw
-    from palpate.plan.prospect import NoPathError, summary, prospect
+    from palpate.plan.prospect import NoPathError, prospect, summary
     from palpate.run.inputs import usable
     from palpate_models.pattern_choice import PatternError
     from palpate_models.phantom import build_phantom

@@ -83,4 +83,4 @@ def _counted(number: int, one: str, many: str = "") -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
-__all__ = ["NoPathError", "Prospect", "summary", "prospect"]
+__all__ = ["NoPathError", "Prospect", "prospect", "summary"]
