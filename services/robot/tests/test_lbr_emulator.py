@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import socket
 from itertools import pairwise
 
 import pytest
 from lbr_bench import MS
 
-from palpate_robot.backends.lbr.emulator import Metronome
+from palpate_robot.backends.lbr.emulator import Metronome, main
 
 PERIOD = 2 * MS
 WALL = 1_700_000_000_000_000_000
@@ -44,3 +45,11 @@ def test_a_sleep_that_is_a_little_long_does_no_harm() -> None:
     began, _ = paced({30: 3 * MS})
     assert began[-1] == PERIOD * 100
     assert min(b - a for a, b in pairwise(began)) >= PERIOD // 2
+
+
+def test_an_address_that_is_in_use_is_told_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert main(["clean", "--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}"]) == 2
+    assert "that address is in use" in capsys.readouterr().err

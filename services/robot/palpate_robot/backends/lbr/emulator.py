@@ -34,6 +34,7 @@ from palpate_bus.messages import (
     WrenchStamped,
 )
 from palpate_bus.messages.stamps import header
+from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models import lbr
@@ -244,7 +245,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = Options(given.period_ms, given.stiffness, given.gravity_error, given.command_timeout_ms)
     try:
         emulator = Emulator(plant_input(load_scenario(given.scenario)), options)
-    except (ScenarioError, ValueError) as error:
+        node = RosNode("lbr_emulator", given.domain, BusOptions(listen=(given.listen,)))
+    except (ScenarioError, BusConfigError, ValueError) as error:
         print(f"emulator: {error}", file=sys.stderr)
         return 2
     running = [True]
@@ -254,7 +256,6 @@ def main(arguments: list[str] | None = None) -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    node = RosNode("lbr_emulator", given.domain, BusOptions(listen=(given.listen,)))
     log.info("an LBR at %s, FRI every %d ms", given.listen, options.period_ms)
     gc.freeze()  # a controller cabinet takes no tenth of a second to collect garbage
     try:
