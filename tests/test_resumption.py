@@ -85,7 +85,8 @@ def check(folder: Path, resumed: Finished) -> None:
     times = [float(row["time_s"]) for row in rows(resumed.folder)]
     felt_before = recorded_samples(folder)
     assert felt_before > 0
-    assert sum(time < 0 for time in times) == felt_before
+    held_back = sum(time < 0 for time in times) - felt_before
+    assert held_back in (0, 1), "what waited for the breath to be seen when the run broke off counts, too"
     assert sum(time > 0 for time in times) > 0
     assert len(times) == report["samples"] == report["services"]["assessment"]["facts"]["samples"]
     assert "targets that are left" in resumed.output
