@@ -20,7 +20,8 @@ PAGES = sorted(page for page in ROOT.rglob("*.md") if not {".venv", "out", "node
 def lines() -> list[tuple[str, str]]:
     """Page and words of each indented command line, without what is said about it."""
     pattern = re.compile(r"^ {4}(?:\w+=\S+ )*palpate (\S.*)$", re.MULTILINE)
-    found = {(page, line) for page in PAGES for line in pattern.findall(page.read_text(encoding="utf-8"))}
+    texts = {page: re.sub(r" *\\\n +", " ", page.read_text(encoding="utf-8")) for page in PAGES}  # a line that goes on
+    found = {(page, line) for page, text in texts.items() for line in pattern.findall(text)}
     return sorted((str(page.relative_to(ROOT)), re.split(r" {2,}| #", line)[0].strip()) for page, line in found)
 
 

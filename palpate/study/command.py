@@ -121,9 +121,11 @@ def scenario_of_case(
 ) -> None:
     """Print the scenario of a case, to examine its patient again with everything a run shows.
 
-    [bold]Example[/]
+    [bold]Examples[/]
 
-      palpate study scenario cases/ID.json > patient.yaml && palpate run patient.yaml --composed
+      palpate study scenario cases/ID.json > patient.yaml   write it into a file
+
+      palpate run patient.yaml --composed                   examine that patient
     """
     from palpate.study.perform import print_scenario
 
