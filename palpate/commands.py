@@ -142,7 +142,7 @@ def _add(app: typer.Typer, word: str, columns: int) -> None:
         sys.exit(EXIT_BAD_INPUT)
     if isinstance(command, typer.Typer):
         for own in command.registered_commands:
-            own.help = own.help or _flowing(own.callback, columns)
+            own.help = _flowing(own.callback, columns) or own.help
         app.add_typer(command, name=word)
     else:
         app.command(word, help=_flowing(command, columns))(command)
