@@ -74,8 +74,8 @@ class Narration:
             sentence = str(state.message) + ("" if self._told[0] == name else WHY.get(state.phase, ""))
         elif state.message not in USUAL:
             sentence = str(state.message)
-        elif self._told[0] == name:
-            return None
+        elif self._told[0] == name or not (self._touching(state) or self._scanning):
+            return None  # the first descent after the touches ends them; the scan begins at depth
         else:
             sentence = self._touching_words() if name == "touch" else self._scanning_words(state)
         if (name, str(state.message)) == self._told:
