@@ -44,8 +44,8 @@ class Narration:
     def __init__(self, exam: Exam) -> None:
         """`exam`: what is examined, and how."""
         self._exam, self._outlook = exam, Outlook.of(exam)
-        self._before = self._strokes = 0
-        """Strokes until the arm last came to the patient, and until now."""
+        self._before = 0
+        """Strokes until the arm last came to the patient."""
         self._scanning = False
         self._told: tuple[str, str] = ("", "")
 
