@@ -67,7 +67,7 @@ class Trace:
     aside: Array
     """Where it was less that [m], xy, shape (n, 2)."""
     wrong: Array
-    """Measured less true depth [m], as the assessment has it, by the breath that was seen; shape (n,)."""
+    """Measured less true depth [m], as the assessment has it in the end; shape (n,)."""
     unseen: Array
     """How far breathing lifted the skin there above its mean [m], shape (n,)."""
     regulation: Array
@@ -108,7 +108,7 @@ def trace_of(folder: Path) -> Trace:
         time=time,
         place=touched.believed[:, :2] - scenario.exam.centre_m,
         aside=(off_W @ X_WA[:3, :3])[:, :2],
-        wrong=evidence.depth_seen[there] - true_depth,
+        wrong=evidence.depth_known[there] - true_depth,
         unseen=skin.between(model.breathing)(touched.true[:, :2]) * (excursion - curve.mean_m),
         regulation=evidence.depth[there] - evidence.setpoint[there],
     )

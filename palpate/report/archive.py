@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from palpate.truth.pressed import Pressed
 from palpate.truth.touched import Touched
-from palpate_assessment.seen_breath import BreathingShares, depth_seen
-from palpate_bus.messages import SurfaceMotion, codec
+from palpate_assessment.seen_breath import SEEN, BreathingShares, depth_seen
+from palpate_assessment.skin import skin_of
+from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected
 from palpate_models.frames import Array
@@ -60,8 +61,8 @@ class Evidence:
     """ExamState.PHASE_*, shape (n,)."""
     depth: Array
     """Measured [m], along the inward normal from the perceived rest surface; negative before contact."""
-    depth_seen: Array
-    """The same by the breath that was seen afterwards instead of its forecast [m], as the assessment has it."""
+    depth_known: Array
+    """The same as the assessment has it in the end [m]: by the breath that was seen, from the skin as all of it tells."""
     setpoint: Array
     """[m]"""
     force: Array
@@ -124,7 +125,7 @@ def write_evidence(
         "phase": np.array([s.phase for s in states], dtype=np.uint8),
         **{name: np.array([getattr(s, field) for s in states], dtype=np.float32) for name, field in _FLOATS.items()},
         **{name: np.array([getattr(s, name) for s in states], dtype=bool) for name in _FLAGS},
-        "depth_seen": _depth_seen(c).astype(np.float32),
+        "depth_known": _depth_known(c).astype(np.float32),
         "visited": np.array([s.target_index for s in states], dtype=np.uint32),
         "skipped": np.array([s.targets_skipped for s in states], dtype=np.uint32),
         "target_count": np.array(max((s.target_count for s in states), default=0)),
@@ -146,11 +147,23 @@ def write_evidence(
     np.savez_compressed(path, **columns)
 
 
+def _depth_known(c: Collected) -> Array:
+    """Depths of the exam states as they are known in the end [m], shape (n,)."""
+    depth = _depth_seen(c)
+    skin = None if c.surface is None or c.correction is None else skin_of(c.surface, c.correction, np.eye(4))
+    if skin is None:
+        return depth
+    time = np.array([nanoseconds(s.header.stamp) / NS for s in c.exam_states])
+    points, normals = ([getattr(s, name) for s in c.exam_states] for name in ("surface_point", "surface_normal"))
+    deeper, _ = skin.deeper(time, *(np.array([(v.x, v.y, v.z) for v in vectors]) for vectors in (points, normals)))
+    return depth + np.nan_to_num(deeper)
+
+
 def _depth_seen(c: Collected) -> Array:
     """Depths of the exam states by the breath that was seen [m], shape (n,)."""
     told = np.array([(nanoseconds(s.header.stamp) / NS, s.depth, s.wall_displacement) for s in c.exam_states]).reshape(-1, 3)
     time, depth, followed = told.T
-    motions = [m for m in c.motions if m.state in (SurfaceMotion.QUIET, SurfaceMotion.SPOILED)]
+    motions = [m for m in c.motions if m.state in SEEN]
     if c.surface is None or not motions:
         return np.asarray(depth)
     shares = BreathingShares(np.asarray(c.surface.vertices, dtype=float).reshape(-1, 3), np.asarray(c.surface.breathing))

@@ -412,6 +412,13 @@ class SupervisorState:
     refusals: int
 
 @dataclass
+class SurfaceCorrection:
+    __msgtype__: ClassVar[str]
+    header: Header
+    outward: NDArray[np.float32]
+    uncertainty: NDArray[np.float32]
+
+@dataclass
 class SurfaceMesh:
     __msgtype__: ClassVar[str]
     header: Header

@@ -14,7 +14,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "Advance", "CameraTrigger", "ExamState", "Finding", "Findings", "ImpedanceSetpoint", "IndentationTruth",
         "JointTorqueCommand", "OperatorRequest", "PalpationSample", "PalpationTargets", "PatientTruth", "PhantomTruth",
         "RecordChunk", "RobotStatus", "RunControl", "SearchRequest", "ServiceReport", "SkinTouch", "StiffnessMap",
-        "SupervisorState", "SurfaceMesh", "SurfaceMotion", "ToolState",
+        "SupervisorState", "SurfaceCorrection", "SurfaceMesh", "SurfaceMotion", "ToolState",
     ),
     "rosgraph_msgs": ("Clock",),
     "sensor_msgs": ("CameraInfo", "Image", "JointState", "PointCloud2", "PointField", "RegionOfInterest"),

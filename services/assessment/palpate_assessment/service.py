@@ -12,9 +12,10 @@ from palpate_assessment.calibration import learned
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
-from palpate_assessment.seen_breath import SeenBreath
+from palpate_assessment.seen_breath import SEEN, SeenBreath
+from palpate_assessment.skin import Skin, skin_of
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, SurfaceMotion, Vector3
+from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
@@ -42,8 +43,6 @@ TOLD_AT_ONCE = 50
 NOTICED_S = 1.0
 """A patient who moves is noticed within this time."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
-SEEN = frozenset({SurfaceMotion.QUIET, SurfaceMotion.SPOILED})
-"""What perception says of the wall when it has seen it, and where it was expected."""
 FINISHED = frozenset({ExamState.PHASE_ASSESS, ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
 
 
@@ -67,6 +66,9 @@ class AssessmentService(Service):
         self._moved_at: float | None = None
         """When the patient was seen to have moved [s]."""
         self._surface: Array | None = None
+        self._perceived: Message | None = None
+        self._skin: Skin | None = None
+        """Where the skin was, as all of the examination tells."""
         self._coarse: MapGrid | None = None
         self._last_map = 0
         self._mapped = 0
@@ -79,6 +81,8 @@ class AssessmentService(Service):
             self.perceive(surface)
         for motion in inbox.new("perception/motion"):
             self.hear(motion)
+        for correction in inbox.new("exam/correction"):
+            self.correct(correction)
         phase = None
         new, self._untold = self._untold[:TOLD_AT_ONCE], self._untold[TOLD_AT_ONCE:]
         for state in inbox.new("exam/state"):
@@ -98,6 +102,11 @@ class AssessmentService(Service):
         """Takes the next `perception/motion`."""
         if motion.state in SEEN and self._exam.breathing is not Following.IGNORE:
             self._breath.hear(nanoseconds(motion.header.stamp) / NS, float(motion.displacement))
+
+    def correct(self, message: Message) -> None:
+        """Takes the `exam/correction`."""
+        if self._perceived is not None:
+            self._skin = skin_of(self._perceived, message, self._X_AW)
 
     def take(self, state: Message) -> list[ForceSample]:
         """Takes the next `exam/state`; returns the samples that are complete now. The last ones are at the end of the scan."""
@@ -125,6 +134,7 @@ class AssessmentService(Service):
         wanted = contract().topics["perception/surface"].frame
         if message.header.frame_id != wanted:
             raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
+        self._perceived, self._skin = message, None
         p_A = apply(self._X_AW, np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3))
         self._breath.perceive(p_A, np.asarray(message.breathing, dtype=np.float64))
         if self._surface is not None and self.samples:
@@ -172,6 +182,8 @@ class AssessmentService(Service):
         return {} if result is None else {"assessment/map": map_message(t, result, self._exam.depth_m)}
 
     def _finish(self, t: int) -> Outbox:
+        if self._skin is not None:
+            self.samples = self._skin.again(self.samples)
         if self._surface is not None:
             self._final = assess(self.samples, self._grid(PITCH), self._reach, self._exam.false_findings)
         if self._final is None:

@@ -34,6 +34,8 @@ class Collected:
     """Its newest state."""
     phantom: Any | None = None
     surface: Any | None = None
+    correction: Any | None = None
+    """Where the skin lay relative to the surface, as all of the examination tells."""
     targets: Any | None = None
     stiffness_map: Any | None = None
     findings: Any | None = None
@@ -81,6 +83,7 @@ class Collector(Service):
         if not c.samples:  # later looks are at a patient who has moved: what is felt is told where the first look saw it
             c.surface = inbox.latest("perception/surface")
             c.targets = inbox.latest("perception/targets")
+        c.correction = inbox.latest("exam/correction")
         c.stiffness_map = inbox.latest("assessment/map")
         c.findings = inbox.latest("assessment/findings")
         out: dict[str, Any] = {"clock": Clock(time_message(t))}

@@ -9,6 +9,7 @@ import numpy as np
 from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Robot
 from palpate_perception.arm import ArmMask
+from palpate_perception.average import WallAverage
 from palpate_perception.fusion import Image
 from palpate_perception.registration import shift_between
 from palpate_perception.tracker import NOTHING, Followed, Tracker
@@ -44,6 +45,11 @@ class Follower:
             followed = self._follow(t_s, depth, q)
         self.counts[followed.state.name.lower()] += 1
         return replace(followed, shift=followed.shift + np.append(self.shift, 0.0))
+
+    @property
+    def average(self) -> WallAverage | None:
+        """What the images since the latest look show in the mean; None before it, and where the patient has moved since."""
+        return None if self._tracker is None or self._tracker.moved else self._tracker.average
 
     @property
     def watched(self) -> bool:

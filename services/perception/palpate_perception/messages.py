@@ -1,4 +1,4 @@
-"""Camera messages as arrays, and the wall's motion as a message."""
+"""Camera messages as arrays; the wall's motion and the surface's correction as messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import SurfaceMotion, Vector3
+from palpate_bus.messages import SurfaceCorrection, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header
@@ -42,3 +42,8 @@ def motion(stamp: int, followed: Followed) -> Message:
     """`palpation_msgs/SurfaceMotion` of an image exposed at the time `stamp` [ns]."""
     state, shift = getattr(SurfaceMotion, followed.state.name), Vector3(*map(float, followed.shift))
     return SurfaceMotion(header(stamp, MOTION_FRAME), state, followed.displacement, followed.forecast, followed.sigma, shift)
+
+
+def correction(t: int, outward: Array) -> Message:
+    """`palpation_msgs/SurfaceCorrection` at the time `t` [ns]: how far outward [m] the wall lies at each vertex, shape (n,)."""
+    return SurfaceCorrection(header(t, MOTION_FRAME), outward.astype(np.float32), np.empty(0, np.float32))

@@ -16,6 +16,7 @@ from palpate_models.table import TABLE_TOP_M
 from palpate_perception import cloud, pattern, surface, visibility
 from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
+from palpate_perception.surface import HeightField
 from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
 from palpate_perception.wall import BreathingMode
 
@@ -78,6 +79,8 @@ class Perceived:
     """Part of the region of interest that was seen."""
     message: str
     """What is wrong, in words; empty when all is well."""
+    field: HeightField | None = None
+    """The surface over x and y of A; None when too little was seen."""
 
 
 class Pipeline:
@@ -130,7 +133,7 @@ class Pipeline:
         motion = self._motion(fusion, fused, points, p_A, camera)
         sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
         message = _remarks(int(np.count_nonzero(~known)), len(nodes), motion)
-        return Perceived(points, self._mesh(field, p_A, mode, shift), targets, sigma, fused.frames, coverage, message)
+        return Perceived(points, self._mesh(field, p_A, mode, shift), targets, sigma, fused.frames, coverage, message, field)
 
     def _reasons(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> str:
         """Why the region's other cells were not seen."""
@@ -147,12 +150,12 @@ class Pipeline:
         height_per_depth = float(np.mean(np.abs(drop / fused.depth[pixel[:, 0], pixel[:, 1]])))
         return height_per_depth * fusion.motion(fused.depth, pixel)
 
-    def _on(self, field: surface.HeightField, xy: Array) -> tuple[Array, Array]:
+    def _on(self, field: HeightField, xy: Array) -> tuple[Array, Array]:
         """Positions and normals in world of the surface at `xy` in A, shape (n, 2)."""
         p_A, n_A = _in_A(field, xy)
         return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
 
-    def _mesh(self, field: surface.HeightField, p_A: Array, mode: BreathingMode | None, shift: Array) -> PerceivedMesh:
+    def _mesh(self, field: HeightField, p_A: Array, mode: BreathingMode | None, shift: Array) -> PerceivedMesh:
         """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         x = stations(cx + shift[0], width + 2 * MESH_MARGIN_M, MESH_STEP_M)
@@ -169,7 +172,7 @@ class Pipeline:
         return PerceivedMesh(p_W, n_W, new[triangles].astype(np.uint32), lifts)
 
 
-def _in_A(field: surface.HeightField, xy: Array) -> tuple[Array, Array]:
+def _in_A(field: HeightField, xy: Array) -> tuple[Array, Array]:
     """Positions [m] and outward unit normals in A of the surface at `xy` in A [m], shape (n, 2)."""
     return np.column_stack((xy, field.height(xy[:, 0], xy[:, 1]))), field.normal(xy[:, 0], xy[:, 1])
 

@@ -13,7 +13,7 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.images import depth_in_metres
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import Array
+from palpate_models.frames import Array, apply, inverse
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Scenario
 from palpate_perception import messages
@@ -27,6 +27,8 @@ from palpate_perception.wall import BreathingMode
 from palpate_perception.watch import LONGEST_S
 
 IMAGE: Final = "camera/depth/image_raw"
+CORRECTED_EVERY_NS: Final = 5 * NS
+"""So often the surface is corrected by the images since."""
 PATIENCE_NS: Final = 1 * NS
 """How long after the expected end of a burst perception waits for missing frames."""
 
@@ -42,7 +44,10 @@ class PerceptionService(Service):
         self._follower = Follower(exam.exam, X_WA, exam.robot)
         self._period = contract().topics[IMAGE].period
         self._burst: _Burst | None = None
+        self._X_AW = inverse(X_WA)
         self._last: Perceived | None = None
+        self._corrected = 0
+        """When the surface was corrected, or published, last [ns]."""
         self._bursts = 0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -54,7 +59,7 @@ class PerceptionService(Service):
             self._bursts += 1
         told = [self._follow(image, inbox) for image in inbox.new("camera/follow/depth")]
         outbox: dict[str, Message | list[Message]] = {"perception/motion": told} if told else {}
-        return outbox | self._answer(t, inbox)
+        return outbox | self._correction(t) | self._answer(t, inbox)
 
     def _follow(self, image: Message, inbox: Inbox) -> Message:
         """What a small image tells."""
@@ -63,6 +68,20 @@ class PerceptionService(Service):
         camera = messages.intrinsics(inbox, "camera/follow/camera_info", image)
         q = None if status is None else np.asarray(status.position, np.float64)
         return messages.motion(stamp, self._follower.take(stamp / NS, depth, camera, q))
+
+    def _correction(self, t: int) -> dict[str, Message | list[Message]]:
+        """Now and then, how far outward of the surface that was published last the images since show the wall."""
+        last, average = self._last, self._follower.average
+        if self._burst is not None or last is None or last.mesh is None or last.field is None or average is None:
+            return {}
+        if t < self._corrected + CORRECTED_EVERY_NS:
+            return {}
+        self._corrected = t
+        outward = average.outward_of(last.field, self._X_AW)
+        if outward is None:
+            return {}
+        x, y, _ = apply(self._X_AW, last.mesh.p_W).T
+        return {"perception/correction": messages.correction(t, outward.height(x, y))}
 
     def _answer(self, t: int, inbox: Inbox) -> dict[str, Message | list[Message]]:
         """What the look that is under way shows; nothing until it is over."""
@@ -88,7 +107,7 @@ class PerceptionService(Service):
             burst.fusion.level(displacements, wall.depth_per_metre(burst.camera, burst.fusion.window))
             mode = wall.mode
         perceived = self._pipeline.perceive(burst.fusion, burst.camera, mode, self._follower.shift)
-        self._last = perceived
+        self._last, self._corrected = perceived, t
         outbox: dict[str, Message | list[Message]] = {
             "perception/points": points(t, perceived.cloud.p_W),
             "perception/targets": targets(t, perceived),

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.frames import Array
+from palpate_perception.average import WallAverage
 from palpate_perception.breath_filter import BreathFilter
 from palpate_perception.registration import PRIOR, reasons
 from palpate_perception.wall import SeenWall
@@ -87,6 +88,8 @@ class Tracker:
     def __init__(self, wall: SeenWall, t_s: Array, d: Array, corners: Array) -> None:
         """A wall displaced by `d` [m] at times `t_s` [s], shape (n,) each; `corners` of the region in A, shape (m, 3)."""
         self.wall = wall
+        self.average = WallAverage(wall, len(t_s))
+        """What the images of a quiet wall show in the mean."""
         self._filter = BreathFilter(t_s, d)
         middle = corners.mean(axis=0)
         self._reasons = reasons(wall.lifts, wall.n_A, wall.p_A - middle)
@@ -118,7 +121,8 @@ class Tracker:
             return self._told(State.MOVED if self._moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
         noise = float(np.hypot(1 / np.sqrt(weight @ self.wall.lifts**2), SHARED_M))
-        self._weigh_motion(t_s - self._last_s, y - self.wall.lifts * d, weight)
+        still = y - self.wall.lifts * d
+        self._weigh_motion(t_s - self._last_s, still, weight)
         self._last_s = t_s
         surprise = abs(d - expected)
         if surprise > max(SURPRISE * np.hypot(spread, noise), SURPRISE_M) or d > DEEP * self._filter.depth + SURPRISE_M:
@@ -130,7 +134,10 @@ class Tracker:
         self._filter.remember(d)
         if self._moved:
             return self._told(State.MOVED, d)
-        return self._told(State.SPOILED if t_s < self._calm_s else State.QUIET, float(self._filter.forecast(np.zeros(1))[0]))
+        quiet = t_s >= self._calm_s
+        if quiet:
+            self.average.add(still, weight > 0)
+        return self._told(State.QUIET if quiet else State.SPOILED, float(self._filter.forecast(np.zeros(1))[0]))
 
     def _told(self, state: State, d: float) -> Followed:
         shift = np.append((self._motion - self._drift)[1:3], 0.0) if state is State.MOVED else np.zeros(3)

@@ -104,6 +104,9 @@ class ExamSequence:
         self._trigger = False
         self._path: Array | None = None
         self._touched: TouchedSkin | None = None
+        self._averaged: Array | None = None
+        """Where the images since the look show the wall in the mean, at the vertices of the perceived surface."""
+        self._correction: tuple[Array, Array] | None = None
 
     @property
     def status(self) -> ExamStatus:
@@ -127,14 +130,16 @@ class ExamSequence:
             course.arm.hold(now.reading.q)
             course.enter(Phase.HOME, now.t, "going home")
         status.steady = status.force_limited = False
-        self._trigger, self._path, self._touched = False, None, None
+        self._trigger, self._path, self._touched, self._correction = False, None, None, None
+        if now.averaged is not None:
+            self._averaged = now.averaged
         if now.motion is not None:
             self._sense.wall.breath.hear(now.motion, now.t)
         course.contact = self._sense.sense(now.reading, now.t)
         status.depth_setpoint = course.contact.depth
         self._stops.watch(now)
         setpoint = self._phases[status.phase](now) or course.arm.step(now.t, course.rate)
-        return ExamStep(setpoint, course.contact, self._trigger, self._path, self._touched)
+        return ExamStep(setpoint, course.contact, self._trigger, self._path, self._touched, self._correction)
 
     # --- before contact -----------------------------------------------------------------------------------------------
 
@@ -161,7 +166,7 @@ class ExamSequence:
             except NoPathError as error:
                 self._look_again(now, f"look posture cannot be reached: {error}")
         elif isinstance(now.perceived, PerceivedAbdomen):
-            course.perceived = now.perceived
+            course.perceived, self._averaged = now.perceived, None
             wall, surface = self._sense.wall, now.perceived.surface
             self._sense.wall = wall.seen_again(surface) if self._moves else Wall(surface, wall.breath)
             self.status.target_count, self.status.view_blocked = len(now.perceived.positions), False
@@ -265,6 +270,7 @@ class ExamSequence:
     def _end_strokes(self, now: Observation, palpation: Palpation) -> None:
         """Goes home; but where a patient has moved before all was felt, looks at him again, to go on with what is left."""
         if not (palpation.moved and palpation.ahead and self._moves < MOVES_MAX):
+            self._correct()
             self._course.go_home(now, palpation.failed)
             return
         assert now.reading is not None
@@ -272,6 +278,12 @@ class ExamSequence:
         self._asked, self._looked = None, 0
         self._course.arm.hold(now.reading.q)
         self._course.enter(Phase.LOOK, now.t, "the patient has moved: looking again")
+
+    def _correct(self) -> None:
+        """Tells where the skin lay in the strokes, now that all touches and images are in; not where the patient has moved."""
+        perceived, wall = self._course.perceived, self._sense.wall
+        if perceived is not None and not self._moves and not wall.breath.moved:
+            self._correction = wall.corrected(perceived.vertices, self._averaged)
 
     def _search(self, now: Observation, palpation: Palpation) -> None:
         """Has the press laid that the search asks for, one at a time, and counts those that are over as targets."""

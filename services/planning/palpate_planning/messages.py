@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch, SurfaceMotion, Vector3
+from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch, SurfaceCorrection, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header, nanoseconds
@@ -50,6 +50,11 @@ def touch_message(t: int, touched: TouchedSkin) -> Message:
     return SkinTouch(
         header(t, "world"), point, touched.stroke, touched.height, touched.sigma, touched.expected, touched.expected_sigma
     )
+
+
+def correction_message(t: int, outward: Array, sigma: Array) -> Message:
+    """`palpation_msgs/SurfaceCorrection` at `t` [ns], of the vertices of the perceived surface [m], shape (n,) each."""
+    return SurfaceCorrection(header(t, "abdomen"), outward.astype(np.float32), sigma.astype(np.float32))
 
 
 def path_message(t: int, poses_WI: Array) -> Message:

@@ -17,6 +17,7 @@ from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.checkpoint import Checkpoint, read_checkpoint
+from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import ExamInput, Following, Scenario
 from palpate_planning.background import WORKER
@@ -24,7 +25,7 @@ from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
-from palpate_planning.messages import motion_of, path_message, state_message, touch_message
+from palpate_planning.messages import correction_message, motion_of, path_message, state_message, touch_message
 from palpate_planning.periods import Periods
 from palpate_planning.requests import PressRequest
 from palpate_planning.status import Observation, PerceptionFailure, Phase
@@ -69,6 +70,7 @@ class PlanningService(Service):
                 reading=self._reading,
                 perceived=self._perceived(inbox),
                 motion=self._motion(inbox),
+                averaged=self._averaged(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
                 stop=stop,
                 soft=soft,
@@ -87,6 +89,8 @@ class PlanningService(Service):
             outbox["planning/camera_trigger"] = CameraTrigger(header(t), self._known.camera.frames)
         if step.touched is not None:
             outbox["exam/touches"] = touch_message(t, step.touched)
+        if step.correction is not None:
+            outbox["exam/correction"] = correction_message(t, *step.correction)
         if step.path is not None:
             outbox["planning/path"] = path_message(t, step.path)
         return outbox
@@ -145,6 +149,13 @@ class PlanningService(Service):
         """The wall's newest motion, if there is one and it is to be followed."""
         heard = [motion_of(message) for message in inbox.new("perception/motion")]
         return heard[-1] if heard and self._known.exam.breathing is not Following.IGNORE else None
+
+    def _averaged(self, inbox: Inbox) -> Array | None:
+        """Where the mean of all images shows the wall, if that has just come and is of the surface that is examined."""
+        for message in inbox.new("perception/correction"):
+            if self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
+                return np.asarray(message.outward, dtype=float)
+        return None
 
     def _request(self, inbox: Inbox) -> PressRequest | None:
         """What the search asks for, if it has just asked."""

@@ -81,6 +81,8 @@ class Observation(NamedTuple):
     """Roles whose services are gone."""
     request: PressRequest | None = None
     """What the search asks for, at the step at which it came."""
+    averaged: Array | None = None
+    """How far outward of the surface's vertices the mean of the images since shows the wall [m], at the step at which it came."""
 
 
 @dataclass(slots=True)
@@ -118,3 +120,5 @@ class ExamStep:
     """Planned poses of the indenter at depth, shape (n, 4, 4), once."""
     touched: TouchedSkin | None = None
     """The touch of this step, if there was one."""
+    correction: tuple[Array, Array] | None = None
+    """Of the perceived surface's vertices, as `Wall.corrected` has it, once: when the strokes are over."""

@@ -9,13 +9,15 @@ Each touch measures c at its place with an error of its own, and from n of them 
 
     c(x) = k(x)^T (K + S)^-1 y,     var c(x) = k(x, x) - k(x)^T (K + S)^-1 k(x).
 
-How rough the error is, a, is the touches' to tell: of a few values the one that makes them most probable, given a prior about 1
-(their eq. 2.30). A camera without error leaves a small a, and a surface that is known within what a touch gets wrong.
+How rough the error is, a, is the touches' to tell: of a few values the one that makes them most probable, given a prior about
+what is expected (their eq. 2.30). A camera without error leaves a small a, and a surface that is known within what a touch gets
+wrong.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -33,16 +35,20 @@ these patients, and the length of their variogram; nothing that varies over more
 ROUGHNESSES = 2.0 ** np.arange(-5, 2)
 """What a may be, ..."""
 ROUGHNESS_SD = 0.5
-"""... and the standard deviation of its logarithm about 0 [A]."""
+"""... and the standard deviation of its logarithm about that of what is expected [A]."""
+AVERAGED = 0.35
+"""How rough the error is expected to be of a surface that the images of a whole examination show in the mean."""
 
 
 class SurfaceCorrection:
     """The correction c(x) [m] outward, and how sure it is. Places are in A's xy plane [m]."""
 
-    def __init__(self) -> None:
+    def __init__(self, expected_roughness: float = 1.0) -> None:
+        """Of a surface whose error is expected to be so rough, over that of one burst."""
+        self._expected = expected_roughness
         self._places = np.empty((0, 2))
         self._heights, self._variances = np.empty(0), np.empty(0)
-        self._fit = _Fit(1.0, np.empty((0, 0)), np.empty(0), 0.0)
+        self._fit = _Fit(expected_roughness, np.empty((0, 0)), np.empty(0), 0.0)
 
     @property
     def roughness(self) -> float:
@@ -68,8 +74,16 @@ class SurfaceCorrection:
             self._learn()
 
     def _learn(self) -> None:
-        fits = (_fit(float(a), self._places, self._heights, self._variances) for a in ROUGHNESSES)
+        fits = (_fit(float(a), self._expected, self._places, self._heights, self._variances) for a in ROUGHNESSES)
         self._fit = max(fits, key=lambda fit: fit.log_probability)
+
+    def averaged(self, outward: Callable[[Array], Array]) -> SurfaceCorrection:
+        """What the same touches tell of a better surface, which lies `outward` [m] of this one at places (n, 2)."""
+        better = SurfaceCorrection(AVERAGED)
+        better._places, better._variances = self._places, self._variances
+        better._heights = self._heights - outward(self._places)
+        better._learn()
+        return better
 
     def height(self, xy_A: Array) -> float:
         """C [m] at a place, shape (2,)."""
@@ -81,9 +95,15 @@ class SurfaceCorrection:
 
     def at(self, xy_A: Array) -> tuple[float, float]:
         """C and its standard deviation [m] at a place, shape (2,)."""
-        prior = OFFSET_M**2 + TILT_RAD**2 * float(xy_A @ xy_A) + self._fit.roughness**2 * FIELD_M**2
+        height, sigma = self.over(xy_A[None])
+        return float(height[0]), float(sigma[0])
+
+    def over(self, xy_A: Array) -> tuple[Array, Array]:
+        """C and its standard deviation [m] at places, shape (n, 2): shape (n,) each."""
+        prior = OFFSET_M**2 + TILT_RAD**2 * (xy_A**2).sum(axis=1) + self._fit.roughness**2 * FIELD_M**2
         k = _covariance(xy_A, self._places, self._fit.roughness)
-        return float(k @ self._fit.weights), math.sqrt(max(prior - float(k @ self._fit.precision @ k), 0.0))
+        known = ((k @ self._fit.precision) * k).sum(axis=1)
+        return k @ self._fit.weights, np.sqrt(np.maximum(prior - known, 0.0))
 
 
 class _Fit(NamedTuple):
@@ -98,11 +118,11 @@ class _Fit(NamedTuple):
     """Logarithm of the probability of the touches and the roughness, but for a constant."""
 
 
-def _fit(roughness: float, places: Array, heights: Array, variances: Array) -> _Fit:
-    """The process given touches at places (n, 2) of heights (n,) [m], known within variances (n,) [m^2]."""
+def _fit(roughness: float, expected: float, places: Array, heights: Array, variances: Array) -> _Fit:
+    """The process, whose roughness is `expected`, given touches at places (n, 2) of heights (n,) [m] within variances [m^2]."""
     factor = cho_factor(_covariance(places, places, roughness) + np.diag(variances), lower=True)
     weights = cho_solve(factor, heights)
-    prior = -0.5 * (math.log(roughness) / ROUGHNESS_SD) ** 2
+    prior = -0.5 * (math.log(roughness / expected) / ROUGHNESS_SD) ** 2
     evidence = -0.5 * float(heights @ weights) - float(np.log(np.diag(factor[0])).sum())
     return _Fit(roughness, cho_solve(factor, np.eye(len(heights))), weights, prior + evidence)
 

@@ -14,6 +14,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import NearestNDInterpolator
 
 from palpate_models.frames import Array
 from palpate_planning.breath import Breath
@@ -68,6 +69,17 @@ class Wall:
         wall.correction, wall._first = self.correction, self._first
         wall.correction.blur()
         return wall
+
+    def corrected(self, vertices_W: Array, averaged: Array | None) -> tuple[Array, Array]:
+        """How far the skin lies outward of vertices of the perceived surface, and its standard deviation [m], shape (n,) each.
+
+        By all touches so far, and by how far outward the mean of all images shows the wall there [m], if that is known.
+        """
+        xy = np.array([self.perceived.xy(p) for p in vertices_W])
+        if averaged is None:
+            return self.correction.over(xy)
+        height, sigma = self.correction.averaged(NearestNDInterpolator(xy, averaged)).over(xy)
+        return averaged + height, sigma
 
     def skin(self, foot: Foot, correction: float) -> tuple[Array, Array]:
         """The point of the skin [m] that is now `correction` [m] above `foot`, and its outward normal, shape (3,) each.

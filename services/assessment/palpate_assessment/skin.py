@@ -1,0 +1,60 @@
+"""Depth by the skin as the whole examination shows it.
+
+Planning counts depth from the skin as it knows it then. When the strokes are over it knows better: by all touches, and by all
+images of the wall. With z(x) the height of that skin, and z' the height from which depth d' was counted at a place of normal n,
+
+    d = d' + n_z (z(x) - z').
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+
+from palpate_assessment.sampling import ForceSample
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_models.frames import Array, apply
+
+
+class Skin:
+    """The skin at the end of expiration, in A."""
+
+    def __init__(self, p_A: Array, sigma: Array, since: float) -> None:
+        """Points [m], shape (n, 3), with the standard deviation of their height [m], (n,), for what is felt after `since` [s]."""
+        self._known = LinearNDInterpolator(p_A[:, :2], np.column_stack((p_A[:, 2], sigma)))
+        self._since = since
+
+    def deeper(self, time: Array, position: Array, normal: Array) -> tuple[Array, Array]:
+        """How much deeper [m] than was told, and the standard deviation of depth [m]; shape (k,) each, NaN where not known.
+
+        For times [s], points of the skin from which depth was counted [m] and outward normals, shapes (k,), (k, 3), (k, 3).
+        """
+        height, sigma = self._known(position[:, :2]).T
+        there = time >= self._since
+        deeper = normal[:, 2] * (height - position[:, 2])
+        return np.where(there, deeper, np.nan), np.where(there, sigma, np.nan)
+
+    def again(self, samples: Sequence[ForceSample]) -> list[ForceSample]:
+        """The samples with their depths from this skin, where it is known."""
+        if not samples:
+            return []
+        columns = ([sample.time for sample in samples], [s.position for s in samples], [s.normal for s in samples])
+        deeper, sigma = self.deeper(*map(np.array, columns))
+        return [
+            sample if np.isnan(by) else replace(sample, depth=sample.depth + float(by), depth_uncertainty=float(s))
+            for sample, by, s in zip(samples, deeper, sigma, strict=True)
+        ]
+
+
+def skin_of(perceived: Message, correction: Message, X_AW: Array) -> Skin | None:
+    """The skin by `perception/surface` and `exam/correction`; None where one is not of the other. `X_AW`: shape (4, 4)."""
+    p_W, n_W = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (perceived.vertices, perceived.normals))
+    outward, sigma = (np.asarray(values, dtype=np.float64) for values in (correction.outward, correction.uncertainty))
+    if not len(p_W) == len(n_W) == len(outward) == len(sigma):
+        return None
+    p_A = apply(X_AW, p_W + outward[:, np.newaxis] * n_W)
+    return Skin(p_A, sigma, nanoseconds(perceived.header.stamp) / NS)

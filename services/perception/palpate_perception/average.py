@@ -1,0 +1,57 @@
+"""Where the wall lies by the mean of all small images, relative to the surface that a burst showed.
+
+A burst lasts less than a second, and what the camera gets wrong for a few seconds is frozen into the surface it shows. The small
+images go on for minutes. Pixel i, which saw the wall at the outward displacement y_i, tells of the wall without its breath
+
+    r_i = mean of (y_i - m_i d)
+
+over the watch and all images since in which the arm did not hide it. Its point lies outward of the burst's surface by so much as
+is fitted over x and y of A by the same smoothing spline as the surface itself.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models.frames import Array, apply
+from palpate_perception import surface
+from palpate_perception.surface import HeightField
+from palpate_perception.wall import SeenWall
+
+FEWEST: Final = 30
+"""A pixel that was seen in fewer images tells nothing."""
+LEAST_PIXELS: Final = 12
+"""Fewer pixels over the surface correct nothing."""
+KEPT_M: Final = 2e-4
+"""What the mean of a pixel errs by [A]; it is the same everywhere, so that it sets no weight."""
+
+
+class WallAverage:
+    """The mean of what each pixel of the wall shows."""
+
+    def __init__(self, wall: SeenWall, watched: int) -> None:
+        """The wall as `watched` images have shown it."""
+        self._wall = wall
+        self._images = np.full(len(wall.pixel), float(watched))
+        self._sum = np.zeros(len(wall.pixel))
+
+    def add(self, still: Array, seen: NDArray[np.bool_]) -> None:
+        """Takes an image: outward displacement without the breath [m], and which pixels showed the wall, shape (n,) each."""
+        self._images += seen
+        self._sum += np.where(seen, still, 0.0)
+
+    def outward_of(self, field: HeightField, X_AW: Array) -> HeightField | None:
+        """How far outward of a surface the wall lies [m], over the surface's rectangle; None where too little was seen."""
+        wall = self._wall
+        z = wall.depth + wall.gain * self._sum / np.maximum(self._images, 1.0)
+        x, y, height = apply(X_AW, wall.camera.X_WC[:3, 3] + z[:, np.newaxis] * wall.r_W).T
+        low, high = ((getattr(field.x, end), getattr(field.y, end)) for end in ("low", "high"))
+        over = (self._images >= FEWEST) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        if np.count_nonzero(over) < LEAST_PIXELS:
+            return None
+        x, y, height = x[over], y[over], height[over]
+        outward = (height - field.height(x, y)) * field.normal(x, y)[:, 2]
+        return surface.fit(np.column_stack((x, y, outward)), np.full(len(x), KEPT_M), low, high)
