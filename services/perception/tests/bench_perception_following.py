@@ -109,6 +109,7 @@ class Run:
     cost_s: list[float] = field(default_factory=list)
     shift: list[Array] = field(default_factory=list)
     surface: Any = None
+    correction: Any = None
     answered_s: float = np.nan
 
 
@@ -146,6 +147,7 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float
             continue
         if result.surface is None:
             continue
+        result.correction = out.get("perception/correction", result.correction)
         (message,) = out["perception/motion"]
         result.t_s.append(nanoseconds(message.header.stamp) / NS)
         result.state.append(message.state)

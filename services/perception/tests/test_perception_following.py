@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from bench_perception_following import READY, Patient, Run, run
 
+from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_bus.messages import SurfaceMotion
 from palpate_models.frames import apply, inverse
 from palpate_models.lbr_kinematics import tool_pose
@@ -67,6 +68,24 @@ def test_quiet_breathing_is_followed_with_typical_errors_while_the_arm_palpates(
     assert np.sqrt(np.mean(error**2)) < 0.7e-3
     assert np.abs(error).max() < 5e-3
     assert np.ptp(told[:, 0]) > 4e-3, "it does breathe"
+
+
+def bent(outward: np.ndarray, xy: np.ndarray) -> float:
+    """What an offset, a tilt and a bowl leave of a surface's error, root mean square over its vertices."""
+    x, y = (xy - xy.mean(axis=0)).T
+    smooth = np.column_stack((np.ones(len(x)), x, y, x**2, x * y, y**2))
+    return float(np.std(outward - smooth @ np.linalg.lstsq(smooth, outward, rcond=None)[0]))
+
+
+def test_what_the_camera_sees_bent_for_seconds_averages_out() -> None:
+    result, patient = followed("phantom.breathing.peak_to_peak_m=0.008", seconds=60.0)
+    p_A = apply(inverse(patient.X_WA), np.asarray(result.surface.vertices, np.float64).reshape(-1, 3))
+    n_A = np.asarray(result.surface.normals, np.float64).reshape(-1, 3) @ patient.X_WA[:3, :3]
+    skin = TrueSurface(TrueBody(patient.model.vertices, patient.model.triangles, patient.X_WA))
+    outward = (skin.height(p_A[:, :2]) - p_A[:, 2]) * n_A[:, 2]
+    burst, averaged = bent(outward, p_A[:, :2]), bent(outward - np.asarray(result.correction.outward), p_A[:, :2])
+    assert burst > 0.3e-3
+    assert averaged < 0.75 * burst
 
 
 def test_a_still_wall_moves_by_next_to_nothing() -> None:

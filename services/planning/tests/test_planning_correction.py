@@ -89,3 +89,17 @@ def test_a_new_look_keeps_what_touches_told_of_offset_and_tilt() -> None:
     assert correction.sigma(PLACES[0]) > before
     for place in BETWEEN:
         assert correction.height(place) == pytest.approx(float(tilted(place)), abs=5e-4)
+
+
+def test_of_a_better_surface_the_same_touches_leave_less() -> None:
+    rng = np.random.default_rng(5)
+    apart = np.sum((PLACES[:, None] - PLACES) ** 2, axis=-1)
+    bent = rng.multivariate_normal(np.zeros(len(PLACES)), (2 * FIELD_M) ** 2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)))
+    correction = SurfaceCorrection()
+    for place, field in zip(PLACES, bent, strict=True):
+        correction.touch(place, float(tilted(place) + field), 2e-4)
+    better = correction.averaged(lambda xy: bent[[int(np.argmin(np.sum((PLACES - p) ** 2, axis=1))) for p in xy]])
+    assert better.roughness < correction.roughness
+    heights, sigmas = better.over(BETWEEN)
+    assert heights == pytest.approx(tilted(BETWEEN), abs=2e-4)
+    assert (sigmas < [correction.sigma(place) for place in BETWEEN]).all()

@@ -114,7 +114,7 @@ def test_an_examination_over_messages() -> None:
     world = BusWorld()
     world.run()
     assert world.exam.status.phase is Phase.DONE
-    assert world.events == ["planning/camera_trigger", "planning/path"] + 3 * ["exam/touches"]
+    assert world.events == ["planning/camera_trigger", "planning/path"] + 3 * ["exam/touches"] + ["exam/correction"]
     assert [s.phase for s in world.states if s.end_tick >= 0] == [Phase.DONE]
     steady = [s for s in world.states if s.steady]
     assert steady
