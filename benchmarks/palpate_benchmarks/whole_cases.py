@@ -188,7 +188,7 @@ def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
             failure, kept = str(error), False
     finding.kept = kept
     finding.sign = _first_word(struck) if CONDUCTOR in roles else str(failure or ", ".join(struck.said.get("lost", ())))
-    finding.ended = str(failure or (COMPLETE if finding.kind in (PARTITION, "starve") else WENT_WITHOUT))
+    finding.ended = str(failure or (WENT_WITHOUT if finding.kind in KINDS else COMPLETE))
     words = f"{finding.sign} {finding.ended}"
     finding.named = any(re.search(rf"(?<![\w/]){role}(?!\w)", words) for role in roles)
     _measure(finding, struck)
