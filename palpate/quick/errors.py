@@ -88,7 +88,7 @@ class LoopErrors(Section):
     zero_m: NonNegative
     """What is wrong all over one stroke, since its touch: standard deviation over strokes."""
     uncertainty_m: NonNegative
-    """RMS of all that is wrong with the depth: the standard deviation that the examination is to state."""
+    """The standard deviation of depth that the examination tells, root mean square."""
     field_m: NonNegative
     """What else is wrong with it, smooth over the skin: standard deviation."""
     field_length_m: Positive

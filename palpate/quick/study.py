@@ -68,6 +68,8 @@ class Trace:
     """Where it was less that [m], xy, shape (n, 2)."""
     wrong: Array
     """Measured less true depth [m], as the assessment has it in the end; shape (n,)."""
+    uncertainty: Array
+    """Its standard deviation, as the assessment has it [m], shape (n,)."""
     unseen: Array
     """How far breathing lifted the skin there above its mean [m], shape (n,)."""
     regulation: Array
@@ -109,6 +111,7 @@ def trace_of(folder: Path) -> Trace:
         place=touched.believed[:, :2] - scenario.exam.centre_m,
         aside=(off_W @ X_WA[:3, :3])[:, :2],
         wrong=evidence.depth_known[there] - true_depth,
+        uncertainty=evidence.uncertainty[there],
         unseen=skin.between(model.breathing)(touched.true[:, :2]) * (excursion - curve.mean_m),
         regulation=evidence.depth[there] - evidence.setpoint[there],
     )
@@ -141,7 +144,7 @@ def loop_of(traces: Sequence[Trace]) -> LoopErrors:
         offset_m=_normal(surface[:, 0]),
         tilt=_normal(surface[:, 1:3].ravel()),
         zero_m=_round(np.sqrt(np.mean(np.concatenate([found.zeros_m for found, _ in fitted]) ** 2))),
-        uncertainty_m=_round(np.sqrt(np.mean([np.mean(trace.wrong**2) for trace in traces]))),
+        uncertainty_m=_round(np.sqrt(np.mean([np.mean(trace.uncertainty**2) for trace in traces]))),
         field_m=field_m,
         field_length_m=field_length_m,
         followed=_normal(surface[:, 3]) if breathes else Normal(),

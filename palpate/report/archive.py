@@ -63,6 +63,8 @@ class Evidence:
     """Measured [m], along the inward normal from the perceived rest surface; negative before contact."""
     depth_known: Array
     """The same as the assessment has it in the end [m]: by the breath that was seen, from the skin as all of it tells."""
+    uncertainty: Array
+    """Standard deviation of that, as it is told [m]."""
     setpoint: Array
     """[m]"""
     force: Array
@@ -119,13 +121,15 @@ def write_evidence(
     """Writes what was collected of the run called `run`, complete or not, and what is known of its truth."""
     states, contacts = c.exam_states, c.indentation
     events = _events(c)
+    known, uncertainty = _depth_known(c)
     columns: dict[str, Any] = {
         "run": np.array(run),
         "time": np.array([nanoseconds(s.header.stamp) / NS for s in states]),
         "phase": np.array([s.phase for s in states], dtype=np.uint8),
         **{name: np.array([getattr(s, field) for s in states], dtype=np.float32) for name, field in _FLOATS.items()},
         **{name: np.array([getattr(s, name) for s in states], dtype=bool) for name in _FLAGS},
-        "depth_known": _depth_known(c).astype(np.float32),
+        "depth_known": known.astype(np.float32),
+        "uncertainty": uncertainty.astype(np.float32),
         "visited": np.array([s.target_index for s in states], dtype=np.uint32),
         "skipped": np.array([s.targets_skipped for s in states], dtype=np.uint32),
         "target_count": np.array(max((s.target_count for s in states), default=0)),
@@ -147,16 +151,16 @@ def write_evidence(
     np.savez_compressed(path, **columns)
 
 
-def _depth_known(c: Collected) -> Array:
-    """Depths of the exam states as they are known in the end [m], shape (n,)."""
-    depth = _depth_seen(c)
+def _depth_known(c: Collected) -> tuple[Array, Array]:
+    """Depths of the exam states as they are known in the end, and their standard deviations [m], shape (n,) each."""
+    depth, told = _depth_seen(c), np.array([s.depth_uncertainty for s in c.exam_states])
     skin = None if c.surface is None or c.correction is None else skin_of(c.surface, c.correction, np.eye(4))
     if skin is None:
-        return depth
+        return depth, told
     time = np.array([nanoseconds(s.header.stamp) / NS for s in c.exam_states])
     points, normals = ([getattr(s, name) for s in c.exam_states] for name in ("surface_point", "surface_normal"))
-    deeper, _ = skin.deeper(time, *(np.array([(v.x, v.y, v.z) for v in vectors]) for vectors in (points, normals)))
-    return depth + np.nan_to_num(deeper)
+    deeper, sigma = skin.deeper(time, *(np.array([(v.x, v.y, v.z) for v in vectors]) for vectors in (points, normals)))
+    return depth + np.nan_to_num(deeper), np.where(np.isnan(sigma), told, sigma)
 
 
 def _depth_seen(c: Collected) -> Array:
