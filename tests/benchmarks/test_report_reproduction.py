@@ -58,7 +58,8 @@ def evidence(phase: list[int], force: list[float]) -> Evidence:
     n = len(phase)
     flat, none = np.zeros(n), np.zeros(n, dtype=bool)
     return Evidence(
-        time=np.arange(n, dtype=float), phase=np.array(phase, dtype=np.uint8), depth=flat, depth_known=flat, uncertainty=flat, setpoint=flat,
+        time=np.arange(n, dtype=float), phase=np.array(phase, dtype=np.uint8), depth=flat, depth_known=flat,
+        uncertainty=flat, setpoint=flat,
         force=np.array(force),
         in_contact=none, steady=none, force_limited=none, visited=np.zeros(n, np.uint32), skipped=np.zeros(n, np.uint32),
         target_count=1, true_time=flat, true_depth=flat, true_force=flat, events=(), stiffness_map=None, findings=None,
