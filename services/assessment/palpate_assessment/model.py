@@ -42,7 +42,7 @@ BREATHING_S = 1.0
 """How long what following leaves of breathing stays alike."""
 LEAST_DEPTH_ERROR_M = 0.0001
 """Prior median of the depth's errors for strokes that claim to have none."""
-SURFACE_M, SURFACE_SHARE = 0.020, 0.8
+SURFACE_M, SURFACE_SHARE = 0.015, 0.8
 """Length of the error that strokes share, what an offset and a tilt leave of the camera's, and its part of the depth's
 uncertainty: a scan cannot tell it from stiffness, ..."""
 WIDE_M, WIDE_SHARE = 0.15, 0.7
