@@ -27,7 +27,7 @@ SURFACE, IMAGES, ALL = "perception/surface", "perception/correction", "exam/corr
 
 
 @dataclass(frozen=True)
-class Skin:
+class SkinError:
     """How far outward of the perceived surface the skin lies at n places of the region, but for an offset and a tilt [m]."""
 
     xy: Array
@@ -42,7 +42,7 @@ class Skin:
     """Standard deviation of `known` that is told."""
 
 
-def read(folder: Path) -> Skin:
+def read(folder: Path) -> SkinError:
     """The skin of a recorded run. Raises RecordingError, and KeyError where no correction was sent."""
     scenario, newest = load_scenario(str(folder / "scenario.yaml")), dict[str, Message]()
     for message in open_recording(folder).messages((SURFACE, IMAGES, ALL)):
@@ -59,7 +59,7 @@ def read(folder: Path) -> Skin:
         return np.asarray(inner - flat @ np.linalg.lstsq(flat, inner, rcond=None)[0])
 
     told = np.asarray(newest[ALL].uncertainty, float)[inside]
-    return Skin(p_A[inside, :2], bent(true), bent(newest[IMAGES].outward), bent(newest[ALL].outward), told)
+    return SkinError(p_A[inside, :2], bent(true), bent(newest[IMAGES].outward), bent(newest[ALL].outward), told)
 
 
 def outward(scenario: Scenario, p_W: Array, n_W: Array) -> tuple[Array, Array]:
@@ -71,7 +71,7 @@ def outward(scenario: Scenario, p_W: Array, n_W: Array) -> tuple[Array, Array]:
     return (skin.height(p_A[:, :2]) - p_A[:, 2]) * n_A[:, 2], np.asarray(skin.between(model.breathing)(p_A[:, :2]))
 
 
-def draw(figure: Figure, skin: Skin) -> None:
+def draw(figure: Figure, skin: SkinError) -> None:
     """The true error of the surface, what is known of it, and what is left, as maps."""
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     parts = (("error of the surface", skin.true), ("as it is known", skin.known), ("what is left", skin.true - skin.known))

@@ -13,7 +13,7 @@ from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
 from palpate_assessment.seen_breath import SEEN, SeenBreath
-from palpate_assessment.skin import Skin, skin_of
+from palpate_assessment.skin import KnownSkin, skin_of
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
 from palpate_bus.messages.codec import Message
@@ -67,7 +67,7 @@ class AssessmentService(Service):
         """When the patient was seen to have moved [s]."""
         self._surface: Array | None = None
         self._perceived: Message | None = None
-        self._skin: Skin | None = None
+        self._skin: KnownSkin | None = None
         """Where the skin was, as all of the examination tells."""
         self._coarse: MapGrid | None = None
         self._last_map = 0

@@ -20,7 +20,7 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.frames import Array, apply
 
 
-class Skin:
+class KnownSkin:
     """The skin at the end of expiration, in A."""
 
     def __init__(self, p_A: Array, sigma: Array, since: float) -> None:
@@ -50,11 +50,11 @@ class Skin:
         ]
 
 
-def skin_of(perceived: Message, correction: Message, X_AW: Array) -> Skin | None:
+def skin_of(perceived: Message, correction: Message, X_AW: Array) -> KnownSkin | None:
     """The skin by `perception/surface` and `exam/correction`; None where one is not of the other. `X_AW`: shape (4, 4)."""
     p_W, n_W = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (perceived.vertices, perceived.normals))
     outward, sigma = (np.asarray(values, dtype=np.float64) for values in (correction.outward, correction.uncertainty))
     if not len(p_W) == len(n_W) == len(outward) == len(sigma):
         return None
     p_A = apply(X_AW, p_W + outward[:, np.newaxis] * n_W)
-    return Skin(p_A, sigma, nanoseconds(perceived.header.stamp) / NS)
+    return KnownSkin(p_A, sigma, nanoseconds(perceived.header.stamp) / NS)
