@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from palpate.truth.pressed import Pressed
 from palpate.truth.touched import Touched
-from palpate_assessment.seen_breath import SEEN, BreathingShares, depth_seen
-from palpate_assessment.skin import skin_of
+from palpate_assessment.messages import SEEN, skin_of
+from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected

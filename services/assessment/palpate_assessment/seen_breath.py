@@ -20,13 +20,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate_assessment.sampling import ContactState
-from palpate_bus.messages import SurfaceMotion
 from palpate_models.frames import Array
 
 LONGEST_S: Final = 0.5
 """Images further apart tell nothing of the time between them, and a state waits no longer for the next."""
-SEEN: Final = frozenset({SurfaceMotion.QUIET, SurfaceMotion.SPOILED})
-"""What perception says of the wall when it has seen it, and where it was expected."""
 IMAGES: Final = 40
 """So many images are remembered, 4 s of them."""
 
