@@ -52,7 +52,7 @@ def kill_in_contact(role: str, folder: Path, *options: str) -> Killed:
             target = next(child for child in children if f"palpate_{role}" in child.cmdline())
             target.kill()
             killed_at = time.monotonic()
-        if killed_at is not None and f"{role} lost at tick" in line and named_after is None:
+        if killed_at is not None and f"{role} lost at" in line and named_after is None:
             named_after = time.monotonic() - killed_at
     return Killed(run.wait(timeout=120), lines, float("inf") if named_after is None else named_after, folder)
 

@@ -21,7 +21,7 @@ def test_without_planning_the_arm_holds_safely_and_the_force_does_not_rise(tmp_p
 def test_without_the_physics_the_run_ends_at_once(role: str, tmp_path: Path) -> None:
     killed = kill_in_contact(role, tmp_path)
     assert killed.status == 3, killed.lines
-    assert any(f"{role} lost at tick" in line for line in killed.lines)
+    assert any(f"{role} lost at" in line for line in killed.lines)
 
 
 @pytest.mark.parametrize("role", ["dashboard"])

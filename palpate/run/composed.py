@@ -63,9 +63,9 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
             last = run.run(end, SIM_LIMIT)
     except KeyboardInterrupt:
         interrupted = True
-        failure, last = f"interrupted at tick {run.t / NS:.3f} s", run.t
+        failure, last = f"interrupted at {run.t / NS:.3f} s", run.t
     except ServiceFailed as error:
-        failure = f"{error.role} lost at tick {error.t / NS:.3f} s: {error.why}"
+        failure = f"{error.role} lost at {error.t / NS:.3f} s: {error.why}"
         lost = {error.role: error.t}
         last = error.t
     wall = perf_counter() - start

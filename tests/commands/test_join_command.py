@@ -47,7 +47,7 @@ def test_a_run_that_lacks_nobody_says_how_one_is_started(tmp_path: Path) -> None
 
 def test_only_a_failure_for_want_of_an_answer_is_explained(tmp_path: Path) -> None:
     waiting, (sentence,) = absent(tmp_path)
-    assert waiting.explain("control lost at tick 8.000 s: killed") == "control lost at tick 8.000 s: killed"
+    assert waiting.explain("control lost at 8.000 s: killed") == "control lost at 8.000 s: killed"
     assert sentence in waiting.explain("not ready after 30 s: no answer from control. ")
 
 

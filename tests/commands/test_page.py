@@ -76,9 +76,9 @@ def test_the_surface_in_space_is_the_map(page: str) -> None:
 
 
 def test_a_run_that_failed_says_so_first(tmp_path: Path) -> None:
-    folder = run_folder(tmp_path, map_too=False, failure="tissue lost at tick 12.345 s: killed by signal 9")
+    folder = run_folder(tmp_path, map_too=False, failure="tissue lost at 12.345 s: killed by signal 9")
     page = write_page(folder).read_text(encoding="utf-8")
-    assert "did not complete: tissue lost at tick 12.345 s" in page
+    assert "did not complete: tissue lost at 12.345 s" in page
     assert "surface-data" not in page
     assert "12.35 s" in page  # among the safety events
 

@@ -92,7 +92,7 @@ def test_states_without_a_truth_of_their_stamp_are_left_out() -> None:
 
 def test_a_run_that_ended_early_has_a_report_all_the_same(scenario: Scenario, tmp_path: Path) -> None:
     early = collected(map_too=False)
-    report = write_results(tmp_path, scenario, result(early, failure="tissue lost at tick 12.345 s: killed by signal 9"))
+    report = write_results(tmp_path, scenario, result(early, failure="tissue lost at 12.345 s: killed by signal 9"))
     assert report.failure is not None
     assert report.scores is None
     assert report.findings == []

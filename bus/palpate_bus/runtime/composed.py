@@ -28,7 +28,7 @@ class ServiceFailed(RuntimeError):
         self.t = t
         self.why = described(cause, stepper.buffers.values())
         """The cause, with the inputs that are not as they should be."""
-        super().__init__(f"{self.role} failed at tick {t / 1e9:.3f} s: {self.why}")
+        super().__init__(f"{self.role} failed at {t / 1e9:.3f} s: {self.why}")
 
 
 class Composed:
@@ -88,7 +88,7 @@ class Composed:
 
     def _leave_out(self, role: str, t: int, why: str) -> None:
         self.lost[role] = t
-        self.trouble.append(f"{role} lost at tick {t / 1e9:.3f} s: {why}")
+        self.trouble.append(f"{role} lost at {t / 1e9:.3f} s: {why}")
 
     def run(self, end: Callable[[], int | None], limit: int) -> int:
         """Runs up to and including the tick [ns] that `end()` gives once it knows, at most to `limit`; returns the last tick."""

@@ -166,7 +166,7 @@ class Conductor:
             self._end(died)
         except (RunFailed, KeyboardInterrupt) as failure:
             self.outcome.interrupted = isinstance(failure, KeyboardInterrupt)
-            why = f"interrupted at tick {max(self._observed.now, 0) / NS:.3f} s" if self.outcome.interrupted else str(failure)
+            why = f"interrupted at {max(self._observed.now, 0) / NS:.3f} s" if self.outcome.interrupted else str(failure)
             self._hear_who_missed_us()
             self.outcome.failure = self.outcome.failure or why
             self.outcome.wall_time_s = monotonic() - self._started_at
@@ -231,7 +231,7 @@ class Conductor:
                 if "told" in detail:
                     when = max(message.tick, 0) / NS
                     raise RunFailed(
-                        f"{role} was told to end at tick {when:.3f} s ({detail['told']}) in the conductor's name, "
+                        f"{role} was told to end at {when:.3f} s ({detail['told']}) in the conductor's name, "
                         "but not by this conductor: a forged or doubled sender of palpate/control"
                     )
                 if self._places.take(role):
@@ -290,7 +290,7 @@ class Conductor:
         ended = {role: how for role, how in died().items() if role not in self._places.taken}
         if self._member.gone() and self._member.transport_lost():
             reached = max(progress.tick for progress in self.watchdog.progress.values())
-            raise RunFailed(f"transport lost at tick {max(reached, 0) / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault")
+            raise RunFailed(f"transport lost at {max(reached, 0) / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault")
         return {
             **{role: self._freezes.gone(role) for role in self._member.gone() - self.outcome.lost.keys() - ended.keys()},
             **ended,
@@ -323,7 +323,7 @@ class Conductor:
         self.outcome.lost[CONDUCTOR] = max(tick, 0)
         stood = f"; it stood still for {self._heartbeat.stood_still_s:.1f} s" if self._heartbeat.stood_still_s else ""
         said = f"{role} says: {words}" if role else words
-        sentence = f"conductor lost at tick {max(tick, 0) / NS:.3f} s: {said}{stood}"
+        sentence = f"conductor lost at {max(tick, 0) / NS:.3f} s: {said}{stood}"
         self._tell(sentence)
         self.outcome.failure = sentence
 
@@ -339,7 +339,7 @@ class Conductor:
         for one in lost:
             tick = max(self.watchdog.progress[one].tick, 0)
             self.outcome.lost[one] = tick
-            sentences.append(f"{one} lost at tick {tick / NS:.3f} s: {how}")
+            sentences.append(f"{one} lost at {tick / NS:.3f} s: {how}")
         self.outcome.trouble += sentences
         sentence = "; ".join(sentences)
         if self._rules.roles[role].observer:
