@@ -1,4 +1,6 @@
-"""A case is examined in its own process: `python -m palpate.study.case`, a JSON line in for each case, a line out.
+"""A case is examined in its own process: `python -m palpate.study.case [RUNS]`, a JSON line in for each case, a line out.
+
+The results of whole examinations stay in the folder RUNS, if there is one, each in a folder with the name of its case.
 
 A whole examination has its own process; quick ones share one that stays warm. It has one thread of BLAS and OpenMP, and ends
 at once when the process that started it does, however that ended.
@@ -9,6 +11,7 @@ from __future__ import annotations
 import os
 import queue
 import resource
+import shutil
 import socket
 import sys
 import tempfile
@@ -19,7 +22,8 @@ from typing import IO, Final
 
 from pydantic import BaseModel, ConfigDict
 
-from palpate.report.results import assemble, truth_of_run
+from palpate.report.page import write_page
+from palpate.report.results import assemble, truth_of_run, write_results
 from palpate.report.rows import Report
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
@@ -56,8 +60,11 @@ class Attempt(BaseModel):
     """From how many whole examinations the errors of a quick case are; null of a whole one."""
 
 
-def examine(case: Case) -> Attempt:
-    """Examines a patient in this process. Errors of the code are raised; a run that failed is in the report."""
+def examine(case: Case, runs: Path | None = None) -> Attempt:
+    """Examines a patient in this process; `runs`: where the results of a whole examination stay.
+
+    Errors of the code are raised; a run that failed is in the report.
+    """
     begin, used = perf_counter(), _core_s()
     for path, known in case.files.items():
         if file_hash(path) != known:
@@ -66,7 +73,7 @@ def examine(case: Case) -> Attempt:
             )
     scenario = Scenario.model_validate(case.scenario)
     quick = case.tier == "quick"
-    report, assess_s = _quick(scenario) if quick else _whole(scenario, case)
+    report, assess_s = _quick(scenario) if quick else _whole(scenario, case, runs)
     return Attempt(
         case_id=case.case_id,
         report=report,
@@ -81,18 +88,30 @@ def examine(case: Case) -> Attempt:
     )
 
 
-def _whole(scenario: Scenario, case: Case) -> tuple[Report, float | None]:
+def _whole(scenario: Scenario, case: Case, runs: Path | None) -> tuple[Report, float | None]:
     """The report, and the real time of the assessment [s] where it is known."""
-    with tempfile.TemporaryDirectory(prefix="palpate-case-") as folder:
+    with tempfile.TemporaryDirectory(prefix="palpate-case-") as temporary:
+        folder = Path(temporary) if runs is None else _emptied(runs / case.case_id)
         if case.runtime == "lockstep":
-            result = run_composed(scenario, Path(folder), lambda _: None, observers=())
+            result = run_composed(scenario, folder, lambda _: None, observers=())
         else:
-            result = run_distributed(scenario, Path(folder), lambda _: None, (), Timing(wallclock=True))
+            result = run_distributed(scenario, folder, lambda _: None, (), Timing(wallclock=True))
     if result.interrupted:
         raise CaseError("interrupted")
     blame = result.blame.get("assessment")
-    report = assemble(scenario, result, truth_of_run(scenario, result.collected))
+    if runs is None:
+        report = assemble(scenario, result, truth_of_run(scenario, result.collected))
+    else:
+        report = write_results(folder, scenario, result)
+        write_page(folder)
     return report, None if blame is None else blame["steps"] * blame["compute"] / 1e6
+
+
+def _emptied(folder: Path) -> Path:
+    """The folder, without what an earlier attempt left in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
 
 
 def _quick(scenario: Scenario) -> tuple[Report, float]:
@@ -118,10 +137,10 @@ def _peak_memory() -> int:
     return KIB * sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
-def _attempt(line: str) -> Attempt:
+def _attempt(line: str, runs: Path | None) -> Attempt:
     case = Case.model_validate_json(line)
     try:
-        return examine(case)
+        return examine(case, runs)
     except Exception as error:  # whatever it is, it is this case's, and is told
         return Attempt(case_id=case.case_id, report=None, why=f"{type(error).__name__}: {error}", code=code_digest())
 
@@ -133,16 +152,16 @@ def _listen(lines: queue.Queue[str]) -> None:
     os._exit(0)
 
 
-def serve(answers: IO[str]) -> None:
-    """Examines the cases that come in, one after another, until nothing more can come."""
+def serve(answers: IO[str], runs: Path | None) -> None:
+    """Examines the cases that come in, one after another, until nothing more can come; `runs` as in `examine`."""
     lines: queue.Queue[str] = queue.Queue()
     Thread(target=_listen, args=(lines,), daemon=True).start()
     while True:
-        answers.write(_attempt(lines.get()).model_dump_json() + "\n")
+        answers.write(_attempt(lines.get(), runs).model_dump_json() + "\n")
         answers.flush()
 
 
 if __name__ == "__main__":
     own = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints is no answer
-    serve(own)
+    serve(own, Path(sys.argv[1]) if len(sys.argv) > 1 else None)

@@ -30,11 +30,11 @@ _living: weakref.WeakSet[CaseProcess] = weakref.WeakSet()
 class CaseProcess:
     """A process that examines cases."""
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
-        """Starts it, with variables beside those that make results repeatable."""
+    def __init__(self, environment: Mapping[str, str], runs: str | None = None) -> None:
+        """Starts it, with variables beside those that make results repeatable; `runs` as in `run_batch`."""
         self._log = tempfile.TemporaryFile(mode="w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - `close` does
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "palpate.study.case"],
+            [sys.executable, "-m", "palpate.study.case", *([] if runs is None else [runs])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
@@ -104,15 +104,18 @@ def kill_all() -> None:
         process.kill()
 
 
-def run_batch(batch: Sequence[str]) -> list[str]:
-    """Examines cases, given as JSON, one after another; the outcome of each, as JSON in the same order."""
+def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
+    """Examines cases, given as JSON, one after another; the outcome of each, as JSON in the same order.
+
+    `runs`: folder in which the results of whole examinations stay, where the worker is.
+    """
     cases = [Case.model_validate_json(text) for text in batch]
-    return [(_in_warm(case) if case.tier == "quick" else _in_own(case)).model_dump_json() for case in cases]
+    return [(_in_warm(case) if case.tier == "quick" else _in_own(case, runs)).model_dump_json() for case in cases]
 
 
-def _in_own(case: Case) -> Attempt:
+def _in_own(case: Case, runs: str | None) -> Attempt:
     periods = {variable("periods"): ",".join(f"{role}={period}" for role, period in case.periods.items())} if case.periods else {}
-    process = CaseProcess(periods)
+    process = CaseProcess(periods, runs)
     try:
         return process.examine(case, LIMIT_S[case.tier])
     finally:

@@ -53,6 +53,9 @@ def run(  # noqa: PLR0913 - the options of a command
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep cases from another version of the code instead of refusing.")
     ] = False,
+    runs: Annotated[
+        bool, typer.Option("--runs", help="Keep map, evidence and page of each whole examination too, 4 MB each.")
+    ] = False,
     out: Annotated[
         Path | None,
         output_folder(
@@ -96,6 +99,7 @@ def run(  # noqa: PLR0913 - the options of a command
             settings=settings or (),
             seeds_file=seeds_file,
             keep=keep,
+            runs=runs,
             out=out,
             quiet=quiet,
         )

@@ -48,6 +48,7 @@ class StudyOrder:
     settings: Sequence[str]
     seeds_file: Path | None
     keep: bool
+    runs: bool
     out: Path | None
     quiet: bool
 
@@ -78,7 +79,7 @@ def run_study(order: StudyOrder) -> None:
     own = part.part(cases) if part else cases
     count = order.workers or cores()
     hands = threads(count) if part else cluster(count, order.scheduler)
-    _examine(console, folder, own, hands, order.quiet)
+    _examine(console, folder, own, hands, order)
     if part and missing(folder, cases):
         console.print(f"part {part.index} of {part.of} is done; when all are: palpate study merge DIR...", highlight=False)
     else:
@@ -114,7 +115,9 @@ def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | 
     return with_methods(checked_study({**study.model_dump(mode="json"), "methods": methods}, study.name, Path()), only)
 
 
-def _examine(console: Console, folder: Path, cases: Sequence[Case], hands: AbstractContextManager[Workers], quiet: bool) -> None:
+def _examine(
+    console: Console, folder: Path, cases: Sequence[Case], hands: AbstractContextManager[Workers], order: StudyOrder
+) -> None:
     """Runs the cases that have no outcome yet. Ends the command when they cannot be run to their end."""
     todo = len(missing(folder, cases))
     if len(cases) > todo:
@@ -123,7 +126,7 @@ def _examine(console: Console, folder: Path, cases: Sequence[Case], hands: Abstr
         return
     begin, finished, count = monotonic(), 0, 0
     try:
-        with hands as workers, CaseDisplay(console, quiet, "cases") as display:
+        with hands as workers, CaseDisplay(console, order.quiet, "cases") as display:
             count = workers.count
             console.print(f"{todo} cases, {count} at a time, into {folder}", highlight=False, soft_wrap=True)
             if workers.dashboard:
@@ -135,7 +138,7 @@ def _examine(console: Console, folder: Path, cases: Sequence[Case], hands: Abstr
                 finished += 1
                 display.tell(finished, todo, f"{outcome.case.words}{'' if outcome.completed else f': {outcome.why}'}")
 
-            run_cases(folder, cases, workers, tell)
+            run_cases(folder, cases, workers, tell, runs=order.runs)
     except WorkersError as error:
         refuse(error)
     except (StudyStopped, KeyboardInterrupt) as error:

@@ -69,15 +69,19 @@ def opened(folder: Path, study: str, cases: Sequence[Case], keep: bool = False) 
     return manifest
 
 
-def run_cases(folder: Path, cases: Sequence[Case], workers: Workers, tell: Tell) -> None:
-    """Examines all cases that have no outcome yet, in any order. Raises StudyStopped."""
+def run_cases(folder: Path, cases: Sequence[Case], workers: Workers, tell: Tell, *, runs: bool = False) -> None:
+    """Examines all cases that have no outcome yet, in any order. Raises StudyStopped.
+
+    `runs`: the results of whole examinations stay in the folder `runs`, each in a folder of its own.
+    """
     (folder / "cases").mkdir(parents=True, exist_ok=True)
     (folder / "failures").mkdir(exist_ok=True)
-    todo = missing(folder, cases)
+    todo, kept = missing(folder, cases), str((folder / "runs").resolve()) if runs else None
     running: dict[Future[list[str]], list[Case]] = {}
 
     def submit(batch: list[Case]) -> None:
-        running[workers.executor.submit(run_batch, [case.model_dump_json() for case in batch])] = batch
+        lines = [case.model_dump_json() for case in batch]
+        running[workers.executor.submit(run_batch, lines, kept)] = batch
 
     size = max(1, min(BATCH[todo[0].tier], len(todo) // (SHARE * workers.count))) if todo else 1
     for first in range(0, len(todo), size):

@@ -47,6 +47,24 @@ def examined(folder: Path, cases: list[Case], count: int = 1) -> Path:
     return folder
 
 
+def test_results_of_whole_examinations_can_stay(tmp_path: Path) -> None:
+    one = cases_of(study(tier="whole"))[:1]
+    hashes = []
+    for keep in (True, False):
+        folder = tmp_path / str(keep)
+        open_folder(folder, manifest_of("toy", one))
+        with threads(1) as workers:
+            run_cases(folder, one, workers, lambda _: None, runs=keep)
+        outcome = read_outcome(folder, one[0].case_id)
+        assert outcome is not None
+        assert outcome.report is not None
+        hashes.append(outcome.report.run_hash)
+    kept = tmp_path / "True" / "runs" / one[0].case_id
+    assert {"scenario.yaml", "evidence.npz", "report.html"} <= {path.name for path in kept.iterdir()}
+    assert not (tmp_path / "False" / "runs").exists()
+    assert hashes[0] == hashes[1] != ""
+
+
 def digest_of(folder: Path) -> str:
     """The digest of a folder that holds all cases."""
     outcomes = outcomes_of(folder, manifest_of("toy", CASES))
