@@ -86,7 +86,8 @@ class Surface:
         least, greatest = self.range[name]
         if not least <= values[0] <= greatest:
             beyond = "below the least" if values[0] < least else "above the greatest"
-            return Estimate(value=None, n=self.n, of="lumps", interval=f"{beyond} of the study, {least:.4g} to {greatest:.4g}")
+            lengths = f"{1e3 * least:.3g} to {1e3 * greatest:.3g} mm" if name.endswith("_m") else f"{least:.3g} to {greatest:.3g}"
+            return Estimate(value=None, n=self.n, of="lumps", interval=f"{beyond} of the study, {lengths}")
         low, high = np.clip(np.quantile(values[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest"), least, greatest)
         return Estimate(value=float(values[0]), low=float(low), high=float(high), n=self.n, of="lumps")
 
