@@ -15,7 +15,7 @@ from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.sampling import ForceSample
 from palpate_models.seeds import generator
 
-FIELD_LENGTH_M: Final = 0.020
+FIELD_LENGTH_M: Final = 0.015
 """As whole examinations have it: what touches leave of the error of the perceived surface."""
 
 

@@ -23,14 +23,16 @@ from scipy.spatial.distance import cdist
 from scipy.stats import mannwhitneyu
 from statsmodels.stats.proportion import proportion_confint
 
+from palpate.quick.errors import loop_errors
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.calibration import learned
 from palpate_assessment.detection import detect
 from palpate_assessment.model import Bump, errors, fixed
 from palpate_assessment.observations import Observations, observe
 from palpate_models.frames import Array
+from palpate_models.load import load_scenario
 from palpate_models.seeds import generator
-from palpate_validation.felt_scans import ScanErrors, felt_samples
+from palpate_validation.felt_scans import FIELD_LENGTH_M, ScanErrors, felt_samples
 
 LENGTHS_M: Final = (0.015, 0.05, 0.15)
 NATURAL_SD: Final = 0.2
@@ -43,7 +45,8 @@ CLASSES: Final = ((1.3, 1.5), (1.5, 2.0), (2.0, 3.0))
 FALSE_ALARMS: Final = 0.02
 """Healthy patients with a finding."""
 RADII_M: Final = (0.012, 0.026)
-ERRORS: Final = ScanErrors(stroke_m=3e-4, field_m=8e-4, breathing_m=5e-4, tare_n=0.05)
+_LOOP: Final = loop_errors(load_scenario("person"))
+ERRORS: Final = ScanErrors(stroke_m=_LOOP.zero_m, field_m=_LOOP.field_m, breathing_m=_LOOP.wander_m, tare_n=0.05)
 """As typical errors and breathing leave them in whole examinations."""
 _CENTRES_M: Final = np.arange(-0.09, 0.0901, 0.01)
 
@@ -65,8 +68,10 @@ def patient(length: float, seed: int) -> tuple[FeltPatient, float]:
 
 def ideal(o: Observations, length: float) -> float:
     """The ideal observer's greatest |t| of a scan."""
-    o = replace(o, depth_uncertainty=np.full(len(o.y), ERRORS.field_m))
-    S = fixed(o, learned()) + NATURAL_SD**2 * np.exp(-0.5 * cdist(o.xy, o.xy, "sqeuclidean") / length**2)
+    apart, lever = cdist(o.xy, o.xy, "sqeuclidean"), np.outer(o.per_metre, o.per_metre)
+    S = fixed(replace(o, depth_uncertainty=np.zeros(len(o.y))), learned())
+    S += NATURAL_SD**2 * np.exp(-0.5 * apart / length**2)
+    S += ERRORS.field_m**2 * lever * np.exp(-0.5 * apart / FIELD_LENGTH_M**2)
     for sd, part in zip(
         (ERRORS.stroke_m, ERRORS.breathing_m, ERRORS.depth_m * float(np.median(o.per_metre))), errors(o), strict=True
     ):

@@ -46,7 +46,7 @@ class WallAverage:
     def outward_of(self, field: HeightField, X_AW: Array) -> HeightField | None:
         """How far outward of a surface the wall lies [m], over the surface's rectangle; None where too little was seen."""
         wall = self._wall
-        z = wall.depth + wall.gain * self._sum / np.maximum(self._images, 1.0)
+        z = wall.depth + wall.gain * self._sum / self._images
         x, y, height = apply(X_AW, wall.camera.X_WC[:3, 3] + z[:, np.newaxis] * wall.r_W).T
         low, high = ((getattr(field.x, end), getattr(field.y, end)) for end in ("low", "high"))
         over = (self._images >= FEWEST) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
