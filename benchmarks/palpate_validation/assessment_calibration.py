@@ -29,6 +29,7 @@ from statsmodels.stats.proportion import proportion_confint
 import palpate_assessment
 from palpate.quick.case import assess, examined
 from palpate.report.results import truth_of_run
+from palpate.report.scoring import Truth
 from palpate.study.statistics.estimate import LEVEL, Estimate
 from palpate.truth.felt import PALPABLE
 from palpate_assessment.assess import weigh_all
@@ -102,22 +103,23 @@ def weigh(seed: int) -> WeighedPatient:
     off = mean - np.log(known.felt.force(known.touched.places(places)))
     palpable = [lump for lump in known.felt.lumps if lump.palpable]
 
-    def real(candidate: Candidate) -> bool:
-        """Whether a lump is felt within a candidate's radius."""
-        bump, sign = candidate.bump, np.sign(candidate.log_contrast)
-        angle, r = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), np.linspace(0, 1, 4))
-        ring = np.column_stack(((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()))
-        there = known.touched.places(np.array((bump.x, bump.y)) + bump.radius * ring)
-        return bool(np.nan_to_num(sign * known.felt.excess(there)).max() >= np.log(FELT))
-
     return WeighedPatient(
         seed=seed,
         features=[candidate.features.tolist() for candidate in candidates],
-        real=[real(candidate) for candidate in candidates],
+        real=[real(candidate, known) for candidate in candidates],
         contrast=max((float(np.exp(abs(np.log(lump.contrast)))) for lump in palpable), default=1.0),
         radius_m=max((float(np.sqrt(lump.area / np.pi)) for lump in palpable), default=0.0),
         held=float(np.mean(np.abs(off[np.isfinite(off)]) <= 1.6449 * sd[np.isfinite(off)])),
     )
+
+
+def real(candidate: Candidate, known: Truth) -> bool:
+    """Whether a lump of felt contrast FELT or more is felt within a candidate's radius."""
+    bump, sign = candidate.bump, np.sign(candidate.log_contrast)
+    angle, r = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), np.linspace(0, 1, 4))
+    ring = np.column_stack(((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()))
+    there = known.touched.places(np.array((bump.x, bump.y)) + bump.radius * ring)
+    return bool(np.nan_to_num(sign * known.felt.excess(there)).max() >= np.log(FELT))
 
 
 def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration:

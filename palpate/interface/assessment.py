@@ -221,9 +221,11 @@ def samples_frame(messages: list[Any]) -> pd.DataFrame:
 
 
 def findings_frame(rows: Iterable[FindingRow]) -> pd.DataFrame:
-    """Findings, a row each: where [m], area [m^2], apparent stiffness over that of the surroundings with its 90 % band."""
-    columns = ("quadrant", "x_m", "y_m", "z_m", "area_m2", "ratio", "ratio_lower", "ratio_upper", "confidence")
-    values = [(f.quadrant, *f.centroid_m, f.area_m2, f.ratio, *f.ratio_90, f.confidence) for f in rows]
+    """Findings, a row each: where [m], area [m^2], apparent stiffness over that of the surroundings with its 90 % band;
+    probability of a lump, and of a tensed muscle.
+    """
+    columns = ("quadrant", "x_m", "y_m", "z_m", "area_m2", "ratio", "ratio_lower", "ratio_upper", "confidence", "guarding")
+    values = [(f.quadrant, *f.centroid_m, f.area_m2, f.ratio, *f.ratio_90, f.confidence, f.guarding) for f in rows]
     return pd.DataFrame(values, columns=list(columns))
 
 

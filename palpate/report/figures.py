@@ -17,6 +17,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 from matplotlib.tri import Triangulation
 
+from palpate.report import words
 from palpate.report.evidence import Samples, map_of
 from palpate.report.scoring import Map, Truth
 from palpate_models.band import half_width
@@ -267,15 +268,11 @@ def colour_bar(image: ScalarMappable, axes: Axes, label: str) -> None:
     bar.outline.set_visible(False)
 
 
-def _percent(confidence: float) -> str:
-    return f"{100 * confidence:.0f} %" if confidence < 0.99 else "over 99 %"
-
-
 def _summary(drawing: Drawing) -> str:
     if not drawing.findings:
         return "no finding"
     return "; ".join(
         f"{f.quadrant}, {f.ratio:.1f} times as stiff "
-        f"({f.ratio_lower:.1f} to {f.ratio_upper:.1f}), confidence {_percent(f.confidence)}"
+        f"({f.ratio_lower:.1f} to {f.ratio_upper:.1f}), confidence {words.confidence(f)}"
         for f in drawing.findings
     )

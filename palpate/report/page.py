@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from pydantic import ValidationError
 
-from palpate.report import page_figures, page_surface
+from palpate.report import page_figures, page_surface, words
 from palpate.report.archive import FILE as EVIDENCE
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
 from palpate.report.evidence import body_of, felt_truth
@@ -35,7 +35,6 @@ QUADRANTS: Final = {
     "RLQ": "right lower quadrant",
     "LLQ": "left lower quadrant",
 }
-_PERCENT: Final = 100.0
 
 
 def read_report(folder: Path) -> Report:
@@ -92,7 +91,7 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
         report=report,
         evidence=evidence,
         verdict=verdict(report),
-        confidence=confidence,
+        confidence=words.confidence,
         quadrants=QUADRANTS,
         skipped=skipped,
         safety=_safety(report, evidence),
@@ -116,20 +115,16 @@ def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
     return felt_truth(scenario, body_of(evidence.phantom), evidence.pressed, evidence.touched)
 
 
-def confidence(value: float) -> str:
-    """A probability in words: no finding is certain."""
-    return "over 99 %" if value > 0.99 else f"{_PERCENT * value:.0f} %"
-
-
 def verdict(report: Report) -> str:
     """The result in a sentence."""
     if report.failure:
         return f"The examination did not complete: {report.failure}."
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
+    muscles = words.tensed((*report.findings, *report.candidates))
     if not report.findings:
-        return f"{unassessed(report)}No lump was found{_unreached(report)}."
-    return unassessed(report) + " ".join(_in_words(finding) for finding in report.findings)
+        return f"{unassessed(report)}No lump was found{_unreached(report)}. {muscles}".rstrip()
+    return f"{unassessed(report)}{' '.join(map(_in_words, report.findings))} {muscles}".rstrip()
 
 
 def _unreached(report: Report) -> str:
@@ -142,7 +137,7 @@ def _in_words(f: FindingRow) -> str:
     where, kind = QUADRANTS.get(f.quadrant, f.quadrant), "stiff" if f.ratio > 1 else "soft"
     return (
         f"A {kind} area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
-        f"(90 % band {low:.1f} to {high:.1f}), confidence {confidence(f.confidence)}."
+        f"(90 % band {low:.1f} to {high:.1f}), confidence {words.confidence(f)}."
     )
 
 

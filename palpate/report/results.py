@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from palpate.report import archive, scoring
+from palpate.report import archive, scoring, words
 from palpate.report.evidence import (
     ContactRecord,
     Samples,
@@ -203,8 +203,8 @@ def _level(report: Report) -> str:
 
 def print_findings(console: Console, report: Report) -> None:
     """What is not assessed, the findings as a table, and their scores in a line."""
-    if words := unassessed(report):
-        console.print(words.rstrip(), highlight=False, soft_wrap=True)
+    if unknown := unassessed(report):
+        console.print(unknown.rstrip(), highlight=False, soft_wrap=True)
     if report.findings:
         table = Table("finding", "where (x, y)", "area", "apparent stiffness", "90 % band", "confidence", box=None)
         for f in report.findings:
@@ -214,13 +214,15 @@ def print_findings(console: Console, report: Report) -> None:
                 f"{f.area_m2 * 1e4:.1f} cm²",
                 f"{f.ratio:.1f} x",
                 f"{f.ratio_90[0]:.1f} to {f.ratio_90[1]:.1f}",
-                "over 99 %" if f.confidence > 0.99 else f"{100 * f.confidence:.0f} %",
+                words.confidence(f),
             )
         console.print(table)
     elif report.assessed:
         console.print("no finding" if report.failure is None else "no finding in what was scanned")
     else:
         console.print("not assessed")
+    if muscles := words.tensed((*report.findings, *report.candidates)):
+        console.print(muscles.rstrip(), highlight=False, soft_wrap=True)
     if searched := report.services.get("search", {}).get("facts"):
         console.print(
             f"search: {searched['presses']} presses in {searched['seconds']:.0f} s; {searched['ended']}", highlight=False
@@ -264,6 +266,7 @@ def finding_row(f: Any) -> FindingRow:
         ratio=f.ratio,
         ratio_90=(f.ratio_lower, f.ratio_upper),
         confidence=f.confidence,
+        guarding=f.guarding,
     )
 
 

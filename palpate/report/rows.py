@@ -29,6 +29,8 @@ class FindingRow(_Row):
     """Its 90 % band."""
     confidence: float
     """Probability that a lump of felt contrast 1.3 or more is there."""
+    guarding: float
+    """Probability that it is a tensed muscle, and no lump."""
 
 
 class LumpRow(_Row):

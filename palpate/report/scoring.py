@@ -91,7 +91,7 @@ class FindingScore:
     ratio_held: bool | None
     """Whether its band holds the true ratio."""
     on_guarding: bool
-    """Whether it is false and overlaps guarded muscle."""
+    """Whether it is false and overlaps guarded muscle; of a candidate, whether its centroid lies on it."""
 
 
 @dataclass(frozen=True)
@@ -209,10 +209,13 @@ def _within(found: Sequence[Found], truth: Truth) -> Mask:
 def _candidate_scores(candidates: Sequence[Found], taken: set[int], truth: Truth) -> tuple[FindingScore, ...]:
     """Scores of candidates: each matches the first lump about its centroid that no finding and no earlier candidate has."""
     rows = []
+    felt = truth.felt
     for candidate, within in zip(candidates, _within(candidates, truth), strict=True):
         lump = next((int(j) for j in np.flatnonzero(within) if int(j) not in taken), None)
         taken = taken | {lump} if lump is not None else taken
-        rows.append(_finding_score(candidate, lump, None, None, on_guarding=False, truth=truth))
+        centroid = truth.touched.places(candidate.centroid[None, :2])
+        on_guarding = lump is None and bool(felt.inside(felt.guarded, centroid)[0])
+        rows.append(_finding_score(candidate, lump, None, None, on_guarding, truth))
     return tuple(rows)
 
 

@@ -70,6 +70,8 @@ class MethodRow(Row):
     """Detectability by the lumps themselves."""
     errors: ErrorsRow
     calibration: CalibrationRow | None
+    guarding: CalibrationRow | None = None
+    """Of the probabilities of a tensed muscle; None where no area lies on one."""
     effort: dict[str, Spread]
     coverage: dict[str, Estimate]
 
@@ -177,6 +179,7 @@ def _method(a: Analysis) -> MethodRow:
         made=None if a.made is None else _surface(a.made, "contrast", "radius_m"),
         errors=a.errors.figures,
         calibration=None if a.calibration is None else a.calibration.figures,
+        guarding=None if a.guarding is None else a.guarding.figures,
         effort=a.effort,
         coverage=a.coverage,
     )

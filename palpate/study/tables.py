@@ -72,13 +72,16 @@ FINDINGS: Final = pa.schema(
         "ratio_lower": pa.float64(),
         "ratio_upper": pa.float64(),
         "confidence": pa.float64(),
+        "guarding": pa.float64(),
         "lump": pa.int64(),
         "place_error_m": pa.float64(),
         "area_true_m2": pa.float64(),
         "ratio_true": pa.float64(),
+        "on_guarding": pa.bool_(),
     }
 )
-"""A row a finding, and a row a candidate that was weighed and not reported. `lump`: the lump that it matches, -1 if none."""
+"""A row a finding, and a row a candidate that was weighed and not reported. `lump`: the lump that it matches, -1 if none.
+`guarding`: the probability of a tensed muscle that it tells. `on_guarding`: whether it lies on one and hits no lump."""
 LUMPS: Final = pa.schema(
     {
         "case_id": pa.string(),
@@ -180,10 +183,12 @@ def _finding(outcome: Outcome, index: int, found: tuple[FindingRow, bool], score
         "ratio_lower": finding.ratio_90[0],
         "ratio_upper": finding.ratio_90[1],
         "confidence": finding.confidence,
+        "guarding": finding.guarding,
         "lump": -1 if lump is None else lump,
         "place_error_m": nan if score is None else _number(score.place_error_m),
         "area_true_m2": nan if lump is None or truth is None else truth.lumps[lump].area_m2,
         "ratio_true": nan if score is None else _number(score.true_ratio),
+        "on_guarding": None if score is None else score.on_guarding,
     }
 
 

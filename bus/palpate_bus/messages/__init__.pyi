@@ -172,6 +172,7 @@ class Finding:
     ratio_lower: float
     ratio_upper: float
     confidence: float
+    guarding: float
 
 @dataclass
 class Findings:

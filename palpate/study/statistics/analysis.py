@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from palpate.study.statistics.calibration import FindingCalibration, calibration
+from palpate.study.statistics.calibration import FindingCalibration, calibration, guarding
 from palpate.study.statistics.contrast import ContrastRow, by_contrast
 from palpate.study.statistics.detectability import FELT, MADE, Surface, observed, surface
 from palpate.study.statistics.effort import COVERED, MEASURED, Spread, coverage, spread
@@ -35,6 +35,8 @@ class Analysis:
     """Part of the lumps found, in bins over each covariate."""
     errors: FindingErrors
     calibration: FindingCalibration | None
+    guarding: FindingCalibration | None
+    """Of the probabilities of a tensed muscle."""
     effort: dict[str, Spread]
     coverage: dict[str, Estimate]
 
@@ -54,6 +56,7 @@ def analyse(variant: Variant, bootstrap: Bootstrap) -> Analysis:
         observed={name: observed(variant, name, bootstrap) for name in dict.fromkeys((*FELT, *MADE))},
         errors=finding_errors(variant, bootstrap),
         calibration=calibration(variant, bootstrap),
+        guarding=guarding(variant, bootstrap),
         effort={name: spread(variant, name, bootstrap) for name in MEASURED},
         coverage={name: coverage(variant, name, bootstrap) for name in COVERED},
     )

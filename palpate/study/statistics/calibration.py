@@ -1,4 +1,4 @@
-"""Calibration: whether of the areas with confidence p a part p hits a lump."""
+"""Calibration: whether of the areas with confidence p a part p hits a lump; the same of tensed muscle."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Final
 from zlib import crc32
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import logit
 from sklearn.metrics import brier_score_loss
@@ -48,9 +49,19 @@ class FindingCalibration:
 def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
     """The calibration of one method's confidences; None where it has no areas with a confidence."""
     areas = variant.findings.dropna(subset=["confidence"])
-    if areas.empty:
-        return None
-    p, hit = areas["confidence"].to_numpy(dtype=np.float64), (areas["lump"] >= 0).to_numpy()
+    return None if areas.empty else _calibration(areas, "confidence", (areas["lump"] >= 0).to_numpy(), bootstrap)
+
+
+def guarding(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
+    """The same of the probabilities of a tensed muscle; None where no area lies on one, or none tells a probability."""
+    areas = variant.findings.dropna(subset=["guarding", "on_guarding"])
+    tensed = areas["on_guarding"].to_numpy(dtype=bool)
+    return _calibration(areas, "guarding", tensed, bootstrap) if tensed.any() else None
+
+
+def _calibration(areas: pd.DataFrame, told: str, hit: NDArray[np.bool_], bootstrap: Bootstrap) -> FindingCalibration:
+    """How the probabilities `told` of areas go with their hits, shape (n,)."""
+    p = areas[told].to_numpy(dtype=np.float64)
     patient = areas["patient"].to_numpy(dtype=np.intp)
     order = np.argsort(p, kind="stable")
     p, hit, patient = p[order], hit[order], patient[order]

@@ -18,11 +18,12 @@ COLUMNS: Final = {
     "cases": """case_id study population method split number tier errors status completed palpable not_palpable false_findings
         score coverage_area coverage_lumps coverage_ratio depth_rms_m peak_force_n exam_time_s
         loop_examinations""",
-    "findings": """case_id reported area_m2 ratio ratio_lower ratio_upper confidence lump place_error_m area_true_m2
-        ratio_true""",
+    "findings": "case_id reported area_m2 ratio ratio_lower ratio_upper confidence lump place_error_m area_true_m2 ratio_true",
     "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence",
 }
 """What the statistics read of each table."""
+LATER: Final = ("guarding", "on_guarding")
+"""Columns of findings that are empty where an earlier version made the table."""
 PATIENT: Final = ["study", "population", "split", "number"]
 """What tells patients apart: methods, tiers and levels of errors examine the same ones."""
 VARIANT: Final = ["method", "tier", "errors"]
@@ -106,7 +107,7 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, 
         raise TablesError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): one a patient is allowed")
     facts = cases[["case_id", "patient", "failed"]]
     findings, lumps = findings.merge(facts, on="case_id"), lumps.merge(facts, on="case_id")
-    findings = findings[~findings["failed"]]
+    findings = findings[~findings["failed"]].assign(**{name: None for name in LATER if name not in findings})
     lumps = lumps.assign(
         palpable=lumps["palpable"].eq(True),
         found=lumps["found"].eq(True) & ~lumps["failed"],

@@ -29,12 +29,19 @@ class Calibration(BaseModel):
     """A sliding indenter feels this much of its travel ahead [s]."""
     probability: tuple[float, ...]
     """Weights of a candidate's features (`detection.FEATURES`) in the logit of its probability, the constant first."""
+    guarding: tuple[float, float, float]
+    """Weights of the signs of a tensed muscle (`guarding.Signs`) in the logarithm of how much more probable it is than anything
+    else that is no lump, the constant first."""
     tail: tuple[float, float]
     """Location and scale of a healthy examination's greatest logit: P(greatest > s) = exp(-(s - location) / scale)."""
 
     def logit(self, features: Array) -> Array:
         """Logits of the probability of candidates with `features`, shape (k, f) -> (k,)."""
         return np.asarray(self.probability[0] + features @ np.array(self.probability[1:]))
+
+    def muscle(self, features: Array) -> Array:
+        """The logarithm of how much more probable a tensed muscle is than nothing, of signs' `features`, shape (k, 2) -> (k,)."""
+        return np.asarray(self.guarding[0] + features @ np.array(self.guarding[1:]))
 
     def threshold(self, false_findings: float) -> float:
         """The logit that a healthy examination exceeds with the probability `false_findings`."""

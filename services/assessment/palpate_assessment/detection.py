@@ -19,6 +19,7 @@ from scipy.optimize import Bounds, minimize
 from scipy.spatial import cKDTree
 
 from palpate_assessment.calibration import Calibration
+from palpate_assessment.guarding import Signs, signs
 from palpate_assessment.model import Bump, Regression, amplitudes, bone
 from palpate_assessment.observations import FEWEST, Observations
 from palpate_models.frames import Array
@@ -56,6 +57,8 @@ class Candidate:
     """E, by generalised least squares; negative where it is softer than its surroundings."""
     t: float
     """E over its standard deviation, as far as more than one stroke says it (`agreed`)."""
+    signs: Signs
+    """What of a tensed muscle is seen about it."""
 
     @property
     def features(self) -> Array:
@@ -97,7 +100,7 @@ def weigh(regression: Regression, lump: Bump) -> Candidate:
     others = tuple(other for other in regression.lumps if other is not lump)
     without = replace(regression, lumps=others)
     (log_contrast,), (t,) = matched(without, [lump])
-    return Candidate(lump, float(log_contrast), agreed(without, lump, float(t)))
+    return Candidate(lump, float(log_contrast), agreed(without, lump, float(t)), signs(regression, lump))
 
 
 def agreed(regression: Regression, lump: Bump, t: float) -> float:

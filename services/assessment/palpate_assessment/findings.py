@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.special import expit
 
+from palpate_assessment.calibration import Calibration
 from palpate_assessment.detection import SURE, Candidate
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression
@@ -44,6 +45,8 @@ class Area:
     """Probability that a lump of felt contrast 1.3 or more is there."""
     logit: float
     """The same as log-odds, by which the operating point is chosen."""
+    guarding: float
+    """Probability that it is a tensed muscle."""
 
 
 def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid, assessed: Mask) -> list[Area]:
@@ -52,21 +55,38 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
     What is there, but surely of less contrast than a lump, is none: a navel, say, where everything else is known well.
     """
     candidates = [candidate for candidate in candidates if candidate.beyond > -SURE]
-    logits = regression.calibration.logit(np.array([c.features for c in candidates])) if candidates else np.zeros(0)
-    order = np.argsort(-logits)
+    if not candidates:
+        return []
+    logits, guarding = causes(regression.calibration, candidates)
     found: list[Area] = []
-    for index in order:
-        candidate, logit = candidates[int(index)], float(logits[index])
-        if expit(logit) < WEIGHED:
+    for index in np.argsort(-logits):
+        if expit(logits[index]) < WEIGHED:
             break
-        area = _area(regression, candidate, grid, assessed, logit)
+        area = _area(regression, candidates[index], grid, assessed, (float(logits[index]), float(guarding[index])))
         if area is not None and not any((area.nodes & other.nodes).any() for other in found):
             found.append(area)
     return found
 
 
-def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed: Mask, logit: float) -> Area | None:
-    """The connected nodes about a candidate's peak with at least half of its log-contrast; None if nothing of it is left."""
+def causes(calibration: Calibration, candidates: Sequence[Candidate]) -> tuple[Array, Array]:
+    """The logit that each is a lump, and the probability that it is a tensed muscle, shape (k,) each.
+
+    Three causes compete, of weights exp(l) a lump, exp(g) a muscle, 1 neither. A muscle that is tensed is never softer.
+    """
+    lump = calibration.logit(np.array([c.features for c in candidates]))
+    muscle = calibration.muscle(np.array([c.signs.features for c in candidates]))
+    muscle[[c.log_contrast < 0 for c in candidates]] = -np.inf
+    return lump - np.logaddexp(0, muscle), np.exp(muscle - np.logaddexp(np.logaddexp(0, lump), muscle))
+
+
+def _area(
+    regression: Regression, candidate: Candidate, grid: MapGrid, assessed: Mask, probability: tuple[float, float]
+) -> Area | None:
+    """The connected nodes about a candidate's peak with at least half of its log-contrast; None if nothing of it is left.
+
+    `probability`: as of `causes`.
+    """
+    logit, guarding = probability
     xy = grid.nodes[:, :2]
     bump, sign = candidate.bump, float(np.sign(candidate.log_contrast))
     near = np.flatnonzero(bump(xy, 0.5 * bump.radius + 0.01) > 1e-3)
@@ -93,4 +113,5 @@ def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed:
         ratio_upper=float(np.exp(middle + Z90 * sd)),
         confidence=float(expit(logit)),
         logit=logit,
+        guarding=guarding,
     )

@@ -26,6 +26,8 @@ from palpate_models.frames import Array
 
 LENGTHS_M = (0.012, 0.022, 0.045, 0.09, 0.18)
 """Lengths of the fields that natural variation is made of."""
+SMOOTH_M = 0.045
+"""Fields of this length and more are smooth: alike over a hand's breadth."""
 STRIP_M = (0.018, 0.08)
 """Lengths of the strips, across and along the body."""
 BONE_M = 0.022
@@ -221,6 +223,13 @@ class Regression:
         if self.lumps:
             variance += (UNLIKE * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2
         return self.level + self.whitened @ seen, np.sqrt(variance)
+
+    def smooth(self, xy: Array) -> Array:
+        """Posterior mean of the smooth fields at places [m], shape (k, 2) -> (k,)."""
+        o = self.observations
+        fields = zip(self.log_amplitudes, LENGTHS_M, strict=False)
+        parts = [np.exp(2 * log_amplitude) * _smooth(o.xy, xy, length) for log_amplitude, length in fields if length >= SMOOTH_M]
+        return self.whitened @ self.whiten(np.sum(parts, axis=0))
 
     def contrast(self, lump: Bump, xy: Array) -> tuple[Array, Array]:
         """Posterior mean (k,) and covariance (k, k) of one lump's log-contrast at places [m], shape (k, 2)."""

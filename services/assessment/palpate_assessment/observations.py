@@ -31,6 +31,8 @@ class Observations:
     stroke: NDArray[np.intp]
     y: Array
     """log F - n log(depth / press depth) - conversion, shape (m,)."""
+    touched_for: Array
+    """Time since the stroke touched [s]."""
     log_depth: Array
     """log(depth / press depth), by which an error of the exponent n counts."""
     per_metre: Array
@@ -71,6 +73,7 @@ def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observa
         time=np.array([s.time for s in good]),
         stroke=stroke,
         y=np.log(force) - calibration.exponent * log_depth - calibration.conversion,
+        touched_for=np.array([s.time_in_contact for s in good]),
         log_depth=log_depth,
         per_metre=calibration.exponent / depth,
         per_newton=np.array([1.0 / usual[int(one)] for one in stroke]),

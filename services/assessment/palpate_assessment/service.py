@@ -258,4 +258,5 @@ def finding_message(area: Area) -> Message:
         ratio_lower=area.ratio_lower,
         ratio_upper=area.ratio_upper,
         confidence=area.confidence,
+        guarding=area.guarding,
     )

@@ -11,6 +11,7 @@ from assessment_lines import LEVEL, level, lines, lump, natural
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted, pieces
 from palpate_assessment.detection import Candidate, agreed, matched
+from palpate_assessment.guarding import Signs
 from palpate_assessment.model import ILIAC_M, LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
 
@@ -94,14 +95,21 @@ def test_a_model_that_holds_is_not_contradicted() -> None:
 
 
 def test_what_may_be_bone_is_less_probably_a_lump() -> None:
-    open_wall, spine = (Candidate(Bump(x, y, 0.02), 0.6, 5.0) for x, y in ((0.0, 0.0), ILIAC_M))
+    open_wall, spine = (Candidate(Bump(x, y, 0.02), 0.6, 5.0, Signs(0.0, 0.0)) for x, y in ((0.0, 0.0), ILIAC_M))
     logits = learned().logit(np.array((open_wall.features, spine.features)))
     assert logits[1] < logits[0] - 0.5
 
 
 def test_less_false_findings_need_more_evidence() -> None:
     calibration = Calibration(
-        exponent=1.3, exponent_sd=0.1, conversion=0, conversion_sd=0.03, lead_s=0, probability=(-5, 1), tail=(-1.0, 0.8)
+        exponent=1.3,
+        exponent_sd=0.1,
+        conversion=0,
+        conversion_sd=0.03,
+        lead_s=0,
+        probability=(-5, 1),
+        guarding=(-2, 5, 4),
+        tail=(-1.0, 0.8),
     )
     thresholds = [calibration.threshold(rate) for rate in (0.2, 0.02, 0.002)]
     assert np.diff(thresholds) == pytest.approx(0.8 * np.log(10) * np.ones(2))

@@ -25,11 +25,15 @@ FELT_N = 1.0
 """At this force the descent has felt enough."""
 BEGUN_N = 0.2
 """About here the onset is looked for first."""
-WINDOW_M = 0.010
-"""So much of the descent is kept, in depth: more than the onset and enough of the air above it."""
+WINDOW_M, AIR_M = 0.010, 0.003
+"""So much of the descent is kept, in depth, at least; and so much of the air above the skin, as on a soft wall, where FELT_N is
+felt at a depth of more than 7 mm."""
+_SINCE_BEGUN = 1 - (BEGUN_N / FELT_N) ** (1 / ONSET_EXPONENT)
+"""Part of the way from d0 to FELT_N that is left at BEGUN_N, by the law."""
 SAMPLES_MIN = 8
-METHOD_M = 0.00025
-"""Standard deviation of d0 for what the law leaves out."""
+METHOD_M, METHOD_SHARE = 0.00025, 0.035
+"""Standard deviation of d0 for what the law leaves out; at least this part of the way from d0 to FELT_N, since another exponent
+errs by a part of it: 0.055 where it is 1.45."""
 UNFITTED_M = 0.001
 """The same where no law can be fitted, as on bone, where force rises within a few samples: d0 is where force began."""
 
@@ -73,10 +77,10 @@ class Onset:
 
 def find_touch(rows: Array) -> SkinDepth:
     """The touch in a descent's rows of depth [m] and force [N], shape (n, 2), of which the last is the deepest and firmest."""
-    rows = rows[rows[:, 0] > rows[-1, 0] - WINDOW_M]
+    quiet = np.flatnonzero(rows[:, 1] < BEGUN_N)
+    begun = float(rows[quiet[-1] if len(quiet) else 0, 0])
+    rows = rows[rows[:, 0] > rows[-1, 0] - max(WINDOW_M, (rows[-1, 0] - begun) / _SINCE_BEGUN + AIR_M)]
     depth, force = rows.T
-    quiet = np.flatnonzero(force < BEGUN_N)
-    begun = float(depth[quiet[-1]]) if len(quiet) else float(depth[0])
     guess = SkinDepth(begun, UNFITTED_M)
     if len(rows) < SAMPLES_MIN:
         return guess
@@ -88,7 +92,7 @@ def find_touch(rows: Array) -> SkinDepth:
     variance = float(covariance[2, 2])
     if not (slope > 0 and depth[0] < d0 < depth[-1] and variance < UNFITTED_M**2):
         return guess
-    return SkinDepth(float(d0), math.hypot(METHOD_M, math.sqrt(variance)))
+    return SkinDepth(float(d0), math.hypot(max(METHOD_M, METHOD_SHARE * (depth[-1] - d0)), math.sqrt(variance)))
 
 
 def _force(depth: Array, bias: float, slope: float, onset: float) -> Array:

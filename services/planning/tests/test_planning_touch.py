@@ -12,7 +12,7 @@ from palpate_planning.touch import FELT_N, UNFITTED_M, Onset, find_touch
 
 def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:
     """Rows of depth [m] and force [N] every 0.14 mm, until the force is felt; `stiffness` [N] at 4 mm."""
-    depth = np.arange(onset - 0.008, onset + 0.012, 0.00014)
+    depth = np.arange(onset - 0.008, onset + 0.016, 0.00014)
     force = stiffness * (np.maximum(depth - onset, 0.0) / 0.004) ** exponent
     force = force + bias + noise * np.random.default_rng(seed).standard_normal(len(depth))
     return np.column_stack((depth, force))[: int(np.argmax(force >= FELT_N)) + 1]
@@ -26,6 +26,14 @@ def test_the_skin_is_found_within_its_uncertainty(
     touch = find_touch(descent(onset, stiffness, exponent, bias, 0.03, seed))
     assert abs(touch.depth - onset) < 4 * touch.sigma
     assert touch.sigma < 0.0012
+
+
+@given(st.floats(0.2, 0.6), st.floats(1.2, 1.45), st.integers(0, 1000))
+@settings(deadline=None)
+def test_on_a_soft_wall_the_air_above_the_skin_is_kept(stiffness: float, exponent: float, seed: int) -> None:
+    touch = find_touch(descent(0.0, stiffness, exponent, 0.05, 0.03, seed))
+    assert abs(touch.depth) < 0.001
+    assert abs(touch.depth) < 4 * touch.sigma
 
 
 def test_the_law_itself_is_found_exactly() -> None:
