@@ -316,7 +316,7 @@ class DashboardService(Service):
         self._scene.stiffness(t, apply(self._X_WA, vertices.astype(np.float64)).astype(np.float32), ratio, scanned)
 
     def _findings(self, t: int, message: Message) -> None:
-        lines = [words.finding(f.quadrant, f.ratio, f.ratio_lower, f.ratio_upper, f.area, f.confidence) for f in message.findings]
+        lines = [words.finding(f) for f in message.findings]
         if lines != self._found:
             self._found = lines
             centroids = arrays.points(f.centroid for f in message.findings)

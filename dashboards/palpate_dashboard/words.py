@@ -21,6 +21,8 @@ CONTACT_FLAGS = ("in_contact", "steady", "force_limited", "view_blocked")
 
 FREE_M = -0.02
 """At this depth or less the tool is away from the skin, and what the force sensor reads is no contact but its bias."""
+MUSCLE_TOLD = 0.05
+"""From this probability on a tensed muscle is told beside a finding's confidence."""
 
 LEGEND = """
 | in the scene | |
@@ -122,9 +124,10 @@ def unassessed(codes: NDArray[np.uint8]) -> list[str]:
     return [f"not assessed: {100 * share:.0f} %, {reason}" for reason, share in shares.items() if share > 0]
 
 
-def finding(quadrant: str, ratio: float, lower: float, upper: float, area_m2: float, confidence: float) -> str:
-    """A finding in one line."""
+def finding(f: Message) -> str:
+    """A `palpation_msgs/Finding` in one line."""
+    muscle = f" ({100 * f.guarding:.0f} % a tensed muscle)" if f.guarding >= MUSCLE_TOLD else ""
     return (
-        f"{quadrant}: {ratio:.1f} x stiffer ({lower:.1f}-{upper:.1f}), {1e4 * area_m2:.1f} cm2, "
-        f"confidence {100 * confidence:.0f} %"
+        f"{f.quadrant}: {f.ratio:.1f} x stiffer ({f.ratio_lower:.1f}-{f.ratio_upper:.1f}), {1e4 * f.area:.1f} cm2, "
+        f"confidence {100 * f.confidence:.0f} %{muscle}"
     )

@@ -116,6 +116,17 @@ def test_what_is_not_assessed_comes_first_and_a_region_that_is_stiff_all_over_is
     assert firm.startswith("The whole region is unusually firm: 7.0 N, where 1.2 to 4.8 N are usual.")
 
 
+def test_what_is_rather_a_tensed_muscle_is_told() -> None:
+    whole = assemble(load_scenario("clean"), result(collected(), failure=None), Known(None, None, None))
+    (lump,) = whole.findings
+    muscle = lump.model_copy(update={"confidence": 0.12, "guarding": 0.8})
+    assert "tensed muscle" not in verdict(whole)
+    told = verdict(whole.model_copy(update={"candidates": [muscle]}))
+    assert told.endswith("A stiff area in RLQ is probably a tensed muscle (80 %), rather than a lump (12 %).")
+    doubtful = verdict(whole.model_copy(update={"findings": [lump.model_copy(update={"confidence": 0.7, "guarding": 0.2})]}))
+    assert "confidence 70 % (20 % a tensed muscle)" in doubtful
+
+
 def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:
     c = collected(measured_error=0.0002)
     archive.write_evidence(tmp_path / archive.FILE, c)

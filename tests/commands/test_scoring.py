@@ -172,6 +172,8 @@ def test_a_finding_on_guarding_is_false_and_told_apart() -> None:
     assert (s.false_findings, s.on_guarding) == (1, 1)
     away = (np.array((-0.05, 0.0)), 0.02)
     assert score([away], truth([], guarded=guarded)).on_guarding == 0
+    weighed = scoring.score([], None, truth([], guarded=guarded), found([guarded, away])).candidates
+    assert [row.on_guarding for row in weighed] == [True, False]
     over_both = truth([guarded], guarded=guarded)
     assert (score([guarded], over_both).matched, score([guarded], over_both).on_guarding) == (1, 0)
 
@@ -253,6 +255,7 @@ def test_a_candidate_matches_a_lump_that_no_finding_has() -> None:
     assert [row.lump for row in s.findings] == [0]
     assert [row.lump for row in s.candidates] == [None, 1, None, None]
     assert s.candidates[1].place_error_m == pytest.approx(0.0, abs=1e-3)
+    assert not any(row.on_guarding for row in s.candidates)
     without = scoring.score(found(reported), found_map(reported), true)
     assert (s.matched, s.missed, s.false_findings) == (without.matched, without.missed, without.false_findings) == (1, 1, 0)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import synthetic
 
-from palpate.study.statistics.calibration import calibration
+from palpate.study.statistics.calibration import calibration, guarding
 from palpate.study.statistics.errors import finding_errors
 from palpate.study.statistics.estimate import Bootstrap
-from palpate.study.statistics.reading import Tables
+from palpate.study.statistics.reading import Tables, tables_of
 
 
 def _matched(n: int, seed: int = 0) -> Tables:
@@ -93,6 +94,30 @@ def test_confidences_that_are_too_sure() -> None:
     assert found.slope.high is not None
     assert found.slope.high < 0.8
     assert (found.expected_error.value or 0) > 2 * found.expected_error_by_chance
+
+
+def test_probabilities_of_a_tensed_muscle_are_judged_by_the_areas_on_muscles() -> None:
+    rng = np.random.default_rng(0)
+    cases = [synthetic.case(i, "guarding") for i in range(400)]
+    findings = []
+    for case in cases:
+        told = float(rng.uniform(0.0, 1.0))
+        findings.append(synthetic.finding(case["case_id"], 0.1, -1, guarding=told, on_guarding=bool(rng.random() < told)))
+    tables = synthetic.tables(cases, findings, [])
+    calibrated = guarding(tables.variants[0], tables.bootstrap)
+    assert calibrated is not None
+    assert calibrated.figures.slope.value == pytest.approx(1.0, abs=0.2)
+    assert abs(calibrated.figures.in_the_large.value or 0) < 0.05
+
+
+def test_without_muscles_or_in_an_older_table_there_is_no_such_calibration() -> None:
+    without = _areas(20, 1.0)
+    assert guarding(without.variants[0], without.bootstrap) is None
+    findings = [{k: v for k, v in synthetic.finding("a", 0.4, -1).items() if "guarding" not in k}]
+    older = tables_of(
+        pd.DataFrame([synthetic.case(0, "a") | {"case_id": "a"}]), pd.DataFrame(findings), synthetic.frames([], [], [])[2]
+    )
+    assert guarding(older.variants[0], older.bootstrap) is None
 
 
 def test_no_area_no_calibration() -> None:

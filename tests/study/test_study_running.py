@@ -207,14 +207,18 @@ def test_candidates_are_in_the_tables(folder: Path, tmp_path: Path) -> None:
     report = outcome.report
     assert report is not None
     assert report.scores is not None
-    area = FindingRow(centroid_m=(0, 0, 0), quadrant="umbilical", area_m2=1e-3, ratio=1.4, ratio_90=(1.1, 1.8), confidence=0.3)
+    area = FindingRow(
+        centroid_m=(0, 0, 0), quadrant="RLQ", area_m2=1e-3, ratio=1.4, ratio_90=(1.1, 1.8), confidence=0.3, guarding=0.1
+    )
     score = FindingScore(0, None, 0.002, 0.002, 0.1, None, None, None, on_guarding=False)
-    scores = dataclasses.replace(report.scores, findings=(), candidates=(score, dataclasses.replace(score, lump=None)))
+    beside = dataclasses.replace(score, lump=None, on_guarding=True)
+    scores = dataclasses.replace(report.scores, findings=(), candidates=(score, beside))
     weighed = [area, area.model_copy(update={"confidence": 0.1})]
     report = report.model_copy(update={"findings": [], "candidates": weighed, "scores": scores})
     write_tables(tmp_path, "toy", [outcome.model_copy(update={"report": report})])
     rows = pd.read_parquet(tmp_path / "findings.parquet").to_dict("records")
     assert [(row["reported"], row["confidence"], row["lump"]) for row in rows] == [(False, 0.3, 0), (False, 0.1, -1)]
+    assert [(row["guarding"], row["on_guarding"]) for row in rows] == [(0.1, False), (0.1, True)]
     (lump,) = pd.read_parquet(tmp_path / "lumps.parquet").to_dict("records")
     assert (lump["found"], lump["confidence"]) == (False, 0.3)
     (case,) = pd.read_parquet(tmp_path / "cases.parquet").to_dict("records")
