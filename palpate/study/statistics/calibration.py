@@ -53,8 +53,12 @@ def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | 
 
 
 def guarding(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
-    """The same of the probabilities of a tensed muscle; None where no area lies on one, or none tells a probability."""
+    """The same of the probabilities of a tensed muscle, over the areas that are stiffer than their surroundings.
+
+    None where no area lies on a muscle, or none tells a probability.
+    """
     areas = variant.findings.dropna(subset=["guarding", "on_guarding"])
+    areas = areas[areas["ratio"] > 1]
     tensed = areas["on_guarding"].to_numpy(dtype=bool)
     return _calibration(areas, "guarding", tensed, bootstrap) if tensed.any() else None
 
