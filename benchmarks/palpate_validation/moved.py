@@ -13,8 +13,8 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
-from palpate.report.archive import read_evidence
-from palpate_models.load import load_scenario
+from palpate.report.archive import EvidenceError, read_evidence
+from palpate_models.load import ScenarioError, load_scenario
 from palpate_models.motion import BodyMotion
 
 NOTICED: Final = "the patient has moved"
@@ -58,7 +58,10 @@ def noticed(folder: Path) -> Noticed:
 
 def main(folders: Annotated[list[Path], typer.Argument(help="Folders of runs whose patients move.")]) -> None:
     """Print when motions were noticed."""
-    rows = [noticed(folder) for folder in folders]
+    try:
+        rows = [noticed(folder) for folder in folders]
+    except (EvidenceError, ScenarioError) as error:
+        raise typer.BadParameter(str(error)) from error
     for folder, row in zip(folders, rows, strict=True):
         print(
             f"{folder.name}: at {row.at_s:.1f} s, noticed after {row.after_s:.2f} s, looked again after {row.looked_s:.1f} s, "
