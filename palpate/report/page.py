@@ -121,7 +121,7 @@ def verdict(report: Report) -> str:
         return f"The examination did not complete: {report.failure}."
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
-    muscles = words.tensed((*report.findings, *report.candidates))
+    muscles = words.tensed(report.candidates)
     if not report.findings:
         return f"{unassessed(report)}No lump was found{_unreached(report)}. {muscles}".rstrip()
     return f"{unassessed(report)}{' '.join(map(_in_words, report.findings))} {muscles}".rstrip()

@@ -221,7 +221,7 @@ def print_findings(console: Console, report: Report) -> None:
         console.print("no finding" if report.failure is None else "no finding in what was scanned")
     else:
         console.print("not assessed")
-    if muscles := words.tensed((*report.findings, *report.candidates)):
+    if muscles := words.tensed(report.candidates):
         console.print(muscles.rstrip(), highlight=False, soft_wrap=True)
     if searched := report.services.get("search", {}).get("facts"):
         console.print(

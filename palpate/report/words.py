@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final, Protocol
 
+from palpate.report.rows import FindingRow
+
 _SURE: Final = 0.99
 _WORTH_TELLING: Final = 0.05
 """Probability of a tensed muscle from which it is told."""
@@ -14,7 +16,6 @@ _LIKELY: Final = 0.5
 class Probable(Protocol):
     """A finding or a candidate, as a row or as a message."""
 
-    quadrant: str
     confidence: float
     guarding: float
 
@@ -30,11 +31,11 @@ def confidence(found: Probable) -> str:
     return percent(found.confidence) + muscle
 
 
-def tensed(found: Iterable[Probable]) -> str:
-    """The areas that are rather tensed muscle than lumps, in a sentence each."""
-    muscles = [f for f in found if f.guarding > max(f.confidence, _LIKELY)]
+def tensed(candidates: Iterable[FindingRow]) -> str:
+    """The areas that are probably tensed muscle, and no finding, in a sentence each."""
     return "".join(
-        f"A stiff area in {f.quadrant} is probably a tensed muscle ({percent(f.guarding)}), rather than a lump "
-        f"({percent(f.confidence)}). "
-        for f in muscles
+        f"The stiff area about ({1e3 * f.centroid_m[0]:+.0f}, {1e3 * f.centroid_m[1]:+.0f}) mm, in {f.quadrant}, is probably "
+        f"a tensed muscle ({percent(f.guarding)}) and no lump ({percent(f.confidence)}). "
+        for f in candidates
+        if f.guarding > _LIKELY
     )

@@ -122,7 +122,7 @@ def test_what_is_rather_a_tensed_muscle_is_told() -> None:
     muscle = lump.model_copy(update={"confidence": 0.12, "guarding": 0.8})
     assert "tensed muscle" not in verdict(whole)
     told = verdict(whole.model_copy(update={"candidates": [muscle]}))
-    assert told.endswith("A stiff area in RLQ is probably a tensed muscle (80 %), rather than a lump (12 %).")
+    assert told.endswith("mm, in RLQ, is probably a tensed muscle (80 %) and no lump (12 %).")
     doubtful = verdict(whole.model_copy(update={"findings": [lump.model_copy(update={"confidence": 0.7, "guarding": 0.2})]}))
     assert "confidence 70 % (20 % a tensed muscle)" in doubtful
 
