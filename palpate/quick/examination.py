@@ -49,6 +49,7 @@ _DENSE_M: Final = 0.0003
 """Along a stroke, places are known so far apart: what the indenter travels in a period."""
 _DOWN: Final = np.diag((1.0, -1.0, -1.0))
 """The tool's orientation, with its z axis into the body."""
+_NO_ARM: Final = np.zeros(7)
 _NOWHERE: Final = np.zeros(3)
 _FOOT: Final = Foot(_NOWHERE, _NOWHERE, 0.0, _NOWHERE[:2])
 
@@ -246,7 +247,7 @@ class QuickExamination:
         motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
         self._count += 1
         measured = (self._depth, self._force, (_NOWHERE, _NOWHERE), self._touching)
-        contact = ContactMeasurement(_NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, loop.uncertainty_m), *measured)
+        contact = ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, loop.uncertainty_m), *measured)
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT)
         at = int(motion.along.position * way.per_m + 0.5)
         self._depth = motion.regulation.reference + loop.regulation(k)

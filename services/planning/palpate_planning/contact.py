@@ -32,6 +32,8 @@ class SensorReading(NamedTuple):
 class ContactMeasurement(NamedTuple):
     """Measured contact."""
 
+    q: Array
+    """Joint positions [rad], shape (7,)."""
     X_WI: Array
     """Pose of the indenter, shape (4, 4)."""
     R_WS: Array
@@ -73,6 +75,7 @@ class ContactSensing:
         force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ foot.n_W)
         self._touching = self.weight.tared and force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
         return ContactMeasurement(
+            reading.q,
             X_WI,
             R_WS,
             foot,

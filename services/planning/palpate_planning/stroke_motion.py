@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from palpate_bus.setpoint import Setpoint
+from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
@@ -78,6 +79,8 @@ class StrokeMotion:
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0
+        self._aside: Array | None = None
+        """Where the arm was at the start of a free motion, less where that begins [rad], shape (7,); None before it is known."""
         self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m
 
     def restart(self, contact: ContactMeasurement) -> None:
@@ -134,6 +137,22 @@ class StrokeMotion:
         if self.along.velocity > 1e-4:
             self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, CREEP_MPS))
 
+    def _free_setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
+        """A free motion that begins where the arm is, and fades to the planned one: s(x) = 1 - x^2 (3 - 2 x) of the difference.
+
+        It was planned from where the wall was believed to be, before touches. A centimetre off, the elbow of a stretched arm is
+        0.1 rad from there, and a step of the set-point would drive it faster than its limit.
+        """
+        free = self.segment.free
+        assert free is not None
+        last = len(free) - 1
+        q, qd = free.at(self._sample)
+        if self._aside is None:
+            self._aside = contact.q - free.q[0]
+        x = self._sample / last if last else 1.0
+        left, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self._period_s)
+        return joint_setpoint(t, contact.X_WI, q + left * self._aside, rate * (qd + fading * self._aside))
+
     def follow_free_motion(self, rate: float) -> bool:
         """Goes on by `rate` samples of the segment's free motion; returns whether it is at its end."""
         assert self.segment.free is not None
@@ -153,8 +172,7 @@ class StrokeMotion:
     def setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
         """The set-point at `t` [ns]; a free motion goes on by `rate` samples a period."""
         if self.segment.free is not None:
-            q, qd = self.segment.free.at(self._sample)
-            return joint_setpoint(t, contact.X_WI, q, rate * qd)
+            return self._free_setpoint(t, contact, rate)
         regulation, point, speed, dt = self.regulation, self.point, self.along.velocity, self._period_s
         outward = self.wall.outward(point.p, t)
         rising = (self.wall.outward(point.p + point.dp * speed * dt, t + round(dt * SECOND)) - outward) / dt

@@ -30,7 +30,7 @@ MOTION = joint_trajectory(KINEMATICS, np.array([START, GOAL]), Limits(), PERIOD_
 DOWN, ONE = np.diag([1.0, -1.0, -1.0]), np.zeros(1, dtype=int)
 PLACE = SurfacePath(np.zeros(1), np.zeros((1, 3)), -DOWN[None, 2], DOWN[None], GOAL[None], ONE, ONE)
 FOOT = Foot(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.02, np.zeros(2))
-ABOVE = ContactMeasurement(np.eye(4), np.eye(3), FOOT, WallPlace(0.0, 0.0, 0.01), -0.02, 0.0, (FOOT.p_W, FOOT.n_W), False)
+ABOVE = ContactMeasurement(START, np.eye(4), np.eye(3), FOOT, WallPlace(0.0, 0.0, 0.01), -0.02, 0.0, (FOOT.p_W, FOOT.n_W), False)
 
 
 def ticks(late_at: int, late: int, count: int) -> list[int]:
@@ -58,6 +58,18 @@ def free_palpation() -> Palpation:
     segment = Segment(PLACE, contact=False, free=MOTION)
     wall = plane(np.eye(4))
     return Palpation((segment, segment), ExamSettings(), Limits(), BASE.indenter_radius_m, PERIOD_S, wall)
+
+
+def test_a_free_motion_begins_where_the_arm_is_and_ends_where_it_was_planned() -> None:
+    """Touches have moved the wall by centimetres: the arm is not where the motion was planned from."""
+    aside = np.array((0.0, 0.02, 0.0, 0.07, 0.0, 0.0, 0.0))
+    palpation, ramp = free_palpation(), RestartRamp()
+    times = ticks(5, 10 * MS, len(MOTION) - 1)
+    asked = [palpation.step(t, ABOVE._replace(q=START + aside), ramp.step(t)).setpoint for t in times]
+    q, qd = np.array([s.q for s in asked]), np.array([s.qd for s in asked])
+    assert q[0] == pytest.approx(START + aside, abs=1e-3)
+    assert q[-2] == pytest.approx(GOAL, abs=1e-3)
+    assert np.gradient(q[:-1], PERIOD_S, axis=0)[1:-1] == pytest.approx(qd[1:-2], abs=0.01)
 
 
 MOVERS = {"follower": followed, "free segment": palpated}
