@@ -43,7 +43,7 @@ FIRST: Final = 50
 _RIDGE: Final = 0.1
 
 
-class Cause(StrEnum):
+class TrueCause(StrEnum):
     """What a candidate truly is."""
 
     LUMP = "lump"
@@ -60,7 +60,7 @@ class Weighed:
     signs: list[float]
     """Of a muscle."""
     softer: bool
-    cause: Cause
+    cause: TrueCause
 
 
 def cases() -> list[Case]:
@@ -96,19 +96,19 @@ def weighed(samples: list[ForceSample], known: Truth) -> list[Weighed]:
     ]
 
 
-def cause(candidate: Candidate, known: Truth) -> Cause:
+def cause(candidate: Candidate, known: Truth) -> TrueCause:
     """What a candidate truly is; a muscle only where it is stiffer."""
     if real(candidate, known):
-        return Cause.LUMP
+        return TrueCause.LUMP
     middle = known.touched.places(np.array([[candidate.bump.x, candidate.bump.y]]))
     guarded = candidate.log_contrast > 0 and known.felt.inside(known.felt.guarded, middle)[0]
-    return Cause.MUSCLE if guarded else Cause.NEITHER
+    return TrueCause.MUSCLE if guarded else TrueCause.NEITHER
 
 
 def fitted(rows: list[Weighed]) -> Array:
     """Weights of the signs, the constant first, shape (3,)."""
     signs, lump = np.array([row.signs for row in rows]), np.array([row.logit for row in rows])
-    softer, chosen = np.array([row.softer for row in rows]), np.array([list(Cause).index(row.cause) for row in rows])
+    softer, chosen = np.array([row.softer for row in rows]), np.array([list(TrueCause).index(row.cause) for row in rows])
 
     def loss(w: Array) -> float:
         muscle = np.where(softer, -np.inf, w[0] + signs @ w[1:])
@@ -125,11 +125,11 @@ def told(rows: list[Weighed], calibration: Calibration, false_findings: float = 
     muscle[[row.softer for row in rows]] = -np.inf
     before = np.array([row.logit for row in rows])
     now, threshold = before - np.logaddexp(0, muscle), calibration.threshold(false_findings)
-    for one in Cause:
+    for one in TrueCause:
         here = np.array([row.cause is one for row in rows])
         reported = [int((logits[here] >= threshold).sum()) for logits in (before, now)]
         print(f"{one}: {here.sum()} candidates, {reported[0]} reported before, {reported[1]} now")
-    lump, tensed = (np.array([row.cause is one for row in rows]) for one in (Cause.LUMP, Cause.MUSCLE))
+    lump, tensed = (np.array([row.cause is one for row in rows]) for one in (TrueCause.LUMP, TrueCause.MUSCLE))
     either = lump | tensed
     print(
         f"muscle against lump: AUC {roc_auc_score(tensed[either], (muscle - before)[either].clip(-50, 50)):.2f} of {either.sum()}"
