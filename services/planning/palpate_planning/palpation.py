@@ -320,8 +320,10 @@ class Palpation:
             self._enter(StrokeStage.DONE)
         elif not self._watch.calm or self._recovery.displacement is not None:
             return
-        elif self._recovery.resume_at is not None:
-            self._enter(StrokeStage.TRANSFER)
+        elif self._recovery.resume_at is not None or not self._motion.ended:
+            self._enter(
+                StrokeStage.TRANSFER
+            )  # a stroke that ends early is followed above the skin: the next way begins at its end
         else:
             self._next_segment()
 

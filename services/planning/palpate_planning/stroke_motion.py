@@ -26,6 +26,8 @@ TRANSFER_ACCELERATION = 0.8
 """[m/s^2]"""
 CREEP_MPS = 1e-3
 """Least speed along a path: it is to arrive."""
+ENDED_M = 1e-4
+"""So near to its end a path is at its end."""
 BRAKING = 0.75
 """Part of the acceleration with which the motion along a path brakes."""
 
@@ -106,6 +108,11 @@ class StrokeMotion:
     def centre_height(self, t: int) -> float:
         """Distance of the sphere's centre from the perceived surface at zero depth, at `t` [ns]; in metres."""
         return self._radius + self.wall.outward(self.point.p, t)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the path has been followed to its end."""
+        return self.along.position > self.segment.path.length - ENDED_M
 
     @property
     def stopping_distance(self) -> float:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from planning_fakes import World, known
 
 from palpate_bus.messages import SurfaceMotion
+from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario import Following
 from palpate_planning.breath import FORECAST_STEP, JOIN_S, Breath, BreathObservation
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.periods import MS, SECOND
+from palpate_planning.recovery import REPEATS_MAX
 from palpate_planning.status import PerceptionFailure, Phase
 from palpate_planning.wall_watch import CALM_S, LOST_MAX, LOST_S, WallWatch
 
@@ -116,6 +120,24 @@ def test_what_a_cough_spoils_is_repeated() -> None:
     world.run()
     assert world.exam.status.phase is Phase.DONE
     assert world.exam.status.targets_skipped == 0
+
+
+def test_the_rest_of_a_stroke_that_is_given_up_is_passed_above_the_skin() -> None:
+    """The next way begins at the stroke's end: the set-point is not to jump there."""
+    world = World(known(region_m=(0.05, 0.0125)), excursion=breathing)
+    for _ in range(REPEATS_MAX + 1):
+        world.run(lambda: world.exam.status.phase is Phase.SCAN)
+        for _ in range(10):
+            world.step()
+        world.calm = False
+        for _ in range(100):
+            world.step()
+        world.calm = True
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert world.exam.status.targets_skipped > 0
+    there = [pair for pair in pairwise(world.setpoints) if all(s.mode is ControlMode.CARTESIAN for s in pair)]
+    assert max(float(np.linalg.norm(b.p_WD - a.p_WD)) for a, b in there) < 0.005
 
 
 def moved_in_the_second_stroke(*answers: PerceivedAbdomen | PerceptionFailure) -> World:
