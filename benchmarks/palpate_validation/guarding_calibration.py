@@ -32,7 +32,6 @@ from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.detection import Candidate
 from palpate_assessment.observations import observe
-from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import AssessmentService
 from palpate_models.frames import Array
 from palpate_models.load import exam_input
@@ -71,22 +70,17 @@ def cases() -> list[Case]:
 
 
 def weigh(case: Case) -> list[Weighed]:
-    """What was weighed in one patient."""
+    """The candidates of one patient's examination, and what they truly are."""
     scenario = Scenario.model_validate(case.scenario)
     gathered = examined(scenario)
     known = truth_of_run(scenario, gathered).felt
     gathered.exam_states.pop()  # that asks for findings
     service = AssessmentService(exam_input(scenario))
     assess(service, gathered)
-    assert known is not None
-    return weighed(service.samples, known)
-
-
-def weighed(samples: list[ForceSample], known: Truth) -> list[Weighed]:
-    """The candidates of an examination, and what they truly are."""
     calibration = learned()
-    observations = observe(samples, calibration)
+    observations = observe(service.samples, calibration)
     judged = None if observations is None else weigh_all(observations, calibration)
+    assert known is not None
     assert judged is not None
     _, candidates, _ = judged
     logits: Array = calibration.logit(np.array([c.features for c in candidates])) if candidates else np.zeros(0)

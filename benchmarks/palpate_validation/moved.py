@@ -1,7 +1,6 @@
 """When the examination notices that the patient has moved, and how hard the indenter pressed meanwhile.
 
-palpate study moved --runs -o FOLDER
-python -m palpate_validation.moved FOLDER/runs/*
+Run: `palpate study moved --runs -o FOLDER`, then `python -m palpate_validation.moved FOLDER/runs/*`.
 """
 
 from __future__ import annotations
@@ -68,11 +67,11 @@ def main(folders: Annotated[list[Path], typer.Argument(help="Folders of runs who
             f"highest force meanwhile {row.peak_force_n:.1f} N, {row.early} false alarms"
         )
     after = np.array([row.after_s for row in rows])
-    in_time = after[np.isfinite(after)]
+    told = after[np.isfinite(after)]
+    times = f"noticed after {np.median(told):.2f} s in the median, {told.max():.2f} s at most; " if len(told) else ""
     print(
         f"{len(rows)} examinations, {np.isnan(after).sum()} over before the motion, {np.isinf(after).sum()} never noticed; "
-        f"noticed after {np.median(in_time):.2f} s in the median, {in_time.max():.2f} s at most; highest force "
-        f"{max(row.peak_force_n for row in rows):.1f} N; {sum(row.early for row in rows)} false alarms"
+        f"{times}highest force {max(row.peak_force_n for row in rows):.1f} N; {sum(row.early for row in rows)} false alarms"
     )
 
 

@@ -274,7 +274,7 @@ def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str
     shown = sorted(known.items(), key=lambda row: -max(abs(d.mean.value or 0) for _, d in row[1]))[:rows][::-1]
     words, unit, margin = QUANTITIES[name]
     scale, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
-    levels = list(dict.fromkeys(level for _, row in shown for level, _ in row))
+    levels = list(dict.fromkeys(level for row in known.values() for level, _ in row))
     figure = _figure(9.0, 1.6 + 0.34 * len(shown))
     (axes,) = _axes(figure)
     height = 0.7 / len(levels)
