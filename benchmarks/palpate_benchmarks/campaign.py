@@ -200,7 +200,7 @@ class _Watch:
             return
         if self.seen_scan is None:
             self.seen_scan = progress.t
-        if progress.t - self.seen_scan < CONTACT_S * NS and wanted == ExamState.PHASE_SCAN:
+        if progress.t - self.seen_scan < self.case.at_s * NS and wanted == ExamState.PHASE_SCAN:
             return
         self.finding.injected_s = progress.t / NS
         self.since = monotonic()
