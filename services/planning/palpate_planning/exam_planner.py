@@ -18,7 +18,7 @@ from palpate_planning.motion_planning import NoPathError, timed_motion
 from palpate_planning.poses import centre, pose
 from palpate_planning.requests import PressPlanner
 from palpate_planning.scene import CollisionScene
-from palpate_planning.segments import REACH, Segment, SegmentPlanner
+from palpate_planning.segments import REACH, STRETCHED, Segment, SegmentPlanner
 from palpate_planning.surface import PerceivedSurface
 from palpate_planning.timing import JointTrajectory
 
@@ -146,6 +146,8 @@ class ExamPlanner:
         for i, q in enumerate(chosen.q):
             if not chosen.reachable[i]:
                 skipped[i] = REACH
+            elif self._kinematics.stretched(q):
+                skipped[i] = STRETCHED
             elif not scene.free(q):
                 skipped[i] = f"the arm would collide: {', '.join(scene.collisions(q))}"
         return chosen.q, skipped

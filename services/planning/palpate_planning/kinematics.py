@@ -16,6 +16,11 @@ TOLERANCE_M = 1e-4
 """Position error at which inverse kinematics counts as solved."""
 TOLERANCE_RAD = 1e-3
 """Error of the tool axis at which inverse kinematics counts as solved."""
+ELBOW = 3
+"""Index of the joint that alone sets how far the wrist is from the shoulder."""
+STRAIGHT_RAD = 0.2
+"""An elbow that is bent by less is near its singularity: the arm reaches at most 4 mm further, less than what the skin may lie
+deeper than it was seen, and for each metre per second that the wall moves the elbow turns at 25 rad/s and more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +68,10 @@ class ArmKinematics:
         """J with V_WI_W = J qd, rows linear then angular, world axes, of the sphere's centre, shape (6, 7)."""
         J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
+
+    def stretched(self, q: Array) -> bool:
+        """Whether the elbow is so straight at joint positions q [rad] that the arm is near the end of its reach."""
+        return bool(abs(q[ELBOW]) < STRAIGHT_RAD)
 
     def solve(
         self,

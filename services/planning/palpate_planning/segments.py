@@ -24,6 +24,7 @@ usually wrong by (`surface_correction`)."""
 POSTURE_EVERY = 4
 """Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
 REACH = "out of the arm's reach"
+STRETCHED = "within reach of a stretched arm only"
 
 Place = tuple[float, float]
 Troubles = list[tuple[int, str]]

@@ -11,11 +11,12 @@ from planning_fakes import BASE, PERIOD_S, known, seen_dome
 from palpate_models import lbr
 from palpate_models.scenario import Limits, Robot
 from palpate_planning.exam_planner import ExamPlanner
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.kinematics import ELBOW, STRAIGHT_RAD, ArmKinematics
 from palpate_planning.look import look_postures
 from palpate_planning.motion_planning import NoPathError, plan
 from palpate_planning.poses import centre, least_twist, pose
 from palpate_planning.scene import CollisionScene, with_skirt
+from palpate_planning.segments import REACH, STRETCHED
 from palpate_planning.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
 
 LIMITS = Limits()
@@ -152,6 +153,13 @@ def test_rounded_and_timed_motion_of_the_planner_is_free() -> None:
     planner = ExamPlanner(known(region_m=(0.2, 0.2)), PERIOD_S)
     trajectory = planner.motion(*AROUND, SEEN)
     assert all(SCENE.free(q) for q in trajectory.q)
+
+
+def test_what_only_a_stretched_arm_reaches_is_skipped() -> None:
+    far = known(Robot(base_xy_m=(-0.22, 0.0)), region_m=(0.15, 0.0125), centre_m=(0.0, 0.0))
+    examination = ExamPlanner(far, PERIOD_S).examination(seen_dome(far), np.array(lbr.HOME))
+    assert {REACH, STRETCHED} == set(examination.skipped.values())
+    assert min(np.abs(segment.path.q[:, ELBOW]).min() for segment in examination.segments if segment.contact) > STRAIGHT_RAD
 
 
 def test_speed_limit_brakes_ahead_of_a_slow_place() -> None:
