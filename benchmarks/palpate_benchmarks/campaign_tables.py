@@ -10,7 +10,7 @@ from statistics import median
 from rich.markup import escape
 from rich.table import Table
 
-from palpate_benchmarks.campaign import UNHARMED, FaultFinding
+from palpate_benchmarks.campaign import UNHARMED, WENT_WITHOUT, FaultFinding
 from palpate_benchmarks.fault_kinds import KINDS
 
 COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
@@ -68,7 +68,7 @@ def _summary(findings: Sequence[FaultFinding]) -> list[tuple[str, ...]]:
         after = [f.detected_ms for f in cases if f.detected_ms is not None]
         outcomes: dict[str, int] = {}
         for finding in cases:
-            outcome = "went on" if finding.ended in UNHARMED else finding.reaction
+            outcome = "went on" if finding.ended in (*UNHARMED, WENT_WITHOUT) else finding.reaction
             outcomes[outcome] = outcomes.get(outcome, 0) + 1
         rows.append(
             (

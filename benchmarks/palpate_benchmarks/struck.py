@@ -1,10 +1,10 @@
 """A whole run that is struck from outside, in contact: its conductor, its recorder, or several processes at once.
 
-    python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS [secure]
+    python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS ROLES [secure]
 
-is the conductor of such a run: it forks the services and a recorder, says where they are, and when the indenter has slid at depth
-for SECONDS of simulated time. `strike` starts it, does the damage, and gathers the outcome. What the arm did is read from
-what the recorder wrote, or where that was struck too, from what the conductor had heard.
+is the conductor of such a run: it forks the services and observers of these ROLES (comma-separated), says where they are, and
+when the indenter has slid at depth for SECONDS of simulated time. `strike` starts it, does the damage, and gathers the outcome. What
+the arm did is read from what the recorder wrote, or where that was struck too, from what the conductor had heard.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -90,13 +90,15 @@ class Struck:
         return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
 
 
-def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S, namespace: str = "") -> Struck | None:
+def strike(
+    folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S, roles: Sequence[str] = ROLES, namespace: str = ""
+) -> Struck | None:
     """Runs a short examination and does the damage when the indenter has slid at depth for `seconds` [s] of simulated time.
 
     In a network `namespace` all processes are clients of a secure router there, so that what is done to its loopback hits them.
     None when it never came to that: on a busy machine a run by the wall clock may be stopped on its way there.
     """
-    words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(seconds)]
+    words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(seconds), ",".join(roles)]
     if namespace:
         words = ["ip", "netns", "exec", namespace, *words, "secure"]
     log = folder / "logs" / f"{CONDUCTOR}.log"
@@ -134,7 +136,7 @@ def strike(folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S, n
     return Struck(folder, own, status, said, struck_s, left, hung)
 
 
-def _conduct(folder: Path, runtime: str, seconds: float, secure: SecureBus | None) -> None:
+def _conduct(folder: Path, runtime: str, seconds: float, roles: tuple[str, ...], secure: SecureBus | None) -> None:
     began: list[int] = []
 
     def tell(progress: RunProgress) -> None:
@@ -150,14 +152,14 @@ def _conduct(folder: Path, runtime: str, seconds: float, secure: SecureBus | Non
     files = write_scenario_files(scenario, folder)
     wallclock = runtime == "wallclock"
     timing = Timing(wallclock, rate=_calm_rate() if wallclock else 1.0)
-    local = LocalProcesses(apart(ROLES), folder, files, timing, record="full", secure=secure, forks=forks())
+    local = LocalProcesses(apart(roles), folder, files, timing, record="full", secure=secure, forks=forks())
     session = open_session(local.bus[CONDUCTOR])
-    for process in read_processes(compose_file(), ROLES).values():
+    for process in read_processes(compose_file(), roles).values():
         local.start(process)
     pids = {role: child.pid for role, child in local.running.items()}
     print(f"{PROCESSES}{json.dumps({**pids, 'folder': str(local.folder)})}", flush=True)
     with local.as_conductor():
-        result = conduct(session, ROLES, tell, local.ended, timing, PATIENCE)
+        result = conduct(session, roles, tell, local.ended, timing, PATIENCE)
     forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in result.collected.indentation]
     print(f"{RESULT}{json.dumps({'failure': result.failure, 'lost': list(result.lost), 'forces': forces})}", flush=True)
     close_session(session)
@@ -172,4 +174,4 @@ def _calm_rate() -> float:
 
 if __name__ == "__main__":
     with SecureBus() if "secure" in sys.argv else nullcontext() as bus:
-        _conduct(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]), bus)
+        _conduct(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]), tuple(sys.argv[4].split(",")), bus)

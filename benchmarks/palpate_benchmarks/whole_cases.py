@@ -29,9 +29,12 @@ from palpate_bus.recordings import RecordingError
 from palpate_bus.runs.run_folder import remove_leftovers
 
 TOGETHER: Final = "+"
+DASHBOARD: Final = "dashboard"
+"""It runs in the cases that strike it alone."""
 FIXED: Final = (
     CONDUCTOR,
     "recorder",
+    DASHBOARD,
     "planning+conductor",
     "control+conductor",
     "supervisor+conductor",
@@ -93,7 +96,8 @@ def run_whole(case: FaultCase, folder: Path) -> FaultFinding:
     if case.kind == PARTITION:
         struck = _parted(case, folder, _seconds(case))
     else:
-        struck = strike((folder / case.name).resolve(), _runtime(case), _blow(case), case.at_s)
+        roles = (*ROLES, DASHBOARD) if case.where == DASHBOARD else ROLES
+        struck = strike((folder / case.name).resolve(), _runtime(case), _blow(case), case.at_s, roles)
     finding.wall_s = round(time.monotonic() - begin, 1)
     if struck is None:
         finding.ended = "the fault was never done: the run did not come to depth"
@@ -172,7 +176,7 @@ def _parted(case: FaultCase, folder: Path, seconds: float) -> Struck | None:
     subprocess.run(["ip", "netns", "add", name], check=True)
     try:
         loopback("up")
-        return strike((folder / case.name).resolve(), _runtime(case), blow, case.at_s, name)
+        return strike((folder / case.name).resolve(), _runtime(case), blow, case.at_s, namespace=name)
     finally:
         subprocess.run(["ip", "netns", "del", name], check=True)
 
@@ -225,7 +229,7 @@ def _measure(finding: FaultFinding, struck: Struck) -> None:
     finding.peak_force_before_n = round(max((force for stamp, force in forces if stamp < split), default=0.0), 2)
     after = [force for stamp, force in forces if stamp >= split]
     finding.peak_force_n = round(max(after), 2) if after else None
-    if finding.ended == COMPLETE:
+    if finding.ended in (COMPLETE, WENT_WITHOUT):
         finding.reaction = "none needed"
     elif any(status.mode == RobotStatus.MODE_SAFE_HOLD for _, status in statuses):
         finding.reaction = "safe hold"
