@@ -3,8 +3,8 @@
     python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS ROLES [secure]
 
 is the conductor of such a run: it forks the services and observers of these ROLES (comma-separated), says where they are, and
-when the indenter has slid at depth for SECONDS of simulated time. `strike` starts it, does the damage, and gathers the outcome. What
-the arm did is read from what the recorder wrote, or where that was struck too, from what the conductor had heard.
+when the indenter has slid at depth for SECONDS of simulated time. `strike` starts it, does the damage, and gathers the outcome.
+What the arm did is read from what the recorder wrote, or where that was struck too, from what the conductor had heard.
 """
 
 from __future__ import annotations
