@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from palpate.report.evidence import peak_force
 from palpate.run.forks import Forks
-from palpate.run.placement import apart
+from palpate.run.placement import Groups, apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, choice, write_scenario_files
 from palpate_benchmarks.fault_kinds import MESSAGE_KINDS, PROCESS_KINDS
@@ -34,12 +34,12 @@ from palpate_conductor.timing import Timing
 from palpate_models.load import load_scenario
 
 SETTINGS: Final = (
-    "exam.region_m=[0.03, 0.03]",
+    "exam.region_m=[0.0125, 0.03]",
     "exam.centre_m=[-0.055, -0.055]",
     "camera.frames=2",
     "limits.release_patience_s=0.5",
 )
-"""A small region on the lesion of clean, so that a case takes seconds and does not wait long for an operator."""
+"""Two lines on the lesion of clean, so that a case is short and does not wait long for an operator."""
 PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
 HANG_S: Final = 90.0
 """A case that takes longer after its fault has hung."""
@@ -241,12 +241,13 @@ def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> Fault
     timing = Timing(wallclock=case.wallclock)
     finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
     begin = monotonic()
-    local = LocalProcesses(apart(WORKERS), out, files, timing, forks=forks)
+    groups = _placed(case, target)
+    local = LocalProcesses(groups, out, files, timing, forks=forks)
     try:
         session = open_session(local.bus["conductor"])
         try:
-            for role in WORKERS:
-                local.start(processes[role])
+            for group in groups:
+                local.start(*(processes[role] for role in group))
             watch = _Watch(case, local, target, finding)
             with local.as_conductor():
                 result = conduct(session, WORKERS, watch.tell, local.ended, timing, PATIENCE)
@@ -262,6 +263,13 @@ def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> Fault
         local.stop(patience_s=3.0)
     finding.wall_s = round(monotonic() - begin, 1)
     return finding
+
+
+def _placed(case: FaultCase, target: str) -> Groups:
+    """Who shares a process. In lockstep any placement has the same messages: only who tampers with them needs its own."""
+    if case.wallclock or case.kind not in MESSAGE_KINDS:
+        return apart(WORKERS)
+    return (target,), tuple(role for role in WORKERS if role != target)
 
 
 def _fault(case: FaultCase) -> InjectedFault | None:
