@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Robot
 from palpate_perception.arm import ArmMask
 from palpate_perception.average import WallAverage
+from palpate_perception.drift import CameraDrift
 from palpate_perception.fusion import Image
 from palpate_perception.registration import shift_between
 from palpate_perception.tracker import NOTHING, Followed, Tracker
@@ -28,6 +30,7 @@ class Follower:
         self._watching = False
         self._asked_s = 0.0
         self._tracker: Tracker | None = None
+        self._drift: CameraDrift | None = None
         self.shift = np.zeros(2)
         """How far the patient, as the latest look shows, lies from where the first did, along the table in A [m]."""
         self.counts = dict.fromkeys(("quiet", "spoiled", "moved", "lost"), 0)
@@ -65,7 +68,7 @@ class Follower:
         if watch is None:
             return None
         try:
-            wall, times, d = watch.learn()
+            wall, times, d, self._drift = watch.learn()
         except UnseenWallError:
             return None
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
@@ -81,12 +84,15 @@ class Follower:
             self._watch.add(t_s, depth, self._arm, q)
 
     def _follow(self, t_s: float, depth: Image, q: Array | None) -> Followed:
-        if self._tracker is None:
+        if self._tracker is None or self._drift is None or depth.shape != self._tracker.wall.camera.shape:
             return NOTHING
-        wall = self._tracker.wall
-        if depth.shape != wall.camera.shape:
-            return NOTHING
-        hidden = np.zeros(len(wall.pixel), np.bool_)
-        if q is not None:
-            hidden = self._arm.hides(q, wall.camera.X_WC[:3, 3], wall.r_W, wall.depth)
-        return self._tracker.follow(t_s, depth.ravel()[wall.pixel].astype(np.float64), hidden)
+        wall, table, z = self._tracker.wall, self._drift, depth.ravel().astype(np.float64)
+        drift = table.follow(t_s, z[table.pixel], self._hidden(q, table.r_W, table.depth))
+        return self._tracker.follow(t_s, z[wall.pixel] - drift, self._hidden(q, wall.r_W, wall.depth))
+
+    def _hidden(self, q: Array | None, r_W: Array, depth: Array) -> NDArray[np.bool_]:
+        """Which points at depths [m] along rays, shape (n,) and (n, 3), the arm may hide at joint positions [rad], if known."""
+        assert self._tracker is not None
+        if q is None:
+            return np.zeros(len(depth), np.bool_)
+        return self._arm.hides(q, self._tracker.wall.camera.X_WC[:3, 3], r_W, depth)

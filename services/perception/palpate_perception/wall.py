@@ -125,7 +125,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[S
 
     NaN where a pixel is invalid or hidden. Raises UnseenWallError when too few pixels show the wall.
     """
-    pixel, mean, sigma = _steady(frames)
+    pixel, mean, sigma = steady(frames)
     X_AC = inverse(X_WA) @ camera.X_WC
     r_C = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel]
     p_A = apply(X_AC, mean[:, np.newaxis] * r_C)
@@ -156,7 +156,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[S
     return SeenWall(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
 
 
-def _steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
+def steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
     """The pixels that were mostly seen (flat), with their mean depth and the noise of a frame [m], shape (n,) each."""
     flat = frames.reshape(len(frames), -1)
     pixel = np.flatnonzero(np.isfinite(flat).mean(axis=0) > VALID)

@@ -11,6 +11,7 @@ from palpate_models.scenario import Exam
 from palpate_perception import cloud, wall
 from palpate_perception.arm import ArmMask
 from palpate_perception.cloud import RegionBox
+from palpate_perception.drift import CameraDrift
 from palpate_perception.fusion import Image
 from palpate_perception.views import Intrinsics
 from palpate_perception.wall import SeenWall
@@ -32,21 +33,17 @@ class Watch:
         """Intrinsics of the small image."""
         self._X_WA, self._exam = X_WA, exam
         X_CA = inverse(camera.X_WC) @ X_WA
-        self.window = cloud.window(wall.watched(exam), X_CA, camera.K, camera.shape)
-        """Rows and columns of the image that may show the wall."""
         self._middle = cloud.window(RegionBox.of(exam, 0.0, (-0.05, 0.03)), X_CA, camera.K, camera.shape)
-        self._r_W = (cloud.deproject(np.ones(camera.shape), camera.K) @ camera.X_WC[:3, :3].T)[self.window].reshape(-1, 3)
+        self._r_W = (cloud.deproject(np.ones(camera.shape), camera.K) @ camera.X_WC[:3, :3].T).reshape(-1, 3)
         self._times: list[float] = []
         self._images: list[Image] = []
 
     def add(self, t_s: float, image: Image, arm: ArmMask, q: Array | None) -> None:
         """Takes an image [m], exposed at `t_s` [s] with the arm at the joint positions `q` [rad], which are not known if None."""
-        seen = np.full(image.shape, np.nan, np.float32)
-        part = image[self.window].copy()
+        seen = image.copy()
         if q is not None:
-            z = np.nan_to_num(part.ravel().astype(float), nan=0.5)
-            part[arm.hides(q, self.camera.X_WC[:3, 3], self._r_W, z).reshape(part.shape)] = np.nan
-        seen[self.window] = part
+            z = np.nan_to_num(image.ravel().astype(float), nan=0.5)
+            seen[arm.hides(q, self.camera.X_WC[:3, 3], self._r_W, z).reshape(image.shape)] = np.nan
         self._times.append(t_s)
         self._images.append(seen)
 
@@ -62,12 +59,16 @@ class Watch:
         low, high = np.quantile(height, (0.05, 0.95))
         return bool(high - low < STILL_M or rises(height, low, high) > BREATHS)
 
-    def learn(self) -> tuple[SeenWall, Array, Array]:
-        """The wall, and its displacements [m] at the times [s] of the images. Raises UnseenWallError."""
+    def learn(self) -> tuple[SeenWall, Array, Array, CameraDrift]:
+        """The wall, its displacements [m] at the times [s] of the images, and what follows the camera's drift from there.
+
+        Raises UnseenWallError.
+        """
         if not self._images:
             raise wall.UnseenWallError("no small image has come")
-        found, d = wall.learn(np.array(self._images, np.float64), self.camera, self._X_WA, self._exam)
-        return found, np.array(self._times), d
+        frames = np.array(self._images, np.float64)
+        found, d = wall.learn(frames, self.camera, self._X_WA, self._exam)
+        return found, np.array(self._times), d, CameraDrift(frames, self.camera, self._times[-1])
 
 
 def rises(height: Array, low: float, high: float) -> int:

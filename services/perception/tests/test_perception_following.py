@@ -8,6 +8,7 @@ from bench_perception_following import READY, Patient, Run, run
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_bus.messages import SurfaceMotion
+from palpate_models.errors import draw_errors
 from palpate_models.frames import apply, inverse
 from palpate_models.lbr_kinematics import tool_pose
 from palpate_models.load import exam_input, load_scenario
@@ -68,6 +69,16 @@ def test_quiet_breathing_is_followed_with_typical_errors_while_the_arm_palpates(
     assert np.sqrt(np.mean(error**2)) < 0.7e-3
     assert np.abs(error).max() < 5e-3
     assert np.ptp(told[:, 0]) > 4e-3, "it does breathe"
+
+
+def test_a_camera_that_warms_up_moves_no_wall() -> None:
+    warming = ("exam.region_m=[0.1, 0.1]", "errors.camera.warm_up_m=0.01", "errors.camera.warm_up_s=100")
+    case = load_scenario("healthy", warming, 3)
+    result, patient = run(case, 60.0)
+    t, warmer = np.array(result.t_s), draw_errors(case.errors, case.seed).camera.warm_up_m
+    assert abs(warmer) * (np.exp(-t[0] / 100) - np.exp(-t[-1] / 100)) > 1.5e-3, "it drifts"
+    error = np.array(result.told)[:, 0] - [patient.curve.excursion(at) for at in t]
+    assert abs(error[t > t[-1] - 15].mean() - error[t < t[0] + 15].mean()) < 0.5e-3
 
 
 def bent(outward: np.ndarray, xy: np.ndarray) -> float:
