@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 
 from palpate_bus.contract import MS, contract
+from palpate_bus.contract.conformance import Checker
 from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SearchRequest, SupervisorState
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import vector, wrench
@@ -35,6 +37,8 @@ NEEDED = ("robot", "assessment", "supervisor", "conductor")
 """Roles whose loss ends the exam, whatever its phase. Without the conductor no operator could stop it."""
 NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
 """Roles whose loss ends the exam before there are targets."""
+SEEN = ("perception/surface", "perception/targets", "perception/motion", "perception/correction")
+"""Topics of perception that the arm is moved by: a message that breaks the contract is passed over."""
 SEEING = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
 
@@ -55,7 +59,8 @@ class PlanningService(Service):
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
         self._peak_force = 0.0
-        self._unreadable = 0
+        self._unreadable = self._refused = 0
+        self._checks = {topic: Checker(contract().topics[topic]) for topic in SEEN}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """One planning period: what is measured, what the examination makes of it, what is to be done."""
@@ -105,7 +110,17 @@ class PlanningService(Service):
             "skipped_targets": {str(i): why for i, why in sorted(self._exam.skipped.items())},
             "peak_force_N": self._peak_force,
             "unreadable_statuses": self._unreadable,
+            "refused_messages": self._refused,
         }
+
+    def _fitting(self, inbox: Inbox, topic: str) -> Iterator[Message | None]:
+        """The new messages of a topic; None for one that breaks its row of the contract, which is counted and told in the log."""
+        for message in inbox.new(topic):
+            wrong = self._checks[topic](message)
+            if wrong:
+                self._refused += 1
+                logging.getLogger(self.role).warning("%s of %s refused: %s", topic, contract().topics[topic].producer, wrong[0])
+            yield None if wrong else message
 
     def _read(self, status: Message) -> None:
         """Takes joint positions and wrench, averaged by the robot over one period: force and depth of the same moment.
@@ -120,19 +135,22 @@ class PlanningService(Service):
 
     def _perceived(self, inbox: Inbox) -> PerceivedAbdomen | PerceptionFailure | None:
         """Perception's newest answer, if one came."""
-        for message in inbox.new("perception/surface"):
-            self._mesh = message
-        answer = None
-        for message in inbox.new("perception/targets"):
-            answer = self._answer(message)
+        for mesh in self._fitting(inbox, "perception/surface"):
+            self._mesh = mesh
+        answer: PerceivedAbdomen | PerceptionFailure | None = None
+        for targets in self._fitting(inbox, "perception/targets"):
+            answer = PerceptionFailure("perception/targets: refused") if targets is None else self._answer(targets)
         return answer
 
     def _answer(self, targets: Message) -> PerceivedAbdomen | PerceptionFailure:
         mesh = self._mesh
         if not len(targets.positions) or mesh is None:
-            return PerceptionFailure(targets.message or "perception found no targets")
+            return PerceptionFailure(targets.message or "perception found no targets, or no surface that can be used")
         vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
         normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
+        triangles = np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)
+        if triangles.max(initial=-1) >= len(vertices):
+            return PerceptionFailure(f"perception/surface: triangles of vertex {triangles.max()}, it has {len(vertices)}")
         try:
             surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA, np.asarray(mesh.breathing))
         except ValueError as error:
@@ -141,19 +159,19 @@ class PlanningService(Service):
             positions=np.array([vector(p) for p in targets.positions]),
             lines=np.asarray(targets.lines, dtype=np.int64),
             vertices=vertices,
-            triangles=np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3),
+            triangles=triangles,
             surface=surface,
         )
 
     def _motion(self, inbox: Inbox) -> BreathObservation | None:
         """The wall's newest motion, if there is one and it is to be followed."""
-        heard = [motion_of(message) for message in inbox.new("perception/motion")]
+        heard = [motion_of(message) for message in self._fitting(inbox, "perception/motion") if message is not None]
         return heard[-1] if heard and self._known.exam.breathing is not Following.IGNORE else None
 
     def _averaged(self, inbox: Inbox) -> Array | None:
         """Where the mean of all images shows the wall, if that has just come and is of the surface that is examined."""
-        for message in inbox.new("perception/correction"):
-            if self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
+        for message in self._fitting(inbox, "perception/correction"):
+            if message is not None and self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
                 return np.asarray(message.outward, dtype=float)
         return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from palpate_bus.messages import (
     RobotStatus,
     SupervisorState,
     SurfaceMesh,
+    SurfaceMotion,
     Vector3,
     Wrench,
     codec,
@@ -71,6 +73,8 @@ class BusWorld(World):
         self.service = PlanningService(settings)
         self.exam = self.service._exam
         self.inbox = HandInbox()
+        self.seen: Callable[[Any], None] = lambda surface: None
+        """What becomes of a perceived surface on its way."""
         self.states: list[Any] = []
         self.events: list[str] = []
 
@@ -86,10 +90,9 @@ class BusWorld(World):
             mesh, found = self.dome, self.dome.positions
             flat = np.ascontiguousarray(mesh.vertices, dtype=np.float32).ravel()
             triangles = np.ascontiguousarray(mesh.triangles, dtype=np.uint32).ravel()
-            inbox.put(
-                "perception/surface",
-                SurfaceMesh(header(t, "world"), flat, np.zeros(0, dtype=np.float32), triangles, np.empty(0, np.float32)),
-            )
+            surface = SurfaceMesh(header(t, "world"), flat, np.zeros(0, dtype=np.float32), triangles, np.empty(0, np.float32))
+            self.seen(surface)
+            inbox.put("perception/surface", surface)
             normals = [Vector3(0.0, 0.0, 1.0)] * len(found)
             points = [Point(*map(float, p)) for p in found]
             lines = np.asarray(mesh.lines, dtype=np.uint32)
@@ -173,6 +176,36 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     else:
         assert state.phase == Phase.HELD
         assert state.end_tick == -1
+
+
+def test_a_surface_that_is_damaged_is_looked_at_again() -> None:
+    world, damaged = BusWorld(), []
+
+    def damage(mesh: Any) -> None:
+        if not damaged:
+            mesh.triangles[7] = 4294967269
+        elif len(damaged) == 1:
+            mesh.vertices[3] = np.nan
+        damaged.append(mesh)
+
+    world.seen = damage
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert len(damaged) == 3
+    assert world.service.finish()["refused_messages"] == 1
+
+
+def test_a_motion_that_is_damaged_is_passed_over() -> None:
+    service = create(Scenario(robot=BASE))
+    inbox = HandInbox()
+    inbox.put("robot/status", status(0, np.array(lbr.HOME), np.zeros(6)))
+    forecast = np.zeros(11)
+    for damaged, refused in ((0.001, 0), (np.nan, 1), (-1e300, 2)):
+        forecast[3] = damaged
+        inbox.put("perception/motion", SurfaceMotion(header(0, "abdomen"), 0, 0.0, forecast, 1e-4, Vector3(0.0, 0.0, 0.0)))
+        service.step(0, inbox)
+        assert service.finish()["refused_messages"] == refused
+        inbox.events = {}
 
 
 def test_values_that_are_none_are_passed_over() -> None:
