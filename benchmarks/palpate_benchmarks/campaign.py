@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import signal
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final
@@ -321,8 +321,3 @@ def _reaction(collected: Any, ended: str) -> str:
     if collected.supervisor is not None and collected.supervisor.level == SupervisorState.LEVEL_SOFT_STOP:
         return "soft stop"
     return "none needed" if ended in UNHARMED else "run ended"
-
-
-def as_json(findings: Sequence[FaultFinding]) -> list[dict[str, Any]]:
-    """For a file."""
-    return [{**asdict(finding), "good": finding.good} for finding in findings]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,7 +29,7 @@ def faults(  # noqa: PLR0913 - the options of a command
     kind: Annotated[list[str] | None, typer.Option(help=f"Out of {', '.join(KINDS)}; all by default.")] = None,
     only: Listed = None,
     out: Annotated[Path, output_file("File for the outcomes; cases in it are not run again.", "--out", "-o")] = Path(
-        "faults.json"
+        "faults.csv"
     ),
     docs: Annotated[Path | None, docs_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Run again what is already in the file.")] = False,
@@ -39,7 +38,7 @@ def faults(  # noqa: PLR0913 - the options of a command
     seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
 ) -> None:
     """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the outcomes."""
-    from palpate_benchmarks.campaign import as_json, cases, forks, run_case
+    from palpate_benchmarks.campaign import cases, forks, run_case
     from palpate_benchmarks.campaign_tables import csv_text, markdown, table
     from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
 
@@ -66,25 +65,23 @@ def faults(  # noqa: PLR0913 - the options of a command
             finding = run_whole(case, Path(folder)) if is_whole(case) else run_case(case, Path(folder), started_by)
             same = (finding.kind, finding.where, finding.mode, finding.at_s)
             found = [f for f in found if (f.kind, f.where, f.mode, f.at_s) != same] + [finding]
-            write_text(out, json.dumps(as_json(found), indent=1) + "\n")
+            write_text(out, csv_text(found))
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
             display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDE, Console().width)).print(table(found))
     if docs is not None:
         write_part(docs, "faults", markdown(found))
-        write_text(docs.with_suffix(".csv"), csv_text(found))
     if any(not finding.good for finding in found):
         raise typer.Exit(EXIT_FAILED)
 
 
 def _load(path: Path) -> list[FaultFinding]:
-    from palpate_benchmarks.campaign import FaultFinding
+    from palpate_benchmarks.campaign_tables import from_csv
 
     if not path.exists():
         return []
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
-        found = [FaultFinding(**{name: value for name, value in row.items() if name != "good"}) for row in rows]
-    except (ValueError, TypeError, AttributeError) as error:
+        found = from_csv(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         refuse(f"--out {path}: holds no findings of this command: {error}")
     return [finding for finding in found if finding.injected_s is not None]  # those that never began are tried again

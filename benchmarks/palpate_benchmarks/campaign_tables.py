@@ -1,18 +1,24 @@
-"""What came of a fault campaign, as tables for a terminal and for the documentation."""
+"""What came of a fault campaign: a file with a row a case, and tables for a terminal and for the documentation."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from dataclasses import fields
 from io import StringIO
 from statistics import median
 
+from pydantic import TypeAdapter
 from rich.markup import escape
 from rich.table import Table
 
 from palpate_benchmarks.campaign import UNHARMED, WENT_WITHOUT, FaultFinding
 from palpate_benchmarks.fault_kinds import KINDS
 
+FIELDS = tuple(field.name for field in fields(FaultFinding))
+"""Columns of the file, ..."""
+GOOD = "good"
+"""... and the last one, which is computed."""
 COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
 SUMMARY = (
     "mode",
@@ -45,12 +51,27 @@ def markdown(findings: Sequence[FaultFinding]) -> str:
 
 
 def csv_text(findings: Sequence[FaultFinding]) -> str:
-    """Every case, a row each, as CSV."""
+    """Every case, a row each, as CSV; None is left empty."""
     file = StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(("as it should be", *COLUMNS))
-    writer.writerows(("yes" if f.good else "no", *_row(f)) for f in _sorted(findings))
+    writer.writerow((*FIELDS, GOOD))
+    writer.writerows((*(getattr(f, name) for name in FIELDS), f.good) for f in _sorted(findings))
     return file.getvalue()
+
+
+def from_csv(text: str) -> list[FaultFinding]:
+    """What `csv_text` wrote. Raises ValueError."""
+    rows = csv.DictReader(StringIO(text))
+    if tuple(rows.fieldnames or ()) != (*FIELDS, GOOD):
+        raise ValueError(f"its first line wants the columns {', '.join((*FIELDS, GOOD))}")
+    kept = [{name: value or None for name, value in row.items() if name != GOOD} for row in rows]
+    return TypeAdapter(list[FaultFinding]).validate_python([_without_defaults(row) for row in kept])
+
+
+def _without_defaults(row: dict[str, str | None]) -> dict[str, str | None]:
+    """A row without empty texts, whose default is the empty text."""
+    texts = {field.name for field in fields(FaultFinding) if field.type == "str"}
+    return {name: value for name, value in row.items() if value is not None or name not in texts}
 
 
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -57,5 +57,5 @@ def test_a_folder_that_cannot_be(words: str, tmp_path: Path) -> None:
 
 
 def test_findings_that_are_none(tmp_path: Path) -> None:
-    (tmp_path / "faults.json").write_text("[1, 2")
-    assert "faults.json: holds no findings" in refused("faults")
+    (tmp_path / "faults.csv").write_text("[1, 2")
+    assert "faults.csv: holds no findings" in refused("faults")
