@@ -10,7 +10,7 @@ from palpate_benchmarks.campaign_tables import csv_text, from_csv
 
 def test_findings_come_back_from_their_file() -> None:
     found = [
-        FaultFinding("kill", "robot", "lockstep", 15.5, 33.2, 'robot lost, "gone"\nat once', "safe hold", 6.0, None, "x", named=True),
+        FaultFinding("kill", "robot", "lockstep", 15.5, 33.2, 'robot, "gone"\nat once', "safe hold", 6.0, None, "x", named=True),
         FaultFinding("nan", "exam/state", "wall clock", hung=True, left_behind="/tmp/x", kept=False),
     ]
     assert from_csv(csv_text(found)) == found
