@@ -34,15 +34,14 @@ SHIFT_M = 0.008
 """the same along two axes: 5 mm of a camera that is turned by 0.3 degrees, and some of its place and of the arm [C];"""
 FIELD_M, FIELD_LENGTH_M = 0.0006, 0.020
 """what an offset and a tilt leave of the camera's field and of its wander, which outlasts the frames that are fused: 0.50 mm on
-12 patients of tuning seeds, and the length of their variogram; nothing that varies over more is left."""
+these patients, and the length of their variogram; nothing that varies over more is left."""
 ROUGHNESSES = 2.0 ** np.arange(-5, 3)
 """What a may be, ..."""
 ROUGHNESS_SD = 0.5
 """... and the standard deviation of its logarithm about that of what is expected [A]."""
 AVERAGED = 0.35
 """How rough the error is expected to be of a surface that the images of a whole examination show in the mean."""
-RIGID = 5
-"""Motions of the whole surface: an offset, two tilts, two shifts."""
+
 
 Leaning = Callable[[Array], Array]
 """The xy parts of the outward unit normals of a surface over places, (n, 2) of both."""
@@ -51,15 +50,6 @@ Leaning = Callable[[Array], Array]
 def level(xy_A: Array) -> Array:
     """The leaning of a level surface."""
     return np.zeros_like(xy_A)
-
-
-class _Places(NamedTuple):
-    """Places, and what each rigid motion moves the skin outward there."""
-
-    xy: Array
-    """In A [m], shape (n, 2)."""
-    rigid: Array
-    """By a motion of one standard deviation [m], shape (n, RIGID)."""
 
 
 class SurfaceCorrection:
@@ -132,6 +122,19 @@ class SurfaceCorrection:
     def _places(self, xy_A: Array) -> _Places:
         offset = np.full((len(xy_A), 1), OFFSET_M)
         return _Places(xy_A, np.hstack((offset, TILT_RAD * xy_A, SHIFT_M * self._leaning(xy_A))))
+
+
+RIGID = 5
+"""Motions of the whole surface: an offset, two tilts, two shifts."""
+
+
+class _Places(NamedTuple):
+    """Places, and what each rigid motion moves the skin outward there."""
+
+    xy: Array
+    """In A [m], shape (n, 2)."""
+    rigid: Array
+    """By a motion of one standard deviation [m], shape (n, RIGID)."""
 
 
 class _Fit(NamedTuple):
