@@ -127,13 +127,6 @@ class PerceivedSurface:
         n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
         return np.column_stack((xy_A, values[:, 0])), n_A / np.linalg.norm(n_A, axis=1, keepdims=True)
 
-    def leaning(self, xy_A: Array) -> Array:
-        """The parts along A's x and y of the outward unit normals over xy_A, shape (n, 2) of both.
-
-        Of a body that is shifted by s the skin lies s . n farther outward.
-        """
-        return leaning(self._field.spline, np.ascontiguousarray(xy_A))
-
     def xy(self, p_W: Array) -> Array:
         """Where a point of the surface, shape (3,), is in A's xy plane [m], shape (2,)."""
         return np.asarray(((p_W - self._X_WA[:3, 3]) @ self._X_WA[:3, :3])[:2])
@@ -149,16 +142,6 @@ class PerceivedSurface:
         over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
         """
         return Foot(*foot(self._field.spline, self._X_WA, np.ascontiguousarray(c_W)))
-
-
-@compiled
-def leaning(field: BicubicSpline, xy_A: Array) -> Array:
-    """`PerceivedSurface.leaning` of a field."""
-    found = np.empty_like(xy_A)
-    for i, (x, y) in enumerate(xy_A):
-        _, slope_x, slope_y = bicubic_at(field, x, y)
-        found[i] = -np.array((slope_x, slope_y)) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    return found
 
 
 @compiled

@@ -56,7 +56,7 @@ class Wall:
     def __init__(self, perceived: PerceivedSurface, breath: Breath) -> None:
         """Uncorrected until it is touched."""
         self.perceived, self.breath = perceived, breath
-        self.correction = SurfaceCorrection(perceived.leaning)
+        self.correction = SurfaceCorrection()
         self.shift_A = np.zeros(2)
         """How far the body lies from where the first look saw it, along the table in A [m], shape (2,)."""
         self._first = perceived
@@ -67,7 +67,7 @@ class Wall:
         """The wall as a later look sees it; what the touches told of camera and arm holds on."""
         wall = Wall(perceived, self.breath)
         wall.correction, wall._first = self.correction, self._first
-        wall.correction.seen_again(perceived.leaning)
+        wall.correction.blur()
         return wall
 
     def corrected(self, vertices_W: Array, averaged: Array | None) -> tuple[Array, Array]:
