@@ -245,7 +245,7 @@ class Palpation:
 
     def _enter(self, stage: StrokeStage) -> None:
         self.stage = stage
-        self._time = self._settled = self._held = 0.0
+        self._time = self._settled = self._held = self._highest = 0.0
         if stage is StrokeStage.REST:
             self._descent.start()
 
@@ -272,10 +272,9 @@ class Palpation:
         if not self._joined:
             self._motion.restart(contact)
             self._joined = True
-        height = _clearance(contact.wall.sigma)
         if not self._watch.calm or self._recovery.displacement is not None:
             self._descent.start()
-        if not self._recovery.paused and self._descent.rest(height, LIFT_MPS):
+        if not self._recovery.paused and self._descent.rest(self._at_least(_clearance(contact.wall.sigma)), LIFT_MPS):
             self._enter(StrokeStage.DESCEND)
 
     def _descend(self, t: int, contact: ContactMeasurement) -> None:
@@ -314,7 +313,7 @@ class Palpation:
 
     def _lift(self, t: int) -> None:
         self._motion.brake()
-        if not self._motion.depth.step(-self._height(t), LIFT_MPS) or self._recovery.paused:
+        if not self._motion.depth.step(-self._at_least(self._height(t)), LIFT_MPS) or self._recovery.paused:
             return
         if self.failed or self.left:
             self._enter(StrokeStage.DONE)
@@ -326,6 +325,11 @@ class Palpation:
             )  # a stroke that ends early is followed above the skin: the next way begins at its end
         else:
             self._next_segment()
+
+    def _at_least(self, height: float) -> float:
+        """The greatest height [m] asked for in this stage: one that falls and rises with what is known is never reached."""
+        self._highest = max(self._highest, height)
+        return self._highest
 
     def _height(self, t: int) -> float:
         """How high to lift at `t` [ns]; in metres."""

@@ -203,3 +203,11 @@ def test_a_forecast_is_the_less_sure_the_older_and_the_worse_those_before_were()
 
 def test_the_forecast_is_read_at_the_times_that_the_message_says() -> None:
     assert FORECAST_STEP == SurfaceMotion.FORECAST_STEP_MS * MS
+
+
+def test_a_wall_that_is_known_now_better_now_worse_is_lifted_off_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Breath, "uncertainty", lambda breath, t: 0.003 + 0.001 * np.sin(t / 37_000_000))
+    world = World(known(region_m=(0.025, 0.0125)), excursion=breathing)
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert world.exam.status.targets_skipped == 0
