@@ -14,6 +14,10 @@ from palpate_models.nearest import nearest_vertex
 from palpate_models.scenario import Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+STILL_MPS = 0.005
+"""A tool that is slower than this rests."""
+LARGEST_BIAS_N = 6.0
+"""What presses a tool that has not moved yet by more than this is no bias: poor sensors have up to 5.2 N (docs/errors.md)."""
 
 
 class Tool(NamedTuple):
@@ -24,11 +28,11 @@ class Tool(NamedTuple):
     speed: float
     """Speed of the centre [m/s]."""
     force: float
-    """Magnitude of the external force [N]: the reading less the tool's weight, untared, so the sensor's bias is in it."""
+    """Magnitude of the external force [N]: the reading less the tool's weight and the sensor's bias."""
 
 
 class ToolSense:
-    """Kinematics and weight of arm and tool."""
+    """Kinematics and weight of arm and tool, and the sensor's bias: the mean of what is measured until the arm moves."""
 
     def __init__(self, robot: Robot) -> None:
         self._model = pin.buildModelFromXML(lbr.urdf(robot, geometry=False))
@@ -39,6 +43,7 @@ class ToolSense:
         self._R_SW: Array = self._data.oMf[self._sensor].rotation.T
         """Views of what pinocchio has computed last."""
         self._weight_W = np.array((0.0, 0.0, -robot.tool_mass_kg * GRAVITY))
+        self._bias_S, self._rested, self._moved = np.zeros(3), 0, False
 
     def sense(self, q: Array, qd: Array, wrench_S: Array) -> Tool:
         """From joint positions [rad] and velocities [rad/s], shapes (7,), and the F/T reading, shape (6,)."""
@@ -46,9 +51,13 @@ class ToolSense:
         pin.forwardKinematics(model, data, q, qd)
         pin.updateFramePlacement(model, data, self._indenter)
         pin.updateFramePlacement(model, data, self._sensor)
-        v_WI = pin.getFrameVelocity(model, data, self._indenter, _WORLD_AXES).linear
+        speed = float(np.linalg.norm(pin.getFrameVelocity(model, data, self._indenter, _WORLD_AXES).linear))
         force_S = wrench_S[:3] - self._R_SW @ self._weight_W
-        return Tool(self._p_WI.copy(), float(np.linalg.norm(v_WI)), float(np.linalg.norm(force_S)))
+        self._moved = self._moved or speed > STILL_MPS or bool(np.linalg.norm(force_S) > LARGEST_BIAS_N)
+        if not self._moved:
+            self._rested += 1
+            self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested
+        return Tool(self._p_WI.copy(), speed, float(np.linalg.norm(force_S - self._bias_S)))
 
 
 class RestSurface:

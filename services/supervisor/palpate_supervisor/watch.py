@@ -30,7 +30,7 @@ DEPTH_MARGIN_M = 0.025
 of about 7 mm (5.6 mm the camera alone, 12 patients of tuning seeds; touches lay up to 13 mm inward, 6 examinations), and this is
 three of these and what following leaves. Planning counts depth from where the skin is touched; this does not depend on that."""
 CONTACT_N = 5.0
-"""Untared force that is surely contact: the sensor's bias is up to 1.7 N, the tool's inertia takes 1.4 N at 4 m/s^2."""
+"""Force that is surely contact: the tool's inertia takes 1.4 N at 4 m/s^2, and a sensor that warms up drifts by 2 N."""
 
 
 class Level(IntEnum):

@@ -93,6 +93,25 @@ def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:
     assert pressed.force == pytest.approx(7.0, abs=0.01)
 
 
+def test_what_is_measured_before_the_arm_moves_is_bias() -> None:
+    sense = ToolSense(KNOWN.robot)
+    q, still, slow = np.array(lbr.HOME), np.zeros(7), np.full(7, 0.05)
+    hanging = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
+    bias = np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.0])
+    for noise in (0.2, -0.2):
+        sense.sense(q, still, hanging + bias + noise)
+    assert sense.sense(q, slow, hanging + bias).force == pytest.approx(0.0, abs=0.01)
+    pressed = hanging + bias - np.array([0.0, 0.0, 9.0, 0.0, 0.0, 0.0])
+    assert sense.sense(q, still, pressed).force == pytest.approx(9.0, abs=0.01), "a tool that has moved may be pressed at rest"
+
+
+def test_a_press_before_the_arm_moves_is_no_bias() -> None:
+    sense = ToolSense(KNOWN.robot)
+    pressed = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY - 9.0, 0.0, 0.0, 0.0])
+    for _ in range(3):
+        assert sense.sense(np.array(lbr.HOME), np.zeros(7), pressed).force == pytest.approx(9.0, abs=0.01)
+
+
 def test_speed_is_that_of_the_sphere() -> None:
     sense = ToolSense(KNOWN.robot)
     q, qd = np.array(lbr.HOME), np.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2, 0.5])
