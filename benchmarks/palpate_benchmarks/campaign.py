@@ -102,7 +102,7 @@ class FaultFinding:
     reaction: str = ""
     """What the arm did."""
     peak_force_before_n: float = 0.0
-    peak_force_n: float | None = 0.0
+    peak_force_n: float | None = None
     """Highest true contact force after the damage, every step of the tissue counted; None where nothing tells it."""
     ended: str = ""
     """How the run ended: complete, or the cause."""

@@ -64,14 +64,8 @@ def from_csv(text: str) -> list[FaultFinding]:
     rows = csv.DictReader(StringIO(text))
     if tuple(rows.fieldnames or ()) != (*FIELDS, GOOD):
         raise ValueError(f"its first line wants the columns {', '.join((*FIELDS, GOOD))}")
-    kept = [{name: value or None for name, value in row.items() if name != GOOD} for row in rows]
-    return TypeAdapter(list[FaultFinding]).validate_python([_without_defaults(row) for row in kept])
-
-
-def _without_defaults(row: dict[str, str | None]) -> dict[str, str | None]:
-    """A row without empty texts, whose default is the empty text."""
-    texts = {field.name for field in fields(FaultFinding) if field.type == "str"}
-    return {name: value for name, value in row.items() if value is not None or name not in texts}
+    told = [{name: value for name, value in row.items() if value and name != GOOD} for row in rows]
+    return TypeAdapter(list[FaultFinding]).validate_python(told)
 
 
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -319,10 +319,8 @@ class Palpation:
             self._enter(StrokeStage.DONE)
         elif not self._watch.calm or self._recovery.displacement is not None:
             return
-        elif self._recovery.resume_at is not None or not self._motion.ended:
-            self._enter(
-                StrokeStage.TRANSFER
-            )  # a stroke that ends early is followed above the skin: the next way begins at its end
+        elif self._recovery.resume_at is not None or not self._motion.ended:  # the next way begins at the stroke's end
+            self._enter(StrokeStage.TRANSFER)
         else:
             self._next_segment()
 
