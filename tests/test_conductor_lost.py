@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from palpate.report.evidence import peak_force
-from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, Blow, Struck, strike
+from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, Blow, Struck, calm_rate, strike
 from palpate_bus.messages import ExamState, RobotStatus
 
 pytestmark = pytest.mark.slow
@@ -43,7 +43,8 @@ def kill_with_planning(processes: Mapping[str, psutil.Process]) -> None:
 def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
     """On a busy machine a run by the wall clock may be stopped on its way to the patient; it is then begun anew."""
     for attempt in range(ATTEMPTS):
-        struck = strike(folder / str(attempt), runtime, blow)
+        rate = calm_rate() if runtime == "wallclock" else 1.0
+        struck = strike(folder / str(attempt), runtime, blow, rate=rate)
         if struck is not None:
             assert not struck.staying
             return struck

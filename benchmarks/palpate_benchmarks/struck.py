@@ -1,6 +1,6 @@
 """A whole run that is struck from outside, in contact: its conductor, its recorder, or several processes at once.
 
-    python -m palpate_benchmarks.struck FOLDER RUNTIME SECONDS ROLES [secure]
+    python -m palpate_benchmarks.struck FOLDER RUNTIME RATE SECONDS ROLES [secure]
 
 is the conductor of such a run: it forks the services and observers of these ROLES (comma-separated), says where they are, and
 when the indenter has slid at depth for SECONDS of simulated time. `strike` starts it, does the damage, and gathers the outcome.
@@ -90,15 +90,29 @@ class Struck:
         return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
 
 
+def calm_rate() -> float:
+    """A rate below what the machine keeps for a second: whoever is busy beside it shall not stop the arm before it is struck."""
+    kept = measure().rate or RATES[-1]
+    return next((rate for rate in RATES if rate < kept), kept)
+
+
 def strike(
-    folder: Path, runtime: str, blow: Blow, seconds: float = CONTACT_S, roles: Sequence[str] = ROLES, namespace: str = ""
+    folder: Path,
+    runtime: str,
+    blow: Blow,
+    seconds: float = CONTACT_S,
+    roles: Sequence[str] = ROLES,
+    namespace: str = "",
+    rate: float = 1.0,
 ) -> Struck | None:
     """Runs a short examination and does the damage when the indenter has slid at depth for `seconds` [s] of simulated time.
 
-    In a network `namespace` all processes are clients of a secure router there, so that what is done to its loopback hits them.
+    By the wall clock time passes at `rate`. In a network `namespace` all processes are clients of a secure router there, so that
+    what is done to its loopback hits them.
+
     None when it never came to that: on a busy machine a run by the wall clock may be stopped on its way there.
     """
-    words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(seconds), ",".join(roles)]
+    words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(rate), str(seconds), ",".join(roles)]
     if namespace:
         words = ["ip", "netns", "exec", namespace, *words, "secure"]
     log = folder / "logs" / f"{CONDUCTOR}.log"
@@ -136,7 +150,7 @@ def strike(
     return Struck(folder, own, status, said, struck_s, left, hung)
 
 
-def _conduct(folder: Path, runtime: str, seconds: float, roles: tuple[str, ...], secure: SecureBus | None) -> None:
+def _conduct(folder: Path, timing: Timing, seconds: float, roles: tuple[str, ...], secure: SecureBus | None) -> None:
     began: list[int] = []
 
     def tell(progress: RunProgress) -> None:
@@ -150,8 +164,6 @@ def _conduct(folder: Path, runtime: str, seconds: float, roles: tuple[str, ...],
 
     scenario = load_scenario("clean", SETTINGS)
     files = write_scenario_files(scenario, folder)
-    wallclock = runtime == "wallclock"
-    timing = Timing(wallclock, rate=_calm_rate() if wallclock else 1.0)
     local = LocalProcesses(apart(roles), folder, files, timing, record="full", secure=secure, forks=forks())
     session = open_session(local.bus[CONDUCTOR])
     for process in read_processes(compose_file(), roles).values():
@@ -166,12 +178,8 @@ def _conduct(folder: Path, runtime: str, seconds: float, roles: tuple[str, ...],
     local.stop(patience_s=3.0)
 
 
-def _calm_rate() -> float:
-    """A rate below what the machine keeps for a second: whoever is busy beside it shall not stop the arm before it is struck."""
-    kept = measure().rate or RATES[-1]
-    return next((rate for rate in RATES if rate < kept), kept)
-
-
 if __name__ == "__main__":
     with SecureBus() if "secure" in sys.argv else nullcontext() as bus:
-        _conduct(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]), tuple(sys.argv[4].split(",")), bus)
+        folder, runtime, rate, seconds, roles = sys.argv[1:6]
+        timing = Timing(runtime == "wallclock", rate=float(rate))
+        _conduct(Path(folder), timing, float(seconds), tuple(roles.split(",")), bus)

@@ -23,7 +23,7 @@ from palpate.report.recover import recovered
 from palpate.run.roles import WORKERS
 from palpate_benchmarks.campaign import COMPLETE, WENT_WITHOUT, FaultCase, FaultFinding
 from palpate_benchmarks.fault_kinds import SCARCE_KINDS
-from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Blow, Struck, strike
+from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Blow, Struck, calm_rate, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.recordings import RecordingError
 from palpate_bus.runs.run_folder import remove_leftovers
@@ -93,17 +93,23 @@ def run_whole(case: FaultCase, folder: Path) -> FaultFinding:
     """Runs one case; its logs stay in a folder of its own under `folder`."""
     finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep", at_s=case.at_s)
     begin = time.monotonic()
-    if case.kind == PARTITION:
-        struck = _parted(case, folder, _seconds(case))
-    else:
-        roles = (*ROLES, DASHBOARD) if case.where == DASHBOARD else ROLES
-        struck = strike((folder / case.name).resolve(), _runtime(case), _blow(case), case.at_s, roles)
+    struck = _done(case, folder, 1.0)
+    if struck is None and case.wallclock:
+        struck = _done(case, folder, calm_rate())
     finding.wall_s = round(time.monotonic() - begin, 1)
     if struck is None:
         finding.ended = "the fault was never done: the run did not come to depth"
         return finding
     _judge(finding, struck, _culprits(case))
     return finding
+
+
+def _done(case: FaultCase, folder: Path, rate: float) -> Struck | None:
+    """The run of a case, with its fault; None when it did not come to that."""
+    if case.kind == PARTITION:
+        return _parted(case, folder, rate)
+    roles = (*ROLES, DASHBOARD) if case.where == DASHBOARD else ROLES
+    return strike((folder / case.name).resolve(), _runtime(case), _blow(case), case.at_s, roles, rate=rate)
 
 
 def _culprits(case: FaultCase) -> list[str]:
@@ -161,7 +167,7 @@ def _runtime(case: FaultCase) -> str:
     return "wallclock" if case.wallclock else "lockstep"
 
 
-def _parted(case: FaultCase, folder: Path, seconds: float) -> Struck | None:
+def _parted(case: FaultCase, folder: Path, rate: float) -> Struck | None:
     """A run in a network namespace of its own, whose network is gone for some time. Needs root, as `ip netns` does."""
     name = f"palpate-{os.getpid()}"
 
@@ -170,13 +176,13 @@ def _parted(case: FaultCase, folder: Path, seconds: float) -> Struck | None:
 
     def blow(_: Mapping[str, psutil.Process]) -> None:
         loopback("down")
-        time.sleep(seconds)
+        time.sleep(_seconds(case))
         loopback("up")
 
     subprocess.run(["ip", "netns", "add", name], check=True)
     try:
         loopback("up")
-        return strike((folder / case.name).resolve(), _runtime(case), blow, case.at_s, namespace=name)
+        return strike((folder / case.name).resolve(), _runtime(case), blow, case.at_s, namespace=name, rate=rate)
     finally:
         subprocess.run(["ip", "netns", "del", name], check=True)
 

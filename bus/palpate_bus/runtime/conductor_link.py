@@ -11,6 +11,7 @@ import logging
 from time import monotonic
 from typing import Any, Final
 
+from palpate_bus.contract import Contract
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.member import Member
@@ -46,6 +47,11 @@ LOCKSTEP_BUSY_S = 30.0
 TRANSPORT_LOST: Final = "the bus is gone: its router does not answer any more"
 
 
+def longest_silence_s(rules: Contract, wallclock: bool) -> float:
+    """How long [s] a conductor whose heart has begun to beat may be silent before its services take it for lost."""
+    return rules.internal[HEARTBEAT].deadline / NS if wallclock else LOCKSTEP_SILENT_S
+
+
 class RunAborted(RuntimeError):
     """The conductor ended the run, or is lost."""
 
@@ -59,10 +65,9 @@ class ConductorLink:
         self._control = member.internal_subscription("palpate/control", CONTROL_TYPE)
         self._beats = member.internal_subscription(HEARTBEAT, CONTROL_TYPE)
         self._decode = codec.decoder(CONTROL_TYPE)
-        if Settings.read().runtime == "wallclock":
-            self._deadline_s, self._busy_s = member.rules.internal[HEARTBEAT].deadline / NS, BUSY_S
-        else:
-            self._deadline_s, self._busy_s = LOCKSTEP_SILENT_S, LOCKSTEP_BUSY_S
+        wallclock = Settings.read().runtime == "wallclock"
+        self._deadline_s = longest_silence_s(member.rules, wallclock)
+        self._busy_s = BUSY_S if wallclock else LOCKSTEP_BUSY_S
         self._grace_s = grace_s / (Settings.read().rate or 1.0)
         self._patience_s = CONDUCTOR_AWAITED_S
         self._granted = self._beating = False

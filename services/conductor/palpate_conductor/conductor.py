@@ -75,7 +75,7 @@ class Conductor:
         self._beside = {role: (role,) for role in roles}
         """By role, who shares its process, itself included."""
         self._sequence = 0
-        self._heartbeat = Heartbeat(member, rules)
+        self._heartbeat = Heartbeat(member, rules, timing.wallclock)
         self._freezes = FreezeWatch(self._patience)
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = RunOutcome()

@@ -14,7 +14,7 @@ from typing import Final
 from palpate_bus.contract import Contract
 from palpate_bus.messages import RunControl, codec
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runtime.conductor_link import CONTROL_TYPE, HEARTBEAT
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE, HEARTBEAT, longest_silence_s
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process_state import home
 
@@ -29,9 +29,9 @@ QOS: Final = "control"
 class Heartbeat:
     """Beats from `start` to `stop`."""
 
-    def __init__(self, member: Member, rules: Contract) -> None:
-        row = rules.internal[HEARTBEAT]
-        self._period_s, self._deadline_s = row.period / NS, row.deadline / NS
+    def __init__(self, member: Member, rules: Contract, wallclock: bool) -> None:
+        self._period_s = rules.internal[HEARTBEAT].period / NS
+        self._deadline_s = longest_silence_s(rules, wallclock)
         self._publisher = member.internal_publisher(HEARTBEAT, CONTROL_TYPE, QOS)
         self._beat = codec.encoder(CONTROL_TYPE)(RunControl(RunControl.HEARTBEAT, os.getpid(), False, "", home()))
         self._turned = monotonic()
@@ -54,7 +54,7 @@ class Heartbeat:
 
     @property
     def stood_still_s(self) -> float:
-        """How long [s] the conductor's loop has just stood still, longer than the deadline; 0 when it has not."""
+        """How long [s] the conductor's loop has just stood still, longer than its services wait; 0 when it has not."""
         return self._stood_still_s if monotonic() - self._moved_on < RECENT_S else 0.0
 
     def stop(self) -> None:
