@@ -90,9 +90,14 @@ class Struck:
         return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
 
 
+def kept_rate() -> float:
+    """The rate that the machine keeps for a second."""
+    return measure().rate or RATES[-1]
+
+
 def calm_rate() -> float:
-    """A rate below what the machine keeps for a second: whoever is busy beside it shall not stop the arm before it is struck."""
-    kept = measure().rate or RATES[-1]
+    """A rate below that: whoever is busy beside it shall not stop the arm before it is struck."""
+    kept = kept_rate()
     return next((rate for rate in RATES if rate < kept), kept)
 
 

@@ -23,7 +23,7 @@ from palpate.report.recover import recovered
 from palpate.run.roles import WORKERS
 from palpate_benchmarks.campaign import COMPLETE, WENT_WITHOUT, FaultCase, FaultFinding
 from palpate_benchmarks.fault_kinds import SCARCE_KINDS
-from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Blow, Struck, calm_rate, strike
+from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Blow, Struck, calm_rate, kept_rate, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.recordings import RecordingError
 from palpate_bus.runs.run_folder import remove_leftovers
@@ -93,7 +93,7 @@ def run_whole(case: FaultCase, folder: Path) -> FaultFinding:
     """Runs one case; its logs stay in a folder of its own under `folder`."""
     finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep", at_s=case.at_s)
     begin = time.monotonic()
-    struck = _done(case, folder, 1.0)
+    struck = _done(case, folder, kept_rate() if case.wallclock else 1.0)
     if struck is None and case.wallclock:
         struck = _done(case, folder, calm_rate())
     finding.wall_s = round(time.monotonic() - begin, 1)

@@ -6,6 +6,14 @@ moves that lies on a table, shifts along it by s_x, s_y and turns about its long
     y_i = m_i d + n_i . (s_x, s_y, 0) + theta n_i . (e_y x p_i) + noise
 
 First d alone, robustly, for the breath filter; then what is left, over some images, by all four with a prior of each.
+
+Neighbouring pixels err together for seconds, so that d errs by more than their number tells, and no filter of breaths takes that
+off. How much it is, is told by patches P of the wall that are wider than such errors, by how d changes when one is left out (a
+jackknife, Efron and Stein 1981): with w the weights
+
+    var d = sum_P (d - d_P)^2,   d - d_P = sum_{i in P} w_i m_i (y_i - m_i d) / sum_{i not in P} w_i m_i^2,
+
+of which half is what the images erred by from which the wall was learnt.
 """
 
 from __future__ import annotations
@@ -25,8 +33,12 @@ from palpate_perception.wall import SeenWall
 
 FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
 """How long after an exposure the displacement is forecast for [s]."""
+PATCH_M: Final = 0.11
+"""Neighbours err together over less than this: 25 pixels of a poor camera, 5 cm on the wall (docs/errors.md)."""
 SHARED_M: Final = 1.5e-4
-"""What an image's displacement errs by besides its pixels' own noise: errors that neighbours and successive images share."""
+"""What an image's displacement errs by with its neighbours, before images have told it ..."""
+SHARED_S: Final = 20.0
+"""... and for so long an image counts for that."""
 REACH_M: Final = 0.06
 """What is farther from where the wall is expected is something else."""
 TUKEY: Final = 5.0
@@ -94,6 +106,8 @@ class Tracker:
         middle = corners.mean(axis=0)
         self._reasons = reasons(wall.lifts, wall.n_A, wall.p_A - middle)
         self._corners = corners - middle
+        self._patch = _patches(wall.p_A)
+        self._shared = SHARED_M**2
         self._certainty = (wall.gain / wall.sigma) ** 2
         self._whole = float(self._certainty @ wall.lifts**2)
         self._precision = np.zeros((4, 4))
@@ -120,10 +134,11 @@ class Tracker:
         if float(weight @ self.wall.lifts**2) < LEAST_SHARE * self._whole:
             return self._told(State.MOVED if self._moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
-        noise = float(np.hypot(1 / np.sqrt(weight @ self.wall.lifts**2), SHARED_M))
         still = y - self.wall.lifts * d
+        self._weigh_error(t_s - self._last_s, still, weight)
         self._weigh_motion(t_s - self._last_s, still, weight)
         self._last_s = t_s
+        noise = float(np.sqrt(1 / (weight @ self.wall.lifts**2) + self._shared))
         surprise = abs(d - expected)
         if surprise > max(SURPRISE * np.hypot(spread, noise), SURPRISE_M) or d > DEEP * self._filter.depth + SURPRISE_M:
             self._calm_s = t_s + CALM_S
@@ -141,7 +156,8 @@ class Tracker:
 
     def _told(self, state: State, d: float) -> Followed:
         shift = np.append((self._motion - self._drift)[1:3], 0.0) if state is State.MOVED else np.zeros(3)
-        return Followed(state, float(d), self._filter.forecast(FORECAST_S), self._filter.sigma, shift)
+        sigma = float(np.hypot(self._filter.sigma, np.sqrt(self._shared)))
+        return Followed(state, float(d), self._filter.forecast(FORECAST_S), sigma, shift)
 
     def _displacement(self, y: Array, weight: Array, expected: float) -> tuple[float, Array]:
         """The breath alone [m], and the weights with which pixels count for it: Tukey's biweight, about the median first."""
@@ -154,6 +170,13 @@ class Tracker:
             robust = weight * np.clip(1 - away, 0, None) ** 2
             d = float(robust @ (lifts * y)) / max(float(robust @ lifts**2), 1e-9)
         return d, robust
+
+    def _weigh_error(self, elapsed_s: float, left: Array, weight: Array) -> None:
+        """Counts what an image, `elapsed_s` [s] after the last, leaves over [m], shape (n,), for what pixels err by together."""
+        told = np.bincount(self._patch, weight * self.wall.lifts**2)
+        pull = np.bincount(self._patch, weight * self.wall.lifts * left)
+        variance = float(np.sum((pull / (told.sum() - told)) ** 2))
+        self._shared += (1 - np.exp(-elapsed_s / SHARED_S)) * (0.5 * variance - self._shared)
 
     def _weigh_motion(self, elapsed_s: float, left: Array, weight: Array) -> None:
         """Counts what an image, `elapsed_s` [s] after the last, leaves over [m], shape (n,), for the rigid motion."""
@@ -185,3 +208,9 @@ class Tracker:
         moved = np.array((s_x, s_y, 0.0)) + np.cross((0.0, theta, 0.0), self._corners)
         moved[:, 2] -= moved[:, 2].mean()
         return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+
+def _patches(p_A: Array) -> NDArray[np.intp]:
+    """The number of the patch of the wall in which each place lies [m], shape (n, 3) -> (n,)."""
+    cell = np.floor((p_A[:, :2] - p_A[:, :2].min(axis=0)) / PATCH_M).astype(np.intp)
+    return np.asarray(np.unique(cell, axis=0, return_inverse=True)[1]).ravel()

@@ -5,9 +5,11 @@ offset, a tilt, and what the camera sees bent,
 
     k(x, x') = OFFSET_M^2 + TILT_RAD^2 x.x' + a^2 FIELD_M^2 exp(-|x - x'|^2 / (2 FIELD_LENGTH_M^2)).
 
-Each touch measures c at its place with an error of its own, and from n of them (Rasmussen and Williams 2006, eq. 2.25 and 2.26)
+Each touch measures c at its place with an error of its own, s_i, and with what the camera got wrong of the breath then, b_i,
+which lasts for some seconds and is partly the next touch's, too. From n of them (Rasmussen and Williams 2006, eq. 2.25 and 2.26)
 
-    c(x) = k(x)^T (K + S)^-1 y,     var c(x) = k(x, x) - k(x)^T (K + S)^-1 k(x).
+    c(x) = k(x)^T (K + S)^-1 y,     var c(x) = k(x, x) - k(x)^T (K + S)^-1 k(x),
+    S_ij = s_i^2 [i = j] + b_i b_j exp(-|t_i - t_j| / LASTING_S).
 
 How rough the error is, a, is the touches' to tell: of a few values the one that makes them most probable, given a prior about
 what is expected (their eq. 2.30). A camera without error leaves a small a, and a surface that is known within what a touch gets
@@ -17,7 +19,7 @@ wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +38,25 @@ ROUGHNESSES = 2.0 ** np.arange(-5, 2)
 """What a may be, ..."""
 ROUGHNESS_SD = 0.5
 """... and the standard deviation of its logarithm about that of what is expected [A]."""
+LASTING_S = 10.0
+"""How long errors last that neighbouring pixels share, after `docs/errors.md`."""
 AVERAGED = 0.35
 """How rough the error is expected to be of a surface that the images of a whole examination show in the mean."""
+
+
+class Touch(NamedTuple):
+    """The surface was felt."""
+
+    xy_A: Array
+    """Where, shape (2,)."""
+    height: float
+    """How far outward of where it was perceived [m]."""
+    sigma: float
+    """Standard deviation of its own error [m]."""
+    breath_sigma: float = 0.0
+    """Standard deviation of what the breath that was followed erred by, which goes on for a while [m]."""
+    t_s: float = 0.0
+    """When [s]."""
 
 
 class SurfaceCorrection:
@@ -46,42 +65,45 @@ class SurfaceCorrection:
     def __init__(self, expected_roughness: float = 1.0) -> None:
         """Of a surface whose error is expected to be so rough, over that of one burst."""
         self._expected = expected_roughness
-        self._places = np.empty((0, 2))
-        self._heights, self._variances = np.empty(0), np.empty(0)
-        self._fit = _Fit(expected_roughness, np.empty((0, 0)), np.empty(0), 0.0)
+        self._touches: tuple[Touch, ...] = ()
+        self._blurred = np.empty(0)
+        """Variance that later looks have added to each touch's own [m^2]."""
+        self._learn()
 
     @property
     def roughness(self) -> float:
         """How rough the error is, over what it is expected to be: a."""
         return self._fit.roughness
 
-    def touch(self, xy_A: Array, height: float, sigma: float) -> None:
-        """The surface was felt at `xy_A`, shape (2,), `height` [m] outward of where it was perceived, within `sigma` [m]."""
-        self._places = np.vstack((self._places, xy_A))
-        self._heights = np.append(self._heights, height)
-        self._variances = np.append(self._variances, sigma**2)
+    def touch(self, touch: Touch) -> None:
+        """Learns from another touch."""
+        self._touches = (*self._touches, touch)
+        self._blurred = np.append(self._blurred, 0.0)
         self._learn()
 
-    def revise(self, height: float, sigma: float) -> None:
-        """The latest touch was at another height [m] than was said, and another standard deviation holds [m]."""
-        self._heights[-1], self._variances[-1] = height, sigma**2
+    def revise(self, touch: Touch) -> None:
+        """The latest touch was otherwise than was said."""
+        self._touches = (*self._touches[:-1], touch)
         self._learn()
 
     def blur(self) -> None:
         """The wall is seen anew: of the touches so far the offset and the tilt hold, the field is another one."""
-        if len(self._heights):
-            self._variances = self._variances + 2 * (self._fit.roughness * FIELD_M) ** 2
-            self._learn()
+        self._blurred = self._blurred + 2 * (self._fit.roughness * FIELD_M) ** 2
+        self._learn()
 
     def _learn(self) -> None:
-        fits = (_fit(float(a), self._expected, self._places, self._heights, self._variances) for a in ROUGHNESSES)
+        self._places = np.array([touch.xy_A for touch in self._touches]).reshape(-1, 2)
+        heights = np.array([touch.height for touch in self._touches])
+        errors = _errors(self._touches) + np.diag(self._blurred)
+        fits = (_fit(float(a), self._expected, self._places, heights, errors) for a in ROUGHNESSES)
         self._fit = max(fits, key=lambda fit: fit.log_probability)
 
     def averaged(self, outward: Callable[[Array], Array]) -> SurfaceCorrection:
         """What the same touches tell of a better surface, which lies `outward` [m] of this one at places (n, 2)."""
         better = SurfaceCorrection(AVERAGED)
-        better._places, better._variances = self._places, self._variances
-        better._heights = self._heights - outward(self._places)
+        less = outward(self._places)
+        better._touches = tuple(t._replace(height=t.height - h) for t, h in zip(self._touches, less.tolist(), strict=True))
+        better._blurred = self._blurred
         better._learn()
         return better
 
@@ -118,9 +140,15 @@ class _Fit(NamedTuple):
     """Logarithm of the probability of the touches and the roughness, but for a constant."""
 
 
-def _fit(roughness: float, expected: float, places: Array, heights: Array, variances: Array) -> _Fit:
-    """The process, whose roughness is `expected`, given touches at places (n, 2) of heights (n,) [m] within variances [m^2]."""
-    factor = cho_factor(_covariance(places, places, roughness) + np.diag(variances), lower=True)
+def _errors(touches: Sequence[Touch]) -> Array:
+    """S, the covariance of what n touches err by [m^2], shape (n, n)."""
+    own, breath, t = np.array([(touch.sigma, touch.breath_sigma, touch.t_s) for touch in touches]).reshape(-1, 3).T
+    return np.asarray(np.diag(own**2) + np.outer(breath, breath) * np.exp(-np.abs(t[:, None] - t) / LASTING_S))
+
+
+def _fit(roughness: float, expected: float, places: Array, heights: Array, errors: Array) -> _Fit:
+    """The process, whose roughness is `expected`, given touches at places (n, 2) of heights (n,) [m] with errors S."""
+    factor = cho_factor(_covariance(places, places, roughness) + errors, lower=True)
     weights = cho_solve(factor, heights)
     prior = -0.5 * (math.log(roughness / expected) / ROUGHNESS_SD) ** 2
     evidence = -0.5 * float(heights @ weights) - float(np.log(np.diag(factor[0])).sum())

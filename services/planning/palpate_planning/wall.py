@@ -18,8 +18,9 @@ from scipy.interpolate import NearestNDInterpolator
 
 from palpate_models.frames import Array
 from palpate_planning.breath import Breath
+from palpate_planning.periods import SECOND
 from palpate_planning.surface import Foot, PerceivedSurface
-from palpate_planning.surface_correction import SurfaceCorrection
+from palpate_planning.surface_correction import SurfaceCorrection, Touch
 from palpate_planning.touch import Onset, SkinDepth
 
 
@@ -112,11 +113,11 @@ class Wall:
     def touched(self, foot: Foot, touch: SkinDepth, stroke: int, t: int) -> tuple[TouchedSkin, float]:
         """Learns from a touch under `foot` at `t` [ns]; also returns how far the wall there moved outward by it [m]."""
         before, before_sigma = self.correction.at(foot.xy_A)
-        sigma = math.hypot(touch.sigma, self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t))
-        felt = before - touch.depth
-        self.correction.touch(foot.xy_A, felt, sigma)
+        moved = self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t)
+        felt = Touch(foot.xy_A, before - touch.depth, touch.sigma, moved, t / SECOND)
+        self.correction.touch(felt)
         self._touched = foot, before
-        observed = TouchedSkin(foot.p_W, stroke, felt, sigma, before, before_sigma)
+        observed = TouchedSkin(foot.p_W, stroke, felt.height, math.hypot(touch.sigma, moved), before, before_sigma)
         return observed, self.correction.height(foot.xy_A) - before
 
     def revise(self, onset: Onset) -> float | None:
@@ -130,7 +131,8 @@ class Wall:
         foot, before = self._touched
         share, reckoned = self.perceived.breathing(foot.xy_A), self.correction.height(foot.xy_A)
         touch = onset.touch_again(share * seen)
-        self.correction.revise(before - touch.depth, math.hypot(touch.sigma, share * self.breath.seen_uncertainty))
+        moved = share * self.breath.seen_uncertainty
+        self.correction.revise(Touch(foot.xy_A, before - touch.depth, touch.sigma, moved, float(onset.times[-1]) / SECOND))
         return self.correction.height(foot.xy_A) - reckoned
 
 
