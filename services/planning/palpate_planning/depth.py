@@ -18,7 +18,7 @@ from typing import NamedTuple
 EXPONENT = 1.45
 """Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
 FORCE_FRACTION = 0.8
-"""Part of the working force limit at which depth yields: what is felt a moment later, and not seen by a sensor whose gain errs, adds."""
+"""Part of the working force limit at which depth yields: force rises until the arm has yielded, and the sensor's gain errs."""
 FEED_FORWARD = 0.9
 """a, below one so that the force cannot build up by itself even on a rigid surface."""
 FORCE_LAG_S = 0.02

@@ -84,7 +84,7 @@ def test_sliding_into_a_lesion_keeps_depth_or_yields_below_the_limit(contrast: f
 def test_a_wrong_exponent_still_ends_at_the_limit(exponent: float) -> None:
     rows = indent(lambda depth, t: 24.0 * (max(depth, 0.0) / 0.01) ** exponent)
     assert rows[-1, 3] <= LIMIT_N
-    assert rows[-1, 3] > 0.6 * LIMIT_N
+    assert rows[-1, 3] > 0.6 * FORCE_FRACTION * LIMIT_N
 
 
 def test_a_hard_surface_is_not_pressed_with_more_than_the_limit_for_long() -> None:
