@@ -1,6 +1,6 @@
 """The regression: log-force as a field over the belly, and errors in depth, time and force, all Gaussian.
 
-    y = z(x) + (n - n0) log(d / D) + (n / d) (stroke zero + breathing left over + surface error(x)) + tare / F + noise
+    y = z(x) + (n - n0) log(d / D) + (n / d) (stroke zero + breathing left over + surface error(x)) + zero of force / F + noise
 
 z is a sum of fields of several lengths, of vertical strips that are symmetric about the midline (muscles and the linea alba), of
 bone where ribs and iliac crests may lie, and of the lumps that were detected. The amplitudes of all parts but the lumps are found
@@ -53,8 +53,9 @@ SLIDE_SD = 0.015
 """How much a slide may feel of a place otherwise than a press does, beside what it does everywhere, in the logarithm."""
 UNLIKE = 0.1
 """How much a press may feel of a lump otherwise than a slide does, of its log-contrast."""
-TARE_N = 0.05
-"""Zero of a stroke's force."""
+TARE_N = 0.06
+"""Prior median of the zero of a stroke's force: 0.06 N with typical equipment, 0.12 N with poor (tuning seeds 0 to 9) [C]. What
+all strokes share, by gain, cross-talk and the tool's weight, is expected to be as large: with poor equipment 0.08 N there [C]."""
 WHITE_SD = 0.01
 """Prior median of what a sample gets wrong by itself, over the force."""
 _SURE, _UNSURE = 0.7, 1.2
@@ -114,10 +115,10 @@ def bone(xy: Array) -> Array:
 
 
 def errors(o: Observations) -> list[Array]:
-    """Unit covariances of the errors whose amplitude is found: stroke zero and breathing [m], noise [1]; (m, m) each."""
-    lever = np.outer(o.per_metre, o.per_metre)
+    """Unit covariances of errors whose amplitude is found: stroke zero and breathing [m], zero of force [N], noise [1]; (m, m)."""
+    lever, weakness = np.outer(o.per_metre, o.per_metre), np.outer(o.per_newton, o.per_newton)
     breathing = np.exp(-np.abs(o.time[:, None] - o.time) / BREATHING_S)
-    return [lever * o.same_stroke, lever * breathing, np.eye(len(o.y))]
+    return [lever * o.same_stroke, lever * breathing, weakness * (1.0 + o.same_stroke), np.eye(len(o.y))]
 
 
 def fixed(o: Observations, calibration: Calibration) -> Array:
@@ -126,7 +127,6 @@ def fixed(o: Observations, calibration: Calibration) -> Array:
     surface = SURFACE_SHARE**2 * _smooth(o.xy, o.xy, SURFACE_M) + WIDE_SHARE**2 * _smooth(o.xy, o.xy, WIDE_M)
     surface *= np.outer(o.depth_uncertainty, o.depth_uncertainty) * lever
     covariance = LEVEL_SD**2 + calibration.exponent_sd**2 * np.outer(o.log_depth, o.log_depth) + surface
-    covariance += TARE_N**2 * np.outer(o.per_newton, o.per_newton) * o.same_stroke
     covariance[np.diag_indices(len(o.y))] += o.noise**2
     return np.asarray(covariance)
 
@@ -135,8 +135,8 @@ def _medians(o: Observations) -> tuple[Array, Array]:
     """Prior of the log-amplitudes: medians' logarithms and standard deviations."""
     depth = max(0.5 * float(np.median(o.depth_uncertainty)), LEAST_DEPTH_ERROR_M)
     fields = len(LENGTHS_M) + 1
-    medians = [NATURAL_SD] * fields + [BONE_SD, depth, depth, WHITE_SD]
-    return np.log(medians), np.array([_SURE] * fields + [_UNSURE] * 4)
+    medians = [NATURAL_SD] * fields + [BONE_SD, depth, depth, TARE_N, WHITE_SD]
+    return np.log(medians), np.array([_SURE] * fields + [_UNSURE] * 3 + [_SURE, _UNSURE])
 
 
 def usual_amplitudes(o: Observations) -> Array:
