@@ -115,7 +115,7 @@ def bone(xy: Array) -> Array:
 
 
 def errors(o: Observations) -> list[Array]:
-    """Unit covariances of errors whose amplitude is found: stroke zero and breathing [m], zero of force [N], noise [1]; (m, m)."""
+    """Unit covariances of errors whose amplitude is found: stroke zero, breathing [m], zero of force [N], noise [1]; (m, m)."""
     lever, weakness = np.outer(o.per_metre, o.per_metre), np.outer(o.per_newton, o.per_newton)
     breathing = np.exp(-np.abs(o.time[:, None] - o.time) / BREATHING_S)
     return [lever * o.same_stroke, lever * breathing, weakness * (1.0 + o.same_stroke), np.eye(len(o.y))]
