@@ -71,6 +71,16 @@ def test_quiet_breathing_is_followed_with_typical_errors_while_the_arm_palpates(
     assert np.ptp(told[:, 0]) > 4e-3, "it does breathe"
 
 
+@pytest.mark.parametrize("level", ["typical", "poor"])
+def test_what_neighbouring_pixels_err_by_together_is_told(level: str) -> None:
+    """Over a minute the displacement errs by about as much as is told, with a camera of either kind."""
+    result, patient = followed(f"errors={level}", "phantom.breathing.peak_to_peak_m=0.008", seconds=60.0)
+    told = np.array([displacement[0] for displacement in result.told])
+    lifted = np.array([patient.curve.excursion(t) for t in result.t_s])
+    ratio = np.sqrt(np.mean(np.square(result.uncertainty))) / np.std(told - lifted)
+    assert 0.6 < ratio < 1.6
+
+
 def test_a_camera_that_warms_up_moves_no_wall() -> None:
     warming = ("exam.region_m=[0.1, 0.1]", "errors.camera.warm_up_m=0.01", "errors.camera.warm_up_s=100")
     case = load_scenario("healthy", warming, 3)
