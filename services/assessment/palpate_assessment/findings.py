@@ -13,7 +13,7 @@ from scipy.special import expit
 from palpate_assessment.calibration import Calibration
 from palpate_assessment.detection import SURE, Candidate
 from palpate_assessment.grid import MapGrid
-from palpate_assessment.model import Regression
+from palpate_assessment.model import UNLIKE, Regression
 from palpate_models.frames import Array
 
 Mask = NDArray[np.bool_]
@@ -103,7 +103,7 @@ def _area(
     weight = grid.area[nodes] / grid.area[nodes].sum()
     inside = nodes[near]
     middle = float(weight @ mean[inside])
-    sd = float(np.sqrt(weight @ covariance[np.ix_(inside, inside)] @ weight))
+    sd = float(np.hypot(np.sqrt(weight @ covariance[np.ix_(inside, inside)] @ weight), UNLIKE * middle))
     return Area(
         nodes=nodes,
         centroid=weight @ grid.nodes[nodes],
