@@ -76,9 +76,7 @@ def scenario(seed: int) -> Scenario:
     if seed % 2:
         contrast = (0.2, 0.6) if seed % 10 == 9 else (1.5, 8.0)
         depth = (0.0, 0.004) if seed % 4 == 1 else (0.0, 0.015)
-        lump = (
-            f"lumps: [1, 1], radius_m: [0.010, 0.035], depth_m: {list(depth)}, contrast: {list(contrast)}, region_m: [0.17, 0.17]"
-        )
+        lump = f"lumps: [1, 1], radius_m: [0.010, 0.035], depth_m: {list(depth)}, contrast: {list(contrast)}"
         settings.append(f"phantom.draw={{{lump}}}")
     return load_scenario("person", settings, seed)
 

@@ -40,7 +40,7 @@ FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
 FEATURES = ("strength", "beyond", "log-radius", "softer", "bone")
 """What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, sign, and how
-much of its strength may be bone under it, which is felt as a lump is."""
+much of its strength is bone's under it, which is felt as a lump is: where bone may just lie, a lump is the likelier one."""
 ALIKE, HALF = 1.5, 0.5
 """Where two strokes over a lump say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
 bump is so high."""
@@ -65,7 +65,7 @@ class Candidate:
         """The FEATURES, shape (f,)."""
         size = np.log(self.bump.radius / RADII_M[2])
         under = float(bone(np.array([[self.bump.x, self.bump.y]]))[0])
-        return np.array((abs(self.t), self.beyond, size, float(self.log_contrast < 0), under * abs(self.t)))
+        return np.array((abs(self.t), self.beyond, size, float(self.log_contrast < 0), under**2 * abs(self.t)))
 
     @property
     def beyond(self) -> float:
