@@ -81,6 +81,21 @@ def test_a_lump_in_the_model_takes_its_contrast() -> None:
     assert covariance[0, 0] > 0
 
 
+def test_the_zero_of_the_force_is_told_by_the_strokes_and_makes_the_level_unsure() -> None:
+    zeros = 0.25 * np.random.default_rng(0).standard_normal(20)
+    wall = natural(1, 0.1)
+    steady = lines(lambda xy: LEVEL + wall(xy))
+    found = []
+    for samples in (steady, [replace(s, force=s.force + float(zeros[s.stroke])) for s in steady]):
+        o = observe(samples, learned())
+        assert o is not None
+        regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
+        found.append((np.exp(regression.log_amplitudes[-2]), regression.field(np.zeros((1, 2)))[1][0]))
+    (small, sure), (large, unsure) = found
+    assert large > 1.3 * small
+    assert unsure > 1.2 * sure
+
+
 def test_every_sample_is_in_one_piece_of_one_stroke() -> None:
     o = observed()
     parts = pieces(o)
