@@ -44,7 +44,7 @@ AVERAGED = 0.35
 """How rough the error is expected to be of a surface that the images of a whole examination show in the mean."""
 
 
-class Touch(NamedTuple):
+class FeltHeight(NamedTuple):
     """The surface was felt."""
 
     xy_A: Array
@@ -65,7 +65,7 @@ class SurfaceCorrection:
     def __init__(self, expected_roughness: float = 1.0) -> None:
         """Of a surface whose error is expected to be so rough, over that of one burst."""
         self._expected = expected_roughness
-        self._touches: tuple[Touch, ...] = ()
+        self._touches: tuple[FeltHeight, ...] = ()
         self._blurred = np.empty(0)
         """Variance that later looks have added to each touch's own [m^2]."""
         self._learn()
@@ -75,13 +75,13 @@ class SurfaceCorrection:
         """How rough the error is, over what it is expected to be: a."""
         return self._fit.roughness
 
-    def touch(self, touch: Touch) -> None:
+    def touch(self, touch: FeltHeight) -> None:
         """Learns from another touch."""
         self._touches = (*self._touches, touch)
         self._blurred = np.append(self._blurred, 0.0)
         self._learn()
 
-    def revise(self, touch: Touch) -> None:
+    def revise(self, touch: FeltHeight) -> None:
         """The latest touch was otherwise than was said."""
         self._touches = (*self._touches[:-1], touch)
         self._learn()
@@ -140,7 +140,7 @@ class _Fit(NamedTuple):
     """Logarithm of the probability of the touches and the roughness, but for a constant."""
 
 
-def _errors(touches: Sequence[Touch]) -> Array:
+def _errors(touches: Sequence[FeltHeight]) -> Array:
     """S, the covariance of what n touches err by [m^2], shape (n, n)."""
     own, breath, t = np.array([(touch.sigma, touch.breath_sigma, touch.t_s) for touch in touches]).reshape(-1, 3).T
     return np.asarray(np.diag(own**2) + np.outer(breath, breath) * np.exp(-np.abs(t[:, None] - t) / LASTING_S))

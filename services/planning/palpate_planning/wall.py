@@ -20,7 +20,7 @@ from palpate_models.frames import Array
 from palpate_planning.breath import Breath
 from palpate_planning.periods import SECOND
 from palpate_planning.surface import Foot, PerceivedSurface
-from palpate_planning.surface_correction import SurfaceCorrection, Touch
+from palpate_planning.surface_correction import FeltHeight, SurfaceCorrection
 from palpate_planning.touch import Onset, SkinDepth
 
 
@@ -114,7 +114,7 @@ class Wall:
         """Learns from a touch under `foot` at `t` [ns]; also returns how far the wall there moved outward by it [m]."""
         before, before_sigma = self.correction.at(foot.xy_A)
         moved = self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t)
-        felt = Touch(foot.xy_A, before - touch.depth, touch.sigma, moved, t / SECOND)
+        felt = FeltHeight(foot.xy_A, before - touch.depth, touch.sigma, moved, t / SECOND)
         self.correction.touch(felt)
         self._touched = foot, before
         observed = TouchedSkin(foot.p_W, stroke, felt.height, math.hypot(touch.sigma, moved), before, before_sigma)
@@ -132,7 +132,7 @@ class Wall:
         share, reckoned = self.perceived.breathing(foot.xy_A), self.correction.height(foot.xy_A)
         touch = onset.touch_again(share * seen)
         moved = share * self.breath.seen_uncertainty
-        self.correction.revise(Touch(foot.xy_A, before - touch.depth, touch.sigma, moved, float(onset.times[-1]) / SECOND))
+        self.correction.revise(FeltHeight(foot.xy_A, before - touch.depth, touch.sigma, moved, float(onset.times[-1]) / SECOND))
         return self.correction.height(foot.xy_A) - reckoned
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_planning.surface_correction import FIELD_LENGTH_M, FIELD_M, OFFSET_M, TILT_RAD, SurfaceCorrection, Touch
+from palpate_planning.surface_correction import FIELD_LENGTH_M, FIELD_M, OFFSET_M, TILT_RAD, FeltHeight, SurfaceCorrection
 
 PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
 BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])
@@ -25,7 +25,7 @@ def test_untouched_it_is_nothing_and_unsure() -> None:
 def test_offset_and_tilt_are_found_in_between() -> None:
     correction = SurfaceCorrection()
     for place in PLACES:
-        correction.touch(Touch(place, float(tilted(place)), 2e-4))
+        correction.touch(FeltHeight(place, float(tilted(place)), 2e-4))
     for place in BETWEEN:
         assert correction.height(place) == pytest.approx(float(tilted(place)), abs=3e-4)
         assert correction.sigma(place) < 0.0015
@@ -35,7 +35,7 @@ def test_offset_and_tilt_are_found_in_between() -> None:
 def test_touches_at_one_place_are_averaged() -> None:
     correction = SurfaceCorrection()
     for height in (0.0042, 0.0038):
-        correction.touch(Touch(np.zeros(2), height, 5e-4))
+        correction.touch(FeltHeight(np.zeros(2), height, 5e-4))
     assert correction.height(np.zeros(2)) == pytest.approx(0.004, abs=2e-5)
     assert correction.sigma(np.zeros(2)) == pytest.approx(5e-4 / np.sqrt(2), rel=0.01)
 
@@ -51,7 +51,7 @@ def test_its_errors_are_as_large_as_it_says() -> None:
         truth = rng.multivariate_normal(np.zeros(len(everywhere)), covariance)
         correction = SurfaceCorrection()
         for place, height in zip(PLACES, truth, strict=False):
-            correction.touch(Touch(place, float(height + 4e-4 * rng.standard_normal()), 4e-4))
+            correction.touch(FeltHeight(place, float(height + 4e-4 * rng.standard_normal()), 4e-4))
         scores += [(correction.height(p) - h) / correction.sigma(p) for p, h in zip(BETWEEN, truth[len(PLACES) :], strict=True)]
     assert np.std(scores) == pytest.approx(1.0, abs=0.2)
 
@@ -64,7 +64,7 @@ def test_touches_tell_how_rough_the_error_is(rough_m: float, most_m: float, roug
     correction = SurfaceCorrection()
     for place in places:
         height = tilted(place) + rough_m * rng.standard_normal() + 2e-4 * rng.standard_normal()
-        correction.touch(Touch(place, float(height), 2.5e-4))
+        correction.touch(FeltHeight(place, float(height), 2.5e-4))
     assert roughness[0] <= correction.roughness <= roughness[1]
     assert correction.sigma(np.array((0.02, 0.02))) < most_m
 
@@ -72,10 +72,10 @@ def test_touches_tell_how_rough_the_error_is(rough_m: float, most_m: float, roug
 def test_the_latest_touch_can_be_revised() -> None:
     revised, right = SurfaceCorrection(), SurfaceCorrection()
     for correction in (revised, right):
-        correction.touch(Touch(PLACES[0], 0.004, 4e-4))
-    revised.touch(Touch(PLACES[1], 0.006, 9e-4))
-    revised.revise(Touch(PLACES[1], 0.005, 4e-4))
-    right.touch(Touch(PLACES[1], 0.005, 4e-4))
+        correction.touch(FeltHeight(PLACES[0], 0.004, 4e-4))
+    revised.touch(FeltHeight(PLACES[1], 0.006, 9e-4))
+    revised.revise(FeltHeight(PLACES[1], 0.005, 4e-4))
+    right.touch(FeltHeight(PLACES[1], 0.005, 4e-4))
     assert revised.height(PLACES[2]) == pytest.approx(right.height(PLACES[2]))
     assert revised.sigma(PLACES[2]) == pytest.approx(right.sigma(PLACES[2]))
 
@@ -83,7 +83,7 @@ def test_the_latest_touch_can_be_revised() -> None:
 def test_a_new_look_keeps_what_touches_told_of_offset_and_tilt() -> None:
     correction = SurfaceCorrection()
     for place in PLACES:
-        correction.touch(Touch(place, float(tilted(place)), 3e-4))
+        correction.touch(FeltHeight(place, float(tilted(place)), 3e-4))
     before = correction.sigma(PLACES[0])
     correction.blur()
     assert correction.sigma(PLACES[0]) > before
@@ -97,7 +97,7 @@ def test_of_a_better_surface_the_same_touches_leave_less() -> None:
     bent = rng.multivariate_normal(np.zeros(len(PLACES)), (2 * FIELD_M) ** 2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)))
     correction = SurfaceCorrection()
     for place, field in zip(PLACES, bent, strict=True):
-        correction.touch(Touch(place, float(tilted(place) + field), 2e-4))
+        correction.touch(FeltHeight(place, float(tilted(place) + field), 2e-4))
     better = correction.averaged(lambda xy: bent[[int(np.argmin(np.sum((PLACES - p) ** 2, axis=1))) for p in xy]])
     assert better.roughness < correction.roughness
     heights, sigmas = better.over(BETWEEN)
@@ -109,8 +109,8 @@ def test_touches_in_a_row_share_what_the_breath_erred_by() -> None:
     """Nine of them within three seconds tell the offset no better than the breath was followed, within three minutes they do."""
     hasty, slow = SurfaceCorrection(), SurfaceCorrection()
     for number, place in enumerate(PLACES):
-        hasty.touch(Touch(place, 0.004, 1e-4, 5e-4, number / 3.0))
-        slow.touch(Touch(place, 0.004, 1e-4, 5e-4, number * 20.0))
+        hasty.touch(FeltHeight(place, 0.004, 1e-4, 5e-4, number / 3.0))
+        slow.touch(FeltHeight(place, 0.004, 1e-4, 5e-4, number * 20.0))
     middle = PLACES[4]
     assert hasty.sigma(middle) == pytest.approx(5e-4, rel=0.2)
     assert slow.sigma(middle) < 0.7 * hasty.sigma(middle)
