@@ -85,10 +85,15 @@ def _ticks(folder: Path) -> bool:
     return path.is_file() and path.stat().st_size > 0
 
 
+def _log(folder: Path) -> Path:
+    """What a run says, beside its folder, which has to be empty when it begins."""
+    return folder.with_name(f"{folder.name}.log")
+
+
 def _start(folder: Path, words: list[str]) -> subprocess.Popen[bytes]:
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "palpate", "run", SCENARIO, "--out", str(folder), *words]
-    with (folder / "output.log").open("wb") as log:
+    with _log(folder).open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
 
@@ -105,7 +110,7 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 def _said(folder: Path) -> str:
     """The last line of a run's output."""
-    lines = (folder / "output.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    lines = _log(folder).read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else "it said nothing"
 
 
