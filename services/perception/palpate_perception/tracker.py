@@ -173,10 +173,9 @@ class Tracker:
 
     def _weigh_error(self, elapsed_s: float, left: Array, weight: Array) -> None:
         """Counts what an image, `elapsed_s` [s] after the last, leaves over [m], shape (n,), for what pixels err by together."""
-        told = np.bincount(self._patch, weight * self.wall.lifts**2)
-        pull = np.bincount(self._patch, weight * self.wall.lifts * left)
-        variance = float(np.sum((pull / (told.sum() - told)) ** 2))
-        self._shared += (1 - np.exp(-elapsed_s / SHARED_S)) * (0.5 * variance - self._shared)
+        variance = jackknife(left, weight, self.wall.lifts, self._patch)
+        if variance is not None:
+            self._shared += (1 - np.exp(-elapsed_s / SHARED_S)) * (0.5 * variance - self._shared)
 
     def _weigh_motion(self, elapsed_s: float, left: Array, weight: Array) -> None:
         """Counts what an image, `elapsed_s` [s] after the last, leaves over [m], shape (n,), for the rigid motion."""
@@ -208,6 +207,17 @@ class Tracker:
         moved = np.array((s_x, s_y, 0.0)) + np.cross((0.0, theta, 0.0), self._corners)
         moved[:, 2] -= moved[:, 2].mean()
         return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+
+def jackknife(left: Array, weight: Array, lifts: Array, patch: NDArray[np.intp]) -> float | None:
+    """The variance [m^2] of d by patches, from what it leaves over [m], weights, the mode and the patch of each pixel, (n,) each.
+
+    None where one patch tells more than all others together, so that nothing is known of what they share.
+    """
+    told, pull = np.bincount(patch, weight * lifts**2), np.bincount(patch, weight * lifts * left)
+    if told.max() > 0.5 * told.sum():
+        return None
+    return float(np.sum((pull / (told.sum() - told)) ** 2))
 
 
 def _patches(p_A: Array) -> NDArray[np.intp]:

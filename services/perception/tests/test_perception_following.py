@@ -15,6 +15,7 @@ from palpate_models.load import exam_input, load_scenario
 from palpate_models.scenario import Robot
 from palpate_perception.arm import ArmMask, passes
 from palpate_perception.breath_filter import BreathFilter, strongest_rate
+from palpate_perception.tracker import jackknife
 from palpate_perception.watch import rises
 
 
@@ -79,6 +80,13 @@ def test_what_neighbouring_pixels_err_by_together_is_told(level: str) -> None:
     lifted = np.array([patient.curve.excursion(t) for t in result.t_s])
     ratio = np.sqrt(np.mean(np.square(result.uncertainty))) / np.std(told - lifted)
     assert 0.6 < ratio < 1.6
+
+
+def test_patches_that_differ_tell_the_variance_and_one_that_tells_most_does_not() -> None:
+    patch, one = np.repeat(np.arange(4), 5), np.ones(20)
+    left = np.repeat((3e-4, -3e-4, 3e-4, -3e-4), 5)
+    assert jackknife(left, one, one, patch) == pytest.approx(4 * (1e-4) ** 2)
+    assert jackknife(left, np.where(patch == 0, 1.0, 0.0), one, patch) is None
 
 
 def test_a_camera_that_warms_up_moves_no_wall() -> None:
