@@ -42,7 +42,7 @@ class Descent:
 
     def start(self) -> None:
         """Before a descent: at rest, soon, above the skin."""
-        self._rested = 0.0
+        self._rested = self._deepest = 0.0
         self._onset = Onset()
         self._felt = self._sure = False
         """Whether the skin has been touched, and whether where is known as surely as it will be."""
@@ -65,15 +65,16 @@ class Descent:
         unsure = SIGMAS * contact.wall.sigma
         braking = motion.depth.velocity**2 / DEPTH_ACCELERATION
         near = motion.depth.position > -unsure - ALLOWANCE_M - braking
-        deepest = motion.depth.step(unsure + self._depth, PROBE_MPS if near else DESCEND_MPS)
+        self._deepest = max(self._deepest, unsure + self._depth)  # one that falls and rises with what is known is never reached
+        there = motion.depth.step(self._deepest, PROBE_MPS if near else DESCEND_MPS)
         if near:
             self._onset.add(contact.depth, contact.force, t, contact.wall.displacement)
-        if contact.force >= FELT_N or (deepest and contact.touching):
+        if contact.force >= FELT_N or (there and contact.touching):
             self.touched, outward = motion.wall.touched(contact.foot, self._onset.touch(), self.stroke, t)
             motion.shift(outward)
             self._felt = True
-        elif deepest:
-            self.missed = f"no tissue felt down to {(unsure + self._depth) * 1e3:.0f} mm below where it is believed to be"
+        elif there:
+            self.missed = f"no tissue felt down to {self._deepest * 1e3:.0f} mm below where it is believed to be"
         return self._felt
 
     def make_sure(self) -> None:

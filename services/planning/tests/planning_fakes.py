@@ -92,6 +92,8 @@ class World:
         self.excursion = excursion
         self.calm, self.moved, self.shift_A = True, False, (0.0, 0.0)
         """What is said about the motion; a look finds the patient where he is now."""
+        self.misled = 0.0
+        """Forecasts err by so much [m], one outward and the next inward."""
         self.settings, self.force = settings, force or hertz(2.4)
         self.exam = ExamSequence(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
@@ -169,6 +171,7 @@ class World:
         assert self.excursion is not None
         stamp = self.t - 100 * MS
         forecast = np.array([self.excursion((stamp + k * FORECAST_STEP) / SECOND) for k in range(11)])
+        forecast += self.misled if self.t % (200 * MS) else -self.misled
         return BreathObservation(stamp, forecast, 3e-4, self.calm, self.moved, self.shift_A)
 
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:

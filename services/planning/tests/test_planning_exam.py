@@ -121,6 +121,14 @@ def test_no_tissue_where_it_should_be_gives_up() -> None:
     assert "no tissue felt" in world.exam.status.message
 
 
+def test_a_touch_ends_on_skin_too_soft_to_be_felt_while_forecasts_err() -> None:
+    """How deep the skin is sought rises and falls with every forecast."""
+    world = World(known(region_m=(0.025, 0.0125)), hertz(0.4), excursion=lambda t: 4e-3 * float(np.sin(2 * np.pi * t / 4)))
+    world.misled = 4e-4
+    world.run(seconds=60.0)
+    assert world.exam.status.phase is Phase.DONE
+
+
 def test_force_limit_makes_depth_yield() -> None:
     world = World(known(region_m=(0.025, 0.0125)), hertz(30.0))
     world.run()
