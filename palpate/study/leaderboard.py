@@ -25,10 +25,10 @@ Made by `python -m palpate.study.leaderboard` from `docs/studies/*/study.json`: 
 intervals and sample sizes; [statistics.md](statistics.md) defines the columns. Failed and not completed cases count against
 the method.
 
-A submission is a Python file with a service and a study file in YAML that names it; the command above a table runs its rows again.
-A method that its study does not name is the file of that name: the command takes it with `--service assessment=FILE`, such as
-[`threshold_assessment.py`](examples/threshold_assessment.py). A study with secret seeds holds the SHA-256 of the file of seeds,
-which `--seeds-file` gives.
+A submission is a Python file with a service and a study file in YAML that names it; the command above a table runs its rows
+again. A method that its study does not name is the file of that name: the command takes it with `--service assessment=FILE`,
+such as [`threshold_assessment.py`](examples/threshold_assessment.py). A study with secret seeds holds the SHA-256 of the file of
+seeds, which `--seeds-file` gives.
 """
 COLUMNS: Final = (
     "method", "version", "AUC", "mean sensitivity, 1/8 to 8 false findings", "sensitivity at no false finding", "lumps found",
