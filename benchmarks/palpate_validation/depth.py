@@ -1,4 +1,4 @@
-"""How wrong depth is, and whether the examination knows it: from recordings, against the truth.
+"""How wrong depth is, whether the examination knows it, and where descents meet the tissue: from recordings, against the truth.
 
 Run: `python -m palpate_validation.depth FOLDER... [--picture FILE.png]`, each FOLDER that of a `palpate run --record normal`.
 """
@@ -6,9 +6,11 @@ Run: `python -m palpate_validation.depth FOLDER... [--picture FILE.png]`, each F
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -24,6 +26,10 @@ from palpate_validation.plots import COLOURS, write_figure
 STATES, TRUTH = "exam/state", "truth/indentation"
 FEWEST = 20
 """A stroke with fewer states tells nothing of itself."""
+PRESSED_M = 0.002
+"""Tissue that was pressed deeper than this may remember it,"""
+BESIDE_M = 0.014
+"""no farther than this from the indenter: so wide is the contact at the examination's depth."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,53 @@ def read(folder: Path) -> Depths:
     time, depth, sigma, stroke = (np.array(column) for column in zip(*rows, strict=True))
     true_time, true = np.array(truth).T
     return Depths(time, depth - np.interp(time, true_time, true), sigma, stroke.astype(np.int64))
+
+
+class Met(NamedTuple):
+    """Where one descent met the tissue."""
+
+    depth: float
+    """Below the skin as it was before it was ever pressed [m]."""
+    since_s: float
+    """Time since the skin beside was pressed; infinite if it never was."""
+
+
+def where_met(folder: Path) -> list[Met]:
+    """Where the descents of a recorded run met the tissue: at the first true force. Raises RecordingError."""
+    began: dict[int, float] = {}
+    rows: list[tuple[float, ...]] = []
+    for message in open_recording(folder).messages((STATES, TRUTH)):
+        decoded, t = codec.decode(message.payload, contract().topics[message.topic].type), message.stamp / NS
+        if message.topic == STATES:
+            began.setdefault(decoded.stroke, t)
+        else:
+            p = decoded.surface_point
+            rows.append((t, decoded.depth, decoded.normal_force, p.x, p.y, p.z))
+    return met_by(began, np.array(rows))
+
+
+def met_by(began: Mapping[int, float], truth: Array) -> list[Met]:
+    """The same of descents that began at times [s]; `truth` has rows of time, depth, force and place [m], shape (n, 6)."""
+    time, depth, force = truth.T[:3]
+    met = []
+    for stroke, begin in began.items():
+        at = int(np.argmax((time >= begin) & (force > 0)))
+        if stroke == 0 or at == 0:
+            continue
+        beside = np.linalg.norm(truth[:, 3:] - truth[at, 3:], axis=1) < BESIDE_M
+        pressed = time[(time < begin) & (depth > PRESSED_M) & beside]
+        met.append(Met(float(depth[at]), float(time[at] - pressed[-1]) if len(pressed) else math.inf))
+    return met
+
+
+def told_of(met: Sequence[Met]) -> str:
+    """In a sentence."""
+    depth, since = (np.array(column) for column in zip(*met, strict=True))
+    parts = []
+    for which, where in ((np.isinf(since), "where it was not pressed before"), (np.isfinite(since), "beside earlier presses")):
+        if which.any():
+            parts.append(f"{1e3 * depth[which].mean():.2f} mm +- {1e3 * depth[which].std():.2f} ({which.sum()} descents) {where}")
+    return f"the tissue is met below the skin as it was at first, {', '.join(parts)}"
 
 
 def row(name: str, depths: Depths) -> str:
@@ -95,6 +148,9 @@ def main() -> None:
     print("|" + "---|" * 8)
     for name, depths in told:
         print(row(name, depths))
+    print()
+    for folder in args.folders:
+        print(f"{folder.name}: {told_of(where_met(folder))}")
     if args.picture is not None:
         write_figure(lambda figure: draw(figure, told), args.picture, size_in=(7.0, 1.8 * len(told) + 0.4))
 

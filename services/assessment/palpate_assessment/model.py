@@ -54,8 +54,8 @@ SLIDE_SD = 0.015
 UNLIKE = 0.1
 """How much a press may feel of a lump otherwise than a slide does, of its log-contrast."""
 ONSET_M = 0.0003
-"""What all touches err by alike, since the law by which the skin is found in a descent is not that of every wall, and what the
-camera errs by all the time: depth is 0.3 mm too small in the mean of twelve examinations (tuning seeds 0 to 11) [C]."""
+"""What all touches err by alike: beside a line of some seconds before the skin has not come back yet to where it was. Depth is
+0.3 mm too small in the mean of twelve examinations (tuning seeds 0 to 11) [C]."""
 TARE_N = 0.06
 """Prior median of the zero of a stroke's force: 0.06 N with typical equipment, 0.12 N with poor (tuning seeds 0 to 9) [C]. What
 all strokes share, by gain, cross-talk and the tool's weight, is expected to be as large: with poor equipment 0.08 N there [C]."""
