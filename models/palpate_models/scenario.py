@@ -65,9 +65,9 @@ class Exam(Section):
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Annotated[str, AfterValidator(known)] = "lines"
-    """`lines`: there and back, lifted at each line's end; `raster`: every line from the feet to the head; `snake`: there and
-    back, line ends joined in contact; `search`: presses where the role `search` asks for them; or a pattern of your own: the
-    path of a Python file that has `scan(exam, surface)`."""
+    """`lines`: there and back, every second line first, lifted at each line's end; `raster`: every line from the feet to the
+    head; `snake`: there and back, line ends joined in contact; `search`: presses where the role `search` asks for them; or a
+    pattern of your own: the path of a Python file that has `scan(exam, surface)`."""
     mode: Mode = Mode.CONTINUOUS
     """`continuous`: slides at depth; `point`: presses, holds and lifts at each point."""
     breathing: Following = Following.FOLLOW

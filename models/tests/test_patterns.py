@@ -55,16 +55,20 @@ def test_the_default_region_has_seventeen_lines_of_seventeen_points() -> None:
 @settings(deadline=None, max_examples=30)
 @given(exams, st.sampled_from(OURS))
 def test_every_node_is_visited_once_line_by_line(exam: Exam, pattern: str) -> None:
-    """The strokes that perception and planning made when the order was theirs."""
-    x, y = lattice(exam)
-    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    index = np.arange(len(nodes)).reshape(len(x), len(y))
-    if pattern != "raster":
-        index[1::2] = index[1::2, ::-1].copy()
-    scan = made(exam, pattern)
-    assert np.array_equal(scan.targets, nodes[index.ravel()])
-    assert scan.line_of_target.tolist() == np.repeat(np.arange(len(x)), len(y)).tolist()
+    scan, nodes = made(exam, pattern), np.stack(np.meshgrid(*lattice(exam), indexing="ij"), axis=-1)
+    order = [int(np.argmin(np.abs(nodes[:, 0, 0] - line[0, 0]))) for line in scan.lines]
+    assert sorted(order) == list(range(len(nodes)))
+    for k, (line, where) in enumerate(zip(scan.lines, order, strict=True)):
+        assert np.array_equal(line, nodes[where][::-1] if pattern != "raster" and k % 2 else nodes[where])
     assert scan.joined is (pattern == "snake")
+    if pattern != "lines":
+        assert order == list(range(len(nodes)))
+
+
+def test_no_line_follows_the_one_beside_it() -> None:
+    """Skin that has just been pressed would be found too deep."""
+    x = np.array([line[0, 0] for line in made(Exam(), "lines").lines])
+    assert np.abs(np.diff(x)).min() > 0.024
 
 
 def test_a_pattern_of_ones_own_is_a_file_with_a_function() -> None:

@@ -1,4 +1,4 @@
-"""Our scan patterns: lines along y_A (foot to head) which follow each other in x_A from the patient's right to the left.
+"""Our scan patterns: lines along y_A (foot to head), side by side in x_A from the patient's right to the left.
 
 Along such a line the wall curves least, so the tool turns least while it is in contact.
 """
@@ -13,9 +13,14 @@ from palpate_models.scenario import Exam
 
 
 def lines(exam: Exam, surface: Surface) -> Scan:
-    """Lines there and back; the tool lifts at their ends, so that each has a touch and a tare of its own."""
+    """Lines there and back, every second one first; the tool lifts at their ends, so that each has a touch and a tare of its own.
+
+    Skin that was pressed takes a while to come back, and a touch beside it would find it too deep: what lies between two lines is
+    pressed a minute after them.
+    """
     del surface
-    return Scan(_alternating(exam))
+    along = _upward(exam)
+    return Scan(_there_and_back(along[::2] + along[1::2]))
 
 
 def raster(exam: Exam, surface: Surface) -> Scan:
@@ -27,12 +32,13 @@ def raster(exam: Exam, surface: Surface) -> Scan:
 def snake(exam: Exam, surface: Surface) -> Scan:
     """Lines there and back, joined in contact by arcs."""
     del surface
-    return Scan(_alternating(exam), joined=True)
+    return Scan(_there_and_back(_upward(exam)), joined=True)
 
 
 def search(exam: Exam, surface: Surface) -> Scan:
     """The places that a search may ask for."""
-    return lines(exam, surface)
+    del surface
+    return Scan(_there_and_back(_upward(exam)))
 
 
 def stations(centre: float, length: float, spacing: float) -> Array:
@@ -52,5 +58,5 @@ def _upward(exam: Exam) -> list[Array]:
     return list(np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
 
 
-def _alternating(exam: Exam) -> list[Array]:
-    return [line[::-1] if k % 2 else line for k, line in enumerate(_upward(exam))]
+def _there_and_back(along: list[Array]) -> list[Array]:
+    return [line[::-1] if k % 2 else line for k, line in enumerate(along)]
