@@ -193,6 +193,7 @@ def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, floa
         at,
         covariance / largest,
         p0=(0.5, 0.015),
+        sigma=[inside[k].sum() ** -0.5 for k in known],
         bounds=((0.0, 0.005), (1.0, 0.06)),
     )
     return _round(np.sqrt(variance * largest)), _round(length)
