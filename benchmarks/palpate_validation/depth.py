@@ -6,7 +6,6 @@ Run: `python -m palpate_validation.depth FOLDER... [--picture FILE.png]`, each F
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,8 +70,8 @@ class Met(NamedTuple):
 
     depth: float
     """Below the skin as it was before it was ever pressed [m]."""
-    since_s: float
-    """Time since the skin beside was pressed; infinite if it never was."""
+    pressed: bool
+    """Whether the skin there, or beside, was pressed before."""
 
 
 def where_met(folder: Path) -> list[Met]:
@@ -98,16 +97,15 @@ def met_by(began: Mapping[int, float], truth: Array) -> list[Met]:
         if stroke == 0 or at == 0:
             continue
         beside = np.linalg.norm(truth[:, 3:] - truth[at, 3:], axis=1) < BESIDE_M
-        pressed = time[(time < begin) & (depth > PRESSED_M) & beside]
-        met.append(Met(float(depth[at]), float(time[at] - pressed[-1]) if len(pressed) else math.inf))
+        met.append(Met(float(depth[at]), bool(np.any((time < begin) & (depth > PRESSED_M) & beside))))
     return met
 
 
 def told_of(met: Sequence[Met]) -> str:
     """In a sentence."""
-    depth, since = (np.array(column) for column in zip(*met, strict=True))
+    depth, pressed = (np.array(column) for column in zip(*met, strict=True))
     parts = []
-    for which, where in ((np.isinf(since), "where it was not pressed before"), (np.isfinite(since), "beside earlier presses")):
+    for which, where in ((~pressed, "where it was not pressed before"), (pressed, "beside earlier presses")):
         if which.any():
             parts.append(f"{1e3 * depth[which].mean():.2f} mm +- {1e3 * depth[which].std():.2f} ({which.sum()} descents) {where}")
     return f"the tissue is met below the skin as it was at first, {', '.join(parts)}"
