@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from math import sqrt
 from typing import Final
 
 import numpy as np
@@ -133,7 +134,7 @@ class QuickExamination:
         self._gated = self._exam.breathing is Following.GATE
         self._open = True
         self._zero_m = 0.0
-        self._force, self._touching = 0.0, False
+        self._force, self._load, self._touching = 0.0, 0.0, False
         self._depth = -HOP_M
         self._count = self._stroke_number = 0
 
@@ -246,7 +247,7 @@ class QuickExamination:
         """The indenter follows the motion for a period, with this examination's errors."""
         motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
         self._count += 1
-        measured = (self._depth, self._force, (_NOWHERE, _NOWHERE), self._touching)
+        measured = (self._depth, self._force, self._load, (_NOWHERE, _NOWHERE), self._touching)
         contact = ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, loop.uncertainty_m), *measured)
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT)
         at = int(motion.along.position * way.per_m + 0.5)
@@ -258,6 +259,8 @@ class QuickExamination:
         height = patient.radius - depth + share * excursion
         force = patient.move(way.place[at] + height * way.normal[at])
         self._force = float(way.gains[at] @ force) + loop.tared(k)
+        along = float(way.normal[at] @ force)
+        self._load = sqrt(self._force**2 + max(force @ force - along**2, 0.0))
         self._touching = self._force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
         self._open = not self._gated or abs(loop.followed * excursion) < GATE_M
         limited = motion.regulation.limited or (motion.short_of_depth and stage in AT_DEPTH)

@@ -46,6 +46,8 @@ class ContactMeasurement(NamedTuple):
     """Radius less the signed distance of the sphere's centre from the unpressed skin, where it is now [m]; negative: gap."""
     force: float
     """Normal force [N], positive when the tissue is pressed."""
+    load: float
+    """Size of the whole force, normal and sideways [N]."""
     skin: tuple[Array, Array]
     """The point of the skin under the indenter and its outward normal, where the first look saw them (`Wall.skin`)."""
     touching: bool
@@ -72,7 +74,8 @@ class ContactSensing:
         velocity = self._kinematics.jacobian(reading.q)[:3] @ reading.qd
         acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
         self._velocity = velocity
-        force = float(self.weight.contact(R_WS, reading.wrench_S, acceleration) @ foot.n_W)
+        force_W = self.weight.contact(R_WS, reading.wrench_S, acceleration)
+        force = float(force_W @ foot.n_W)
         self._touching = self.weight.tared and force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
         return ContactMeasurement(
             reading.q,
@@ -82,6 +85,7 @@ class ContactSensing:
             place,
             self._radius - foot.distance + place.correction + place.displacement,
             force,
+            float(np.linalg.norm(force_W)),
             wall.skin(foot, place.correction),
             self._touching,
         )

@@ -8,7 +8,8 @@ surface. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F 
     d_r  -> min(target, d (F_max/F_p)^(1/1.45))   the depth at which the force would be F_max (F ~ d^1.45)
     g'   = w (F_p - F_max)/K_z, g >= 0      guard that needs no tissue model: a hard surface, a wrong exponent
 
-with F_p = F + tau dF/dt the force expected when the command takes effect.
+with F the normal force, L the size of the whole force (sliding onto a hard edge pushes sideways, too), and F_p = L + tau dL/dt
+the size that is expected when the command takes effect.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import NamedTuple
 
 EXPONENT = 1.45
 """Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
-FORCE_FRACTION = 0.8
+FORCE_FRACTION = 0.83
 """Part of the working force limit at which depth yields: force rises until the arm has yielded, and the sensor's gain errs."""
 FEED_FORWARD = 0.9
 """a, below one so that the force cannot build up by itself even on a rigid surface."""
@@ -80,7 +81,7 @@ class DepthRegulator:
 
     def reset(self, depth: float) -> None:
         """Starts at rest at a commanded depth [m], negative above the surface."""
-        self._force = self._raw = self._slope = 0.0
+        self._force = self._load = self._raw_load = self._slope = 0.0
         self._integral = self._guard = self._yield = 0.0
         self._command = depth
 
@@ -88,13 +89,14 @@ class DepthRegulator:
         """Moves the zero of all depths: every depth reads `change` [m] more."""
         self._command += change
 
-    def update(self, target: float, depth: float, force: float, in_contact: bool) -> Regulation:
-        """One step: target depth, measured depth [m], measured normal force [N], whether the tissue is touched."""
+    def update(self, target: float, depth: float, force: float, load: float, in_contact: bool) -> Regulation:
+        """One step: target and measured depth [m], normal force and size of the whole force [N], whether the tissue is touched."""
         dt = self._dt
-        self._slope += dt / (RATE_LAG_S + dt) * ((force - self._raw) / dt - self._slope)
-        self._raw = force
+        self._slope += dt / (RATE_LAG_S + dt) * ((load - self._raw_load) / dt - self._slope)
+        self._raw_load = load
         self._force += dt / (FORCE_LAG_S + dt) * (force - self._force)
-        expected = self._force + LEAD_S * max(self._slope, 0.0)
+        self._load += dt / (FORCE_LAG_S + dt) * (load - self._load)
+        expected = self._load + LEAD_S * max(self._slope, 0.0)
 
         self._guard += dt * GUARD_PER_S * (expected - self.force_max) / self._stiffness
         self._guard = min(max(self._guard, 0.0), GUARD_MAX_M)

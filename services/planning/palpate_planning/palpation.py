@@ -209,8 +209,8 @@ class Palpation:
         self._recovery.return_to_path(contact)
         if self.stage not in (StrokeStage.SLIDE, StrokeStage.HOLD):
             self._descent.make_sure()
-        if contact.force > self._limits.force_soft_stop_n and self.stage in PRESSING:
-            self._recovery.soft_stop(contact.force, self._motion.segment.path, self._motion.along.position)
+        if contact.load > self._limits.force_soft_stop_n and self.stage in PRESSING:
+            self._recovery.soft_stop(contact.load, self._motion.segment.path, self._motion.along.position)
             self._enter(StrokeStage.LIFT)
         self._heed_the_wall(t, contact)
         if self.stage is StrokeStage.SLIDE:

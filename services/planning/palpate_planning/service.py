@@ -85,7 +85,7 @@ class PlanningService(Service):
             )
         )
         if step.contact is not None and step.contact.touching:
-            self._peak_force = max(self._peak_force, step.contact.force)
+            self._peak_force = max(self._peak_force, step.contact.load)
         outbox: dict[str, Message | list[Message]] = {
             "planning/setpoint": step.setpoint.message(),
             "exam/state": state_message(t, self._exam.status, step.contact),

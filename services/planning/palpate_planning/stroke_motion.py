@@ -169,7 +169,7 @@ class StrokeMotion:
 
     def regulate(self, contact: ContactMeasurement, *, in_contact: bool) -> None:
         """Regulates the measured depth towards the target depth; `in_contact` lets errors be integrated."""
-        self.regulation = self._regulator.update(self.depth.position, contact.depth, contact.force, in_contact)
+        self.regulation = self._regulator.update(self.depth.position, contact.depth, contact.force, contact.load, in_contact)
 
     @property
     def short_of_depth(self) -> bool:

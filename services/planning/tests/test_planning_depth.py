@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from palpate_planning.depth import FORCE_FRACTION, DepthRegulator, Regulation
+from palpate_planning.depth import FEED_FORWARD, FORCE_FRACTION, DepthRegulator, Regulation
 from palpate_planning.setpoints import NORMAL_STIFFNESS
 
 LIMIT_N = 15.0
@@ -42,7 +42,7 @@ def indent(force: Callable[[float, float], float], seconds: float = 4.0, seed: i
             depth, measured = float(np.mean(depths[-10:])), float(np.mean(forces[-10:])) + rng.normal(0, 0.016)
             room = 1.0 if latest is None else np.clip((1 - latest[0].expected_force / regulator.force_max) / 0.3, 0.01, 1)
             target = min(target + 0.0002 * room, 0.010)
-            pending = (regulator.update(target, depth, measured, measured > 0.15), t)
+            pending = (regulator.update(target, depth, measured, abs(measured), measured > 0.15), t)
             rows.append((t, pending[0].reference, depth, float(np.mean(forces[-10:])), pending[0].limited))
         goal, rate, feed = -0.01, 0.0, 0.0
         if latest is not None:
@@ -93,10 +93,20 @@ def test_a_hard_surface_is_not_pressed_with_more_than_the_limit_for_long() -> No
     assert rows[-1, 3] < LIMIT_N
 
 
+def test_sideways_force_makes_depth_yield_as_normal_force_does() -> None:
+    regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
+    regulator.reset(0.01)
+    for _ in range(100):
+        regulation = regulator.update(0.01, 0.01, 11.0, 16.0, True)
+    assert regulation.limited
+    assert regulation.reference < 0.0085
+    assert regulation.force == pytest.approx(FEED_FORWARD * 11.0)
+
+
 def test_depth_is_never_commanded_beyond_its_limit() -> None:
     regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
     regulator.reset(0.0)
-    commands = [regulator.update(0.019, 0.016, 1.0, True).depth for _ in range(200)]
+    commands = [regulator.update(0.019, 0.016, 1.0, 1.0, True).depth for _ in range(200)]
     assert 0.0195 < max(commands) <= 0.02
 
 
@@ -104,6 +114,6 @@ def test_in_free_air_nothing_winds_up() -> None:
     regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
     regulator.reset(-0.02)
     for _ in range(500):
-        regulation = regulator.update(-0.02, -0.018, 0.01, False)
+        regulation = regulator.update(-0.02, -0.018, 0.01, 0.01, False)
     assert regulation.depth == pytest.approx(-0.02)
     assert regulation.force < 0.02

@@ -30,7 +30,9 @@ MOTION = joint_trajectory(KINEMATICS, np.array([START, GOAL]), Limits(), PERIOD_
 DOWN, ONE = np.diag([1.0, -1.0, -1.0]), np.zeros(1, dtype=int)
 PLACE = SurfacePath(np.zeros(1), np.zeros((1, 3)), -DOWN[None, 2], DOWN[None], GOAL[None], ONE, ONE)
 FOOT = Foot(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.02, np.zeros(2))
-ABOVE = ContactMeasurement(START, np.eye(4), np.eye(3), FOOT, WallPlace(0.0, 0.0, 0.01), -0.02, 0.0, (FOOT.p_W, FOOT.n_W), False)
+ABOVE = ContactMeasurement(
+    START, np.eye(4), np.eye(3), FOOT, WallPlace(0.0, 0.0, 0.01), -0.02, 0.0, 0.0, (FOOT.p_W, FOOT.n_W), False
+)
 
 
 def ticks(late_at: int, late: int, count: int) -> list[int]:
