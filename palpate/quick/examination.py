@@ -260,7 +260,7 @@ class QuickExamination:
         force = patient.move(way.place[at] + height * way.normal[at])
         self._force = float(way.gains[at] @ force) + loop.tared(k)
         along = float(way.normal[at] @ force)
-        self._load = sqrt(self._force**2 + max(force @ force - along**2, 0.0))
+        self._load = sqrt(self._force**2 + max(float(force @ force) - along**2, 0.0))
         self._touching = self._force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
         self._open = not self._gated or abs(loop.followed * excursion) < GATE_M
         limited = motion.regulation.limited or (motion.short_of_depth and stage in AT_DEPTH)

@@ -43,7 +43,7 @@ YIELD_MPS = 0.08
 RETURN_MPS = 0.02
 """Fastest d_r back into the tissue after yielding."""
 MODEL_DEPTH_M = 0.003
-"""Shallower than this the power law is not used."""
+"""Shallower than this the power law is not trusted: the force is taken for that of this depth."""
 RATE_MAX_MPS = 0.2
 """Greatest rate of the commanded depth that is passed on for control to extrapolate by."""
 LIMITED_M = 0.0002
@@ -90,7 +90,7 @@ class DepthRegulator:
         self._command += change
 
     def update(self, target: float, depth: float, force: float, load: float, in_contact: bool) -> Regulation:
-        """One step: target and measured depth [m], normal force and size of the whole force [N], whether the tissue is touched."""
+        """One step: target and measured depth [m], normal force and size of the whole [N], whether the tissue is touched."""
         dt = self._dt
         self._slope += dt / (RATE_LAG_S + dt) * ((load - self._raw_load) / dt - self._slope)
         self._raw_load = load
@@ -101,8 +101,8 @@ class DepthRegulator:
         self._guard += dt * GUARD_PER_S * (expected - self.force_max) / self._stiffness
         self._guard = min(max(self._guard, 0.0), GUARD_MAX_M)
         allowed = target
-        if depth > MODEL_DEPTH_M and expected > 0.5 * self.force_max:
-            allowed = min(target, depth * (self.force_max / expected) ** (1.0 / EXPONENT))
+        if expected > 0.5 * self.force_max:
+            allowed = min(target, max(depth, MODEL_DEPTH_M) * (self.force_max / expected) ** (1.0 / EXPONENT))
         step = (target - allowed - self._yield) * dt / (YIELD_LAG_S + dt)
         self._yield = max(0.0, self._yield + min(max(step, -RETURN_MPS * dt), YIELD_MPS * dt))
         reference = target - self._yield

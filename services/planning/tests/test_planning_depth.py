@@ -103,6 +103,15 @@ def test_sideways_force_makes_depth_yield_as_normal_force_does() -> None:
     assert regulation.force == pytest.approx(FEED_FORWARD * 11.0)
 
 
+def test_where_little_depth_gives_much_force_depth_does_not_return_to_its_target() -> None:
+    regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
+    regulator.reset(0.0032)
+    for _ in range(100):
+        regulator.update(0.01, 0.0032, 11.0, 11.0, True)
+    references = [regulator.update(0.01, 0.0028, 11.0, 11.0, True).reference for _ in range(50)]
+    assert max(references) < 0.004
+
+
 def test_depth_is_never_commanded_beyond_its_limit() -> None:
     regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
     regulator.reset(0.0)
