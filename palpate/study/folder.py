@@ -68,10 +68,12 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def open_folder(folder: Path, manifest: Manifest) -> None:
-    """Makes the folder, or goes on in one of the same study and split. Raises StudyError for another's."""
+    """Makes the folder, or goes on in one of the same study, split and settings. Raises StudyError for another's."""
     there = read_manifest(folder)
     if there is not None and (there.study, there.split) != (manifest.study, manifest.split):
         raise StudyError(f"{folder} holds {there.study}, split {there.split}: give {manifest.study} another folder with -o")
+    if there is not None and {row.case_id for row in there.cases}.isdisjoint(row.case_id for row in manifest.cases):
+        raise StudyError(f"{folder} holds {there.study} with other settings or patients: give this one another folder with -o")
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
 
