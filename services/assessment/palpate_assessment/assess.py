@@ -80,8 +80,8 @@ def weigh_all(o: Observations, calibration: Calibration) -> tuple[Regression, li
 
     None while too few samples tell anything.
     """
-    reasons = np.where(o.limited, Reason.YIELDED, Reason.ASSESSED)
-    telling = np.flatnonzero(~o.limited)
+    reasons = np.where(o.yielded, Reason.YIELDED, Reason.ASSESSED)
+    telling = np.flatnonzero(~o.yielded)
     if len(telling) < FEWEST:
         return None
     regression, candidates = detect(o.part(telling), calibration)

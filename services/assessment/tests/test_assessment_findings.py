@@ -10,6 +10,7 @@ import pytest
 from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
 
 from palpate_assessment.assess import AssessedMap, assess, growing
+from palpate_assessment.calibration import learned
 from palpate_assessment.sampling import ForceSample
 from palpate_bus.messages import StiffnessMap
 
@@ -96,12 +97,26 @@ def test_a_stroke_piece_that_the_others_contradict_is_not_assessed() -> None:
     assert (result.unassessed == StiffnessMap.CONTRADICTED).mean() < 0.1
 
 
-def test_a_place_that_met_the_force_limit_is_not_assessed() -> None:
-    samples = [replace(s, force=15.0, force_limited=True) if s.position[0] > 0.05 else s for s in lines(level)]
+def test_a_place_where_the_force_limit_was_met_far_above_the_depth_is_not_assessed() -> None:
+    samples = [replace(s, force=15.0, depth=0.004, force_limited=True) if s.position[0] > 0.05 else s for s in lines(level)]
     result = examine(samples)
     x, y = result.grid.nodes[:, :2].T
     assert (result.unassessed[(x > 0.057) & (x < 0.07) & (np.abs(y) < 0.06)] == StiffnessMap.YIELDED).all()
     assert result.findings == []
+
+
+def test_a_lump_whose_middle_yields_to_the_force_limit_is_one_finding() -> None:
+    limit, calibration = 8.0, learned()
+
+    def yielding(sample: ForceSample) -> ForceSample:
+        depth = sample.depth * min(1.0, (limit / sample.force) ** (1 / calibration.exponent))
+        return replace(sample, force=min(sample.force, limit), depth=depth, force_limited=sample.force > limit)
+
+    samples = lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.025, 4.0))
+    (area,), (unlimited,) = (examine(felt).findings for felt in ([yielding(s) for s in samples], samples))
+    assert np.hypot(*area.centroid[:2]) < 0.002
+    assert area.area == pytest.approx(unlimited.area, rel=0.1)
+    assert area.ratio == pytest.approx(unlimited.ratio, rel=0.05)
 
 
 def test_the_map_says_what_was_not_reached() -> None:
