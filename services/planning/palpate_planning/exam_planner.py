@@ -13,7 +13,7 @@ from palpate_models.patterns.scan import scan_of
 from palpate_models.placement import plan_redundancy, prepare
 from palpate_models.scenario import ExamInput
 from palpate_planning.coverage import strokes, touches
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.kinematics import STRAIGHT_RAD, ArmKinematics, stretched
 from palpate_planning.motion_planning import NoPathError, timed_motion
 from palpate_planning.poses import centre, pose
 from palpate_planning.requests import PressPlanner
@@ -86,15 +86,19 @@ class ExamPlanner:
         mesh = None if perceived is None else (perceived.vertices, perceived.triangles)
         return self._motion(CollisionScene(self._kinematics, self._known.robot, mesh), q0, q1)
 
-    def examination(self, perceived: PerceivedAbdomen, q_now: Array, wanted: frozenset[int] | None = None) -> ExamPlan:
+    def examination(
+        self, perceived: PerceivedAbdomen, q_now: Array, wanted: frozenset[int] | None = None, bend: float | None = None
+    ) -> ExamPlan:
         """The examination of the targets that are `wanted`, of all if None.
+
+        With a `bend` [rad] it goes on: the elbow is bent by at least as much, and the skin is not touched before the strokes.
 
         Raises NoPathError if none of them can be reached or there is no way to the first.
         """
         known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)
         free, contact = (CollisionScene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
         xy = apply(inverse(np.array(known.X_WA)), perceived.positions)[:, :2]
-        postures, skipped = self._reachable(perceived, xy, q_now, contact)
+        postures, skipped = self._reachable(perceived, xy, q_now, contact, bend or STRAIGHT_RAD)
         segments = SegmentPlanner(
             self._kinematics,
             contact,
@@ -109,7 +113,7 @@ class ExamPlanner:
         while True:  # ends: each round takes targets or joints away
             usable = np.array([i not in skipped and (wanted is None or i in wanted) for i in range(len(xy))], dtype=bool)
             scan = [] if exam.searched else strokes(xy, perceived.lines, usable, joined, exam.mode, exam.spacing_m, breaks)
-            pieces = touches(xy, usable) + scan
+            pieces = scan if bend and scan else touches(xy, usable) + scan
             layout = segments.lay(pieces)
             if not layout.troubled:
                 break
@@ -129,7 +133,7 @@ class ExamPlanner:
         return timed_motion(scene, self._kinematics, self._known.limits, q0, q1, self._known.exam.seed, self._period_s)
 
     def _reachable(
-        self, perceived: PerceivedAbdomen, xy: Array, q_now: Array, scene: CollisionScene
+        self, perceived: PerceivedAbdomen, xy: Array, q_now: Array, scene: CollisionScene, bend: float
     ) -> tuple[Array, dict[int, str]]:
         """A posture for each target, shape (n, 7), and the targets that none reaches, with the reason."""
         p, n = perceived.surface.at(xy)
@@ -146,7 +150,7 @@ class ExamPlanner:
         for i, q in enumerate(chosen.q):
             if not chosen.reachable[i]:
                 skipped[i] = REACH
-            elif self._kinematics.stretched(q):
+            elif stretched(q, bend):
                 skipped[i] = STRETCHED
             elif not scene.free(q):
                 skipped[i] = f"the arm would collide: {', '.join(scene.collisions(q))}"

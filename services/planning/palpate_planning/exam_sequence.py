@@ -23,7 +23,7 @@ from palpate_planning.palpation import Palpation, PalpationStep, StrokeStage
 from palpate_planning.path import compile_ahead
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.requests import PLANNING_TIME
-from palpate_planning.segments import Segment
+from palpate_planning.segments import STRETCHED, Segment
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import Stops
@@ -34,6 +34,8 @@ from palpate_planning.wall import TouchedSkin, Wall, plane
 LOOKS_MAX = 3
 MOVES_MAX = 2
 """A patient who moves more often is not looked at again."""
+STRETCHES_MAX = 3
+"""An examination is not planned anew more often because the arm would stretch."""
 ELSEWHERE_M = 0.015
 """A wall that lies further from where an examination before saw it is another patient's, or he has moved since."""
 REST = 200 * MS
@@ -98,6 +100,10 @@ class ExamSequence:
         """Numbers of the search's requests: the latest, and the latest that is over."""
         self._moves = 0
         """How often the patient was looked at again, having moved."""
+        self._bend: float | None = None
+        """How far the elbow is bent, at least, in a plan that was made anew because it became too straight [rad]."""
+        self._stretches = 0
+        """How often that was."""
         self._wanted: frozenset[int] | None = None
         """The targets that were left then; None: all are wanted."""
         self._skipped: dict[int, str] = {}
@@ -200,8 +206,8 @@ class ExamSequence:
             self._give_up(now, f"gave up after {self._looked} looks: {why}")
 
     def _give_up(self, now: Observation, why: str) -> None:
-        """Ends an examination before it has begun; what was felt before a patient moved is assessed all the same."""
-        if self._moves:
+        """Ends an examination that cannot be planned; what was felt before, if anything was, is assessed all the same."""
+        if self._moves or self._stretches:
             self._course.go_home(now, "")
         else:
             self._course.abort(now, why)
@@ -214,7 +220,7 @@ class ExamSequence:
             self._planning = BackgroundTask(
                 now.t,
                 EXAM_PLANNING_TIME,
-                lambda: self._planner.examination(perceived, start, self._wanted),
+                lambda: self._planner.examination(perceived, start, self._wanted, self._bend),
                 lockstep=self._lockstep,
             )
         elif self._planning.due(now.t):
@@ -268,16 +274,20 @@ class ExamSequence:
         return step.setpoint
 
     def _end_strokes(self, now: Observation, palpation: Palpation) -> None:
-        """Goes home; but where a patient has moved before all was felt, looks at him again, to go on with what is left."""
-        if not (palpation.moved and palpation.ahead and self._moves < MOVES_MAX):
+        """Goes home; but where a patient has moved, or the arm would stretch, before all was felt, goes on with what is left."""
+        assert now.reading is not None
+        self._course.arm.hold(now.reading.q)
+        if palpation.ahead and palpation.moved and self._moves < MOVES_MAX:
+            self._moves, self._wanted = self._moves + 1, palpation.ahead
+            self._asked, self._looked, self._bend = None, 0, None
+            self._course.enter(Phase.LOOK, now.t, "the patient has moved: looking again")
+        elif palpation.ahead and palpation.bend_needed and self._stretches < STRETCHES_MAX:
+            self._stretches, self._wanted = self._stretches + 1, palpation.ahead
+            self._bend = max(self._bend or 0.0, palpation.bend_needed)
+            self._course.enter(Phase.PLAN, now.t, f"{STRETCHED}: planning anew")
+        else:
             self._correct()
             self._course.go_home(now, palpation.failed)
-            return
-        assert now.reading is not None
-        self._moves, self._wanted = self._moves + 1, palpation.ahead
-        self._asked, self._looked = None, 0
-        self._course.arm.hold(now.reading.q)
-        self._course.enter(Phase.LOOK, now.t, "the patient has moved: looking again")
 
     def _correct(self) -> None:
         """Tells where the skin lay in the strokes, now that all touches and images are in; not where the patient has moved."""

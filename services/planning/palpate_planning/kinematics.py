@@ -21,6 +21,8 @@ ELBOW = 3
 STRAIGHT_RAD = 0.2
 """An elbow that is bent by less is near its singularity: the arm reaches at most 4 mm further, less than what the skin may lie
 deeper than it was seen, and for each metre per second that the wall moves the elbow turns at 25 rad/s and more."""
+TOO_STRAIGHT_RAD = 0.15
+"""In contact it may come nearer, since the skin may lie deeper than it was seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +37,11 @@ class IkSolution:
     """Distance of the sphere's centre from the one asked for [m]."""
     error_rad: float
     """Angle of the orientation, or of the tool axis where spin is free, from the one asked for [rad]."""
+
+
+def stretched(q: Array, bend: float) -> bool:
+    """Whether the elbow is bent by less than `bend` [rad] at joint positions q [rad]."""
+    return bool(abs(q[ELBOW]) < bend)
 
 
 class ArmKinematics:
@@ -68,10 +75,6 @@ class ArmKinematics:
         """J with V_WI_W = J qd, rows linear then angular, world axes, of the sphere's centre, shape (6, 7)."""
         J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
-
-    def stretched(self, q: Array) -> bool:
-        """Whether the elbow is so straight at joint positions q [rad] that the arm is near the end of its reach."""
-        return bool(abs(q[ELBOW]) < STRAIGHT_RAD)
 
     def solve(
         self,

@@ -13,7 +13,7 @@ from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.descent import ALLOWANCE_M, SIGMAS, Descent
 from palpate_planning.recovery import MOVED_M, Recovery
-from palpate_planning.segments import HOVER_M, Segment
+from palpate_planning.segments import HOVER_M, STRETCHED, Segment
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.wall import TouchedSkin, Wall
 from palpate_planning.wall_watch import WallWatch
@@ -102,6 +102,8 @@ class Palpation:
         """Why the strokes end early, in good order; empty if they do not."""
         self.ahead: frozenset[int] = frozenset()
         """The targets that are then left."""
+        self.bend_needed = 0.0
+        """How far a plan must bend the elbow for the arm not to stretch in contact [rad]; 0 where strokes did not end by that."""
         self._motion = StrokeMotion(exam, limits, radius, period_s, wall)
         self._recovery = Recovery(exam, limits, period_s)
         self._descent = Descent(self._motion, exam.depth_m, period_s, strokes)
@@ -212,6 +214,7 @@ class Palpation:
         if contact.load > self._limits.force_soft_stop_n and self.stage in PRESSING:
             self._recovery.soft_stop(contact.load, self._motion.segment.path, self._motion.along.position)
             self._enter(StrokeStage.LIFT)
+        self._heed_the_elbow(contact)
         self._heed_the_wall(t, contact)
         if self.stage is StrokeStage.SLIDE:
             self._slide()
@@ -231,6 +234,12 @@ class Palpation:
             self._wait()
         self._motion.regulate(contact, in_contact=contact.touching and self.stage is not StrokeStage.LIFT)
         return self._report(t, contact, rate)
+
+    def _heed_the_elbow(self, contact: ContactMeasurement) -> None:
+        """Lifts off before the arm would have to stretch, and ends."""
+        if self.stage in PRESSING and self._motion.bend_ahead < (needed := self._motion.bend_needed(contact.q)):
+            self.bend_needed = needed
+            self.leave(STRETCHED)
 
     def _heed_the_wall(self, t: int, contact: ContactMeasurement) -> None:
         """Lifts off where the wall does what was not expected; that piece of the stroke is repeated."""
@@ -332,11 +341,13 @@ class Palpation:
     def _height(self, t: int) -> float:
         """How high to lift at `t` [ns]; in metres."""
         if self.failed or self.left or not self._watch.calm or self._number == len(self._segments) - 1:
-            return HOVER_M
+            return self._motion.free_height(t)
         if self._recovery.resume_at is not None:
             return HOP_M
         way, wall = self._segments[self._number + 1], self._motion.wall
-        return HOVER_M if way.free is not None else _clearance(wall.sigma(wall.perceived.xy(way.path.p[-1]), t))
+        if way.free is not None:
+            return self._motion.free_height(t)
+        return _clearance(wall.sigma(wall.perceived.xy(way.path.p[-1]), t))
 
     def _transfer(self, rate: float) -> None:
         motion, recovery = self._motion, self._recovery

@@ -9,6 +9,7 @@ from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
+from palpate_planning.kinematics import ELBOW, TOO_STRAIGHT_RAD
 from palpate_planning.path import ACCELERATION, PathPoint
 from palpate_planning.periods import SECOND
 from palpate_planning.segments import HOVER_M, Segment
@@ -109,6 +110,10 @@ class StrokeMotion:
         """Distance of the sphere's centre from the perceived surface at zero depth, at `t` [ns]; in metres."""
         return self._radius + self.wall.outward(self.point.p, t)
 
+    def free_height(self, t: int) -> float:
+        """Height [m] above the skin at `t` [ns] for free motions, which keep clear of where the skin was seen, too."""
+        return HOVER_M + max(0.0, -self.wall.outward(self.point.p, t))
+
     @property
     def ended(self) -> bool:
         """Whether the path has been followed to its end."""
@@ -118,6 +123,20 @@ class StrokeMotion:
     def stopping_distance(self) -> float:
         """Path length needed to come to rest [m]."""
         return self.along.velocity**2 / (2 * BRAKING * self._acceleration)
+
+    def bend_needed(self, q: Array) -> float:
+        """How far the plan must bend the elbow [rad] for it not to become too straight, with the arm at joint positions q [rad].
+
+        The square of the bend falls in proportion to how far the arm reaches. Where the skin lies deeper, or further off, than it
+        was seen, it is less than planned, and will be by as much on what is ahead.
+        """
+        lost = self.point.q[ELBOW] ** 2 - q[ELBOW] ** 2
+        return float(np.sqrt(max(TOO_STRAIGHT_RAD**2 + lost, 0.0)))
+
+    @property
+    def bend_ahead(self) -> float:
+        """How far the plan bends the elbow where the motion along the path can come to rest [rad]."""
+        return float(abs(self.segment.path.at(self.along.position + self.stopping_distance).q[ELBOW]))
 
     # --- one period of motion -----------------------------------------------------------------------------------------
 

@@ -10,6 +10,8 @@ from planning_fakes import PERIOD_S, World, hertz, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario import Mode, Robot
+from palpate_planning.kinematics import ELBOW, TOO_STRAIGHT_RAD
+from palpate_planning.segments import STRETCHED
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 
 
@@ -167,6 +169,18 @@ def test_targets_out_of_reach_are_skipped_counted_and_named() -> None:
     assert len(world.exam.skipped) == status.targets_skipped
     assert "reach" in next(iter(world.exam.skipped.values()))
     assert f"{status.targets_skipped} of {status.target_count} targets skipped" in status.message
+
+
+def test_an_arm_does_not_stretch_to_skin_that_lies_deeper_than_it_was_seen() -> None:
+    world = World(known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), offset=-0.02)
+    bend = []
+    while world.exam.status.end_tick < 0:
+        world.step()
+        bend.append(-world.q[ELBOW])
+    assert world.exam.status.phase is Phase.DONE
+    assert min(bend[500:]) > 0.75 * TOO_STRAIGHT_RAD, "after it has left home, and to the side to which it was planned"
+    assert STRETCHED in world.exam.skipped.values()
+    assert any(row[1] for row in world.rows), "it measured where it reaches"
 
 
 def test_no_target_in_reach_aborts() -> None:
