@@ -10,7 +10,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import resources
@@ -259,11 +259,31 @@ def main(
     for folder in folders:
         trace = trace_of(folder)
         groups[tuple(setting_of(trace.scenario).values())].append(trace)
-    rows = {_key(row): row for row in known_loops()} | {_key(row): row for row in map(loop_of, groups.values())}
-    text = yaml.safe_dump({"loops": [rows[key].model_dump(mode="json") for key in sorted(rows)]}, sort_keys=False, width=130)
+    try:
+        rows = renewed(known_loops(), [loop_of(traces) for traces in groups.values()])
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    text = yaml.safe_dump({"loops": [row.model_dump(mode="json") for row in rows]}, sort_keys=False, width=130)
     path = Path(str(resources.files("palpate.quick").joinpath("loop.yaml")))
     path.write_text(_HEADER + text, encoding="utf-8")
     print(f"{path}: {len(groups)} of {len(rows)} settings from {len(folders)} runs")
+
+
+def renewed(known: Iterable[LoopErrors], fitted: Iterable[LoopErrors]) -> list[LoopErrors]:
+    """The rows of loop.yaml with those that were fitted, in order.
+
+    Raises ValueError for a row of fewer examinations than the one that it would replace.
+    """
+    rows = {_key(row): row for row in known}
+    for row in fitted:
+        before = rows.get(_key(row))
+        if before is not None and row.examinations < before.examinations:
+            raise ValueError(
+                f"loop.yaml: the row {', '.join(_key(row))} is of {before.examinations} examinations, these are "
+                f"{row.examinations}: want at least as many; take the row out first if the loop has changed"
+            )
+        rows[_key(row)] = row
+    return [rows[key] for key in sorted(rows)]
 
 
 def _key(row: LoopErrors) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops
 from palpate.quick.examination import QuickExamination
 from palpate.quick.messages import collected
 from palpate.quick.patient import NoTissueError, Patient, Touch
+from palpate.quick.study import renewed
 from palpate_models.load import load_scenario
 from palpate_models.scenario import Scenario
 
@@ -152,3 +153,13 @@ def test_a_tissue_without_a_copy_is_refused() -> None:
     real = scenario(1).model_copy(update={"services": scenario(1).services.model_copy(update={"tissue": "none"})})
     with pytest.raises(NoTissueError, match=r"services\.tissue"):
         Patient(real)
+
+
+def test_a_row_of_the_loop_is_not_replaced_by_one_of_fewer_examinations() -> None:
+    rows = known_loops()
+    fewer = rows[0].model_copy(update={"examinations": rows[0].examinations - 1})
+    as_many = rows[0].model_copy(update={"begin_s": 12.0})
+    with pytest.raises(ValueError, match=f"is of {rows[0].examinations} examinations, these are {fewer.examinations}"):
+        renewed(rows, [fewer])
+    assert as_many in renewed(rows, [as_many])
+    assert len(renewed(rows, [as_many])) == len(rows)
