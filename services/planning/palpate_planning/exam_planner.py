@@ -106,6 +106,7 @@ class ExamPlanner:
             postures,
             known.robot.indenter_radius_m,
             exam.depth_m,
+            bend or STRAIGHT_RAD,
             lambda q0, q1: self._motion(free, q0, q1),
         )
         joined = scan_of(exam, perceived.surface.in_A).joined

@@ -236,8 +236,9 @@ class Palpation:
         return self._report(t, contact, rate)
 
     def _heed_the_elbow(self, contact: ContactMeasurement) -> None:
-        """Lifts off before the arm would have to stretch, and ends."""
-        if self.stage in PRESSING and self._motion.bend_ahead < (needed := self._motion.bend_needed(contact.q)):
+        """Lifts off before the arm would have to stretch, in a stroke or on the way to the next, and ends."""
+        followed = self.stage in PRESSING or (self.stage is StrokeStage.TRANSFER and self._motion.segment.free is None)
+        if followed and self._motion.bend_ahead < (needed := self._motion.bend_needed(contact.q)):
             self.bend_needed = needed
             self.leave(STRETCHED)
 

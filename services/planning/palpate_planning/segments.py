@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from palpate_models.frames import Array
 from palpate_planning.coverage import Stroke, transfer
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.kinematics import ArmKinematics, stretched
 from palpate_planning.motion_planning import NoPathError
 from palpate_planning.path import SurfacePath, lay
 from palpate_planning.poses import centre, least_twist, pose
@@ -74,11 +74,15 @@ class SegmentPlanner:
         postures: Array,
         radius: float,
         depth: float,
+        bend: float,
         free_motion: Callable[[Array, Array], JointTrajectory],
     ) -> None:
-        """`scene` lets the tool touch the abdomen; `free_motion(q0, q1)` plans without contact, or raises NoPathError."""
+        """`scene` lets the tool touch the abdomen; the elbow is bent by at least `bend` [rad], but on free motions.
+
+        `free_motion(q0, q1)` plans without contact, or raises NoPathError.
+        """
         self._kinematics, self._scene, self._surface = kinematics, scene, surface
-        self._postures, self._radius, self._depth, self._free_motion = postures, radius, depth, free_motion
+        self._postures, self._radius, self._depth, self._bend, self._free_motion = postures, radius, depth, bend, free_motion
         self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Troubles]] = {}
         self._hovers: dict[Place, Array | None] = {}
         self._ways: dict[tuple[Place, Place], tuple[Segment | None, str]] = {}
@@ -155,7 +159,7 @@ class SegmentPlanner:
         return self._ways[key]
 
     def _path(self, stroke: Stroke, depth: float) -> tuple[SurfacePath, Troubles]:
-        """A stroke with postures at `depth`, near those of its targets; and samples out of reach or in collision."""
+        """A stroke with postures at `depth`, near those of its targets; and samples that the arm cannot take."""
         s, p, n, R = lay(self._surface, stroke.xy, self._R_ref)
         centres = centre(p, n, self._radius, depth)
         known = self._postures[stroke.targets]
@@ -168,6 +172,8 @@ class SegmentPlanner:
             q[row] = solution.q
             if not solution.ok:
                 troubles.append((int(i), REACH))
+            elif stretched(solution.q, self._bend):
+                troubles.append((int(i), STRETCHED))
             elif not self._scene.free(solution.q):
                 troubles.append((int(i), f"the arm would collide: {', '.join(self._scene.collisions(solution.q))}"))
         between = np.asarray(CubicSpline(s[solved], q, bc_type="natural")(s)) if len(solved) > 1 else q
