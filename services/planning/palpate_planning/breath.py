@@ -43,6 +43,8 @@ class BreathObservation(NamedTuple):
     """Whether the patient lies elsewhere than when the surface was perceived."""
     shift_A: tuple[float, float] = (0.0, 0.0)
     """How far the patient lies from where the first look saw him, along the table in A [m]."""
+    seen: bool = True
+    """Whether enough of the wall is seen: the arm may hide it."""
 
 
 class Breath:
@@ -110,6 +112,11 @@ class Breath:
     def shift_A(self) -> Array:
         """How far the patient lies from where the first look saw him, along the table in A [m], shape (2,)."""
         return np.zeros(2) if self._motion is None else np.array(self._motion.shift_A)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether perception says that it does not see the wall."""
+        return self._motion is not None and not self._motion.seen
 
     @property
     def moved(self) -> bool:

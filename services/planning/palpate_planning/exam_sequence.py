@@ -16,10 +16,10 @@ from palpate_planning.contact import ContactSensing
 from palpate_planning.course import ExamCourse
 from palpate_planning.exam_planner import ExamPlan, ExamPlanner, PerceivedAbdomen
 from palpate_planning.free_motion import FreeMotion, TrajectoryFollower
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.kinematics import STRAIGHT_RAD, ArmKinematics
 from palpate_planning.look import look_postures
 from palpate_planning.motion_planning import NoPathError
-from palpate_planning.palpation import Palpation, PalpationStep, StrokeStage
+from palpate_planning.palpation import HIDES, Palpation, PalpationStep, StrokeStage
 from palpate_planning.path import compile_ahead
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.requests import PLANNING_TIME
@@ -34,8 +34,8 @@ from palpate_planning.wall import TouchedSkin, Wall, plane
 LOOKS_MAX = 3
 MOVES_MAX = 2
 """A patient who moves more often is not looked at again."""
-STRETCHES_MAX = 3
-"""An examination is not planned anew more often because the arm would stretch."""
+REPLANS_MAX = 3
+"""An examination is not planned anew more often because the arm would stretch, or hides the wall."""
 ELSEWHERE_M = 0.015
 """A wall that lies further from where an examination before saw it is another patient's, or he has moved since."""
 REST = 200 * MS
@@ -102,8 +102,8 @@ class ExamSequence:
         """How often the patient was looked at again, having moved."""
         self._bend: float | None = None
         """How far the elbow is bent, at least, in a plan that was made anew because it became too straight [rad]."""
-        self._stretches = 0
-        """How often that was."""
+        self._replans = 0
+        """How often the rest was planned anew."""
         self._wanted: frozenset[int] | None = None
         """The targets that were left then; None: all are wanted."""
         self._skipped: dict[int, str] = {}
@@ -207,7 +207,7 @@ class ExamSequence:
 
     def _give_up(self, now: Observation, why: str) -> None:
         """Ends an examination that cannot be planned; what was felt before, if anything was, is assessed all the same."""
-        if self._moves or self._stretches:
+        if self._moves or self._replans:
             self._course.go_home(now, "")
         else:
             self._course.abort(now, why)
@@ -274,17 +274,17 @@ class ExamSequence:
         return step.setpoint
 
     def _end_strokes(self, now: Observation, palpation: Palpation) -> None:
-        """Goes home; but where a patient has moved, or the arm would stretch, before all was felt, goes on with what is left."""
+        """Goes home; but where a patient has moved, or the arm would stretch or hides him, goes on with what is left."""
         assert now.reading is not None
         self._course.arm.hold(now.reading.q)
         if palpation.ahead and palpation.moved and self._moves < MOVES_MAX:
             self._moves, self._wanted = self._moves + 1, palpation.ahead
             self._asked, self._looked, self._bend = None, 0, None
             self._course.enter(Phase.LOOK, now.t, "the patient has moved: looking again")
-        elif palpation.ahead and palpation.bend_needed and self._stretches < STRETCHES_MAX:
-            self._stretches, self._wanted = self._stretches + 1, palpation.ahead
-            self._bend = max(self._bend or 0.0, palpation.bend_needed)
-            self._course.enter(Phase.PLAN, now.t, f"{STRETCHED}: planning anew")
+        elif palpation.ahead and palpation.left in (STRETCHED, HIDES) and self._replans < REPLANS_MAX:
+            self._replans, self._wanted = self._replans + 1, palpation.ahead
+            self._bend = max(self._bend or STRAIGHT_RAD, palpation.bend_needed)
+            self._course.enter(Phase.PLAN, now.t, f"{palpation.left}: planning anew")
         else:
             self._correct()
             self._course.go_home(now, palpation.failed)

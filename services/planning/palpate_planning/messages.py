@@ -64,10 +64,10 @@ def path_message(t: int, poses_WI: Array) -> Message:
 
 def motion_of(message: Message) -> BreathObservation:
     """The motion in a `palpation_msgs/SurfaceMotion`. While the wall is hidden the forecast goes on, as long as it is good."""
-    hidden = message.state == SurfaceMotion.LOST and message.uncertainty < HIDDEN_M
-    calm = message.state == SurfaceMotion.QUIET or hidden
+    seen = bool(message.state != SurfaceMotion.LOST)
+    calm = message.state == SurfaceMotion.QUIET or (not seen and message.uncertainty < HIDDEN_M)
     moved = bool(message.state == SurfaceMotion.MOVED)
     shift = (float(message.shift.x), float(message.shift.y))
     return BreathObservation(
-        nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved, shift
+        nanoseconds(message.header.stamp), np.asarray(message.forecast), float(message.uncertainty), calm, moved, shift, seen
     )

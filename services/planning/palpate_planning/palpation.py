@@ -33,6 +33,8 @@ STEADY_FRACTION = 0.5
 """Samples count from this part of the path's speed on."""
 STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
+HIDES = "the arm hides the wall from the camera"
+"""Why strokes end where the arm stays in the camera's way: that stroke is passed over."""
 UNNOTICED_M = 0.03
 """So much of the stroke before a patient was seen to have moved does not count: it is noticed after a second."""
 REPEAT_M = 0.010
@@ -160,18 +162,22 @@ class Palpation:
             self._enter(StrokeStage.LIFT)
 
     def leave(self, why: str) -> None:
-        """Lifts off and ends, in good order: what is left of the plan counts as skipped."""
+        """Lifts off and ends, in good order: what is left of the plan counts as skipped.
+
+        What is left of a stroke in which the arm hides the wall is not `ahead`: it would be hidden there again.
+        """
         if self.left or self.stage is StrokeStage.DONE:
             return
         self.left = why
         strokes = [s.path for s in self._segments[self._number + 1 :] if s.contact and not s.touch]
-        ahead = [int(i) for path in strokes for i in path.targets]
+        later = [int(i) for path in strokes for i in path.targets]
+        ahead = list(later)
         path = self._motion.segment.path
         if self._motion.segment.contact and not self._motion.segment.touch:
             behind = UNNOTICED_M if self._watch.moved else 0.0
             ahead += [int(i) for i in path.targets[path.visits > self._motion.along.position - behind]]
-        self.ahead = frozenset(ahead)
-        self._recovery.skipped |= dict.fromkeys(self.ahead, why)
+        self._recovery.skipped |= dict.fromkeys(ahead, why)
+        self.ahead = frozenset(later if why == HIDES else ahead)
         if self.stage is not StrokeStage.LIFT:
             self._enter(StrokeStage.LIFT)
 
@@ -246,7 +252,9 @@ class Palpation:
         """Lifts off where the wall does what was not expected; that piece of the stroke is repeated."""
         sliding = self.stage is StrokeStage.SLIDE
         self._watch.step(t, adrift=sliding and not contact.touching)
-        if self._watch.ended:
+        if self._watch.hidden:
+            self.leave(HIDES)
+        elif self._watch.ended:
             self.leave(self._watch.ended)
         elif self._watch.spoiled and self.stage in PRESSING:
             back = REPEAT_M if sliding else 0.0

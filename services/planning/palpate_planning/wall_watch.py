@@ -9,6 +9,9 @@ CALM_S = 1.0
 """After a cough or a deep breath the skin is left alone until the wall has been followed well for so long."""
 CALM_PATIENCE_S = 60.0
 """A wall that cannot be followed for so long ends the strokes."""
+HIDDEN_MAX_S = 5.0
+"""An arm that hides the wall from the camera for so long, and no longer knows how it breathes, goes elsewhere. A deep breath or a
+cough, after which nothing may be seen either, is over by then."""
 LOST_S = 0.3
 """Without contact at depth for so long, the wall is not where it was touched: it is touched anew."""
 LOST_MAX = 5
@@ -22,8 +25,9 @@ class WallWatch:
 
     def __init__(self, breath: Breath, following: Following, period_s: float) -> None:
         self._breath, self._gated, self._period_s = breath, following is Following.GATE, period_s
-        self._calm_for, self._restless_for, self._adrift_for = CALM_S, 0.0, 0.0
-        """For how long the wall was followed well, for how long it was not, for how long there was no contact at depth [s]."""
+        self._calm_for, self._restless_for, self._adrift_for, self._hidden_for = CALM_S, 0.0, 0.0, 0.0
+        """For how long the wall was followed well, for how long it was not, for how long there was no contact at depth, and for
+        how long it was not followed because it was not seen [s]."""
         self._losses = 0
         self.spoiled = False
         """Whether what is measured now is worth nothing: the indenter has to lift off."""
@@ -39,11 +43,17 @@ class WallWatch:
         """Whether the wall has been followed well for long enough to touch it."""
         return self._calm_for >= CALM_S
 
+    @property
+    def hidden(self) -> bool:
+        """Whether the wall has been hidden for too long to wait where the arm is."""
+        return self._hidden_for > HIDDEN_MAX_S
+
     def step(self, t: int, *, adrift: bool) -> None:
         """Judges the moment `t` [ns]; `adrift`: at depth, and yet nothing is felt."""
         breath, dt = self._breath, self._period_s
         calm = breath.calm(t)
         self._calm_for, self._restless_for = (self._calm_for + dt, 0.0) if calm else (0.0, self._restless_for + dt)
+        self._hidden_for = self._hidden_for + dt if breath.hidden and not calm else 0.0
         self._adrift_for = self._adrift_for + dt if adrift else 0.0
         lost = self._adrift_for > LOST_S
         if lost:

@@ -92,6 +92,8 @@ class World:
         self.excursion = excursion
         self.calm, self.moved, self.shift_A = True, False, (0.0, 0.0)
         """What is said about the motion; a look finds the patient where he is now."""
+        self.hides: Callable[[Array], bool] = lambda p_WI: False
+        """Whether the arm hides the wall with the indenter at a place [m]: nothing is known of the breath then."""
         self.misled = 0.0
         """Forecasts err by so much [m], one outward and the next inward."""
         self.settings, self.force = settings, force or hertz(2.4)
@@ -172,7 +174,8 @@ class World:
         stamp = self.t - 100 * MS
         forecast = np.array([self.excursion((stamp + k * FORECAST_STEP) / SECOND) for k in range(11)])
         forecast += self.misled if self.t % (200 * MS) else -self.misled
-        return BreathObservation(stamp, forecast, 3e-4, self.calm, self.moved, self.shift_A)
+        seen = not self.hides(self.kinematics.pose(self.q)[:3, 3])
+        return BreathObservation(stamp, forecast, 3e-4, self.calm and seen, self.moved, self.shift_A, seen)
 
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
         """Steps until the exam has ended (or `until`), at most `seconds` of simulated time."""

@@ -11,6 +11,7 @@ from planning_fakes import PERIOD_S, World, hertz, known
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario import Mode, Robot
 from palpate_planning.kinematics import ELBOW, TOO_STRAIGHT_RAD
+from palpate_planning.palpation import HIDES
 from palpate_planning.segments import STRETCHED
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 
@@ -181,6 +182,19 @@ def test_an_arm_does_not_stretch_to_skin_that_lies_deeper_than_it_was_seen() -> 
     assert min(bend[500:]) > 0.75 * TOO_STRAIGHT_RAD, "after it has left home, and to the side to which it was planned"
     assert STRETCHED in world.exam.skipped.values()
     assert any(row[1] for row in world.rows), "it measured where it reaches"
+
+
+def test_an_arm_that_hides_the_wall_passes_over_that_stroke_and_goes_on() -> None:
+    world = World(known(pattern="raster", region_m=(0.05, 0.05)), excursion=lambda t: 0.0)
+    lines = np.unique(np.round(world.dome.positions[:, 1], 4))
+    world.hides = lambda p_WI: bool(abs(p_WI[1] - lines[1]) < 0.005 and p_WI[0] > np.median(world.dome.positions[:, 0]))
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    passed_over = list(world.exam.skipped)
+    assert set(world.exam.skipped.values()) == {HIDES}
+    assert 1 <= len(passed_over) <= len(world.dome.positions) / len(lines), "what is left of that line"
+    assert np.abs(world.dome.positions[passed_over, 1] - lines[1]).max() < 0.005
+    assert world.t < 60 * 1_000_000_000, "it did not wait there"
 
 
 def test_no_target_in_reach_aborts() -> None:
