@@ -26,7 +26,9 @@ from palpate_models.frames import Array
 
 RADII_M = (0.008, 0.012, 0.018, 0.026, 0.036)
 PITCH_M = 0.01
-"""Radii and distance of the bumps that are tried, before place and radius are found to the tenth of a millimetre."""
+"""Radii and distance of the bumps that are tried, before place, radius and edge are found to the tenth of a millimetre."""
+EDGES_M = (0.006, 0.016)
+"""A lump is felt with the edge of the indenter's footprint, or with a wider one where tissue between spreads the pressure."""
 MOST = 4
 """So many lumps are sought."""
 WEAKEST = 3.0
@@ -132,20 +134,21 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
     first = bumps[int(np.argmax(np.abs(t)))]
 
     def loss(p: Array) -> float:
-        _, strength = matched(regression, [Bump(p[0], p[1], float(np.exp(p[2])))])
+        _, strength = matched(regression, [Bump(p[0], p[1], *np.exp(p[2:]))])
         return -abs(float(strength[0]))
 
-    start = np.array((first.x, first.y, np.log(first.radius)))
-    simplex = start + np.vstack((np.zeros(3), np.diag((0.004, 0.004, 0.25))))
-    edge = Bounds((*low, np.log(RADII_M[0])), (*high, np.log(RADII_M[-1] * 1.3)))
+    start = np.array((first.x, first.y, np.log(first.radius), np.log(first.edge)))
+    simplex = start + np.vstack((np.zeros(4), np.diag((0.004, 0.004, 0.25, 0.4))))
+    narrowest, widest = np.log((RADII_M[0], EDGES_M[0])), np.log((RADII_M[-1] * 1.3, EDGES_M[1]))
+    limits = Bounds((*low, *narrowest), (*high, *widest))
     best = minimize(
         loss,
         start,
         method="Nelder-Mead",
-        bounds=edge,
-        options={"initial_simplex": simplex, "maxfev": 40, "xatol": 1e-4, "fatol": 1e-2},
+        bounds=limits,
+        options={"initial_simplex": simplex, "maxfev": 60, "xatol": 1e-4, "fatol": 1e-2},
     )
-    bump = Bump(float(best.x[0]), float(best.x[1]), float(np.exp(best.x[2])))
+    bump = Bump(float(best.x[0]), float(best.x[1]), *map(float, np.exp(best.x[2:])))
     return bump, -float(best.fun)
 
 

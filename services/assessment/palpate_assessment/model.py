@@ -66,7 +66,7 @@ _SURE, _UNSURE = 0.7, 1.2
 _FITTED, _FIRST_STEPS, _STEPS = 250, 20, 6
 """So many samples are enough for the amplitudes, and so many steps from their medians, and from those before."""
 EDGE_M = 0.007
-"""Standard deviation of the edge with which a lump is felt: the indenter's footprint."""
+"""Standard deviation of the edge with which a lump at the skin is felt: the indenter's footprint."""
 LUMP_SD, LUMP_FREE_SD, LUMP_FREE_M = 1.0, 0.25, 0.012
 """Prior of a lump's log-contrast; and how it may differ from the ideal shape, and over which length."""
 
@@ -221,7 +221,7 @@ class Regression:
         seen = self.whiten(self.healthy_covariance(o.xy, xy) + self.lump_covariance(o.xy, xy))
         variances = np.exp(2 * self.log_amplitudes[: len(LENGTHS_M) + 2])
         prior = LEVEL_SD**2 + variances[:-1].sum() + variances[-1] * bone(xy) ** 2
-        prior = prior + sum((LUMP_SD * lump(xy)) ** 2 + (LUMP_FREE_SD * lump(xy, 2 * EDGE_M)) ** 2 for lump in self.lumps)
+        prior = prior + sum((LUMP_SD * lump(xy)) ** 2 + (LUMP_FREE_SD * lump(xy, 2 * lump.edge)) ** 2 for lump in self.lumps)
         variance = np.maximum(prior - (seen**2).sum(axis=0), 1e-8) + self.calibration.conversion_sd**2 + SLIDE_SD**2
         if self.lumps:
             variance += (UNLIKE * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2

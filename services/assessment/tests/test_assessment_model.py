@@ -10,7 +10,7 @@ from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted, pieces
-from palpate_assessment.detection import Candidate, agreed, matched
+from palpate_assessment.detection import Candidate, agreed, matched, strongest
 from palpate_assessment.guarding import Signs
 from palpate_assessment.model import ILIAC_M, LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
@@ -51,6 +51,18 @@ def test_the_matched_filter_reads_a_bump_without_bias() -> None:
     (log_contrast,), (t,) = matched(Regression(o, learned(), (), usual_amplitudes(o)), [bump])
     assert log_contrast == pytest.approx(0.4, abs=0.05)
     assert t > 3
+
+
+@pytest.mark.parametrize("edge", [0.007, 0.013])
+def test_the_edge_with_which_a_lump_is_felt_is_found(edge: float) -> None:
+    lump = Bump(0.005, -0.01, 0.02, edge)
+    o = observe(lines(lambda xy: LEVEL + 0.8 * lump(xy), noise=0.01), learned())
+    assert o is not None
+    found, t = strongest(Regression(o, learned(), (), usual_amplitudes(o)))
+    assert found is not None
+    assert found.edge == pytest.approx(edge, rel=0.2)
+    assert found.radius == pytest.approx(lump.radius, rel=0.15)
+    assert t > 5
 
 
 def test_what_one_stroke_alone_says_is_not_believed() -> None:
