@@ -20,14 +20,14 @@ from scipy.spatial import cKDTree
 
 from palpate_assessment.calibration import Calibration
 from palpate_assessment.guarding import Signs, signs
-from palpate_assessment.model import Bump, Regression, amplitudes, bone
+from palpate_assessment.model import EDGE_M, Bump, Regression, amplitudes, bone
 from palpate_assessment.observations import FEWEST, Observations
 from palpate_models.frames import Array
 
 RADII_M = (0.008, 0.012, 0.018, 0.026, 0.036)
 PITCH_M = 0.01
 """Radii and distance of the bumps that are tried, before place, radius and edge are found to the tenth of a millimetre."""
-EDGES_M = (0.006, 0.016)
+EDGES_M = (EDGE_M, 0.016)
 """A lump is felt with the edge of the indenter's footprint, or with a wider one where tissue between spreads the pressure."""
 MOST = 4
 """So many lumps are sought."""
@@ -138,7 +138,7 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
         return -abs(float(strength[0]))
 
     start = np.array((first.x, first.y, np.log(first.radius), np.log(first.edge)))
-    simplex = start + np.vstack((np.zeros(4), np.diag((0.004, 0.004, 0.25, 0.4))))
+    simplex = start + np.vstack((np.zeros(4), np.diag((0.004, 0.004, 0.25, 0.3))))
     narrowest, widest = np.log((RADII_M[0], EDGES_M[0])), np.log((RADII_M[-1] * 1.3, EDGES_M[1]))
     limits = Bounds((*low, *narrowest), (*high, *widest))
     best = minimize(
