@@ -251,7 +251,8 @@ class Palpation:
     def _heed_the_wall(self, t: int, contact: ContactMeasurement) -> None:
         """Lifts off where the wall does what was not expected; that piece of the stroke is repeated."""
         sliding = self.stage is StrokeStage.SLIDE
-        self._watch.step(t, adrift=sliding and not contact.touching)
+        adrift, leaving = sliding and not contact.touching, self._motion.segment.free is not None
+        self._watch.step(t, adrift=adrift, leaving=leaving)
         if self._watch.hidden:
             self.leave(HIDES)
         elif self._watch.ended:

@@ -48,12 +48,12 @@ class WallWatch:
         """Whether the wall has been hidden for too long to wait where the arm is."""
         return self._hidden_for > HIDDEN_MAX_S
 
-    def step(self, t: int, *, adrift: bool) -> None:
-        """Judges the moment `t` [ns]; `adrift`: at depth, and yet nothing is felt."""
+    def step(self, t: int, *, adrift: bool, leaving: bool = False) -> None:
+        """Judges the moment `t` [ns]; `adrift`: at depth, and yet nothing is felt; `leaving`: the arm is on a free motion."""
         breath, dt = self._breath, self._period_s
         calm = breath.calm(t)
         self._calm_for, self._restless_for = (self._calm_for + dt, 0.0) if calm else (0.0, self._restless_for + dt)
-        self._hidden_for = self._hidden_for + dt if breath.hidden and not calm else 0.0
+        self._hidden_for = self._hidden_for + dt if breath.hidden and not calm and not leaving else 0.0
         self._adrift_for = self._adrift_for + dt if adrift else 0.0
         lost = self._adrift_for > LOST_S
         if lost:

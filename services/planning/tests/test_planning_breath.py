@@ -16,7 +16,7 @@ from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.recovery import REPEATS_MAX
 from palpate_planning.status import PerceptionFailure, Phase
-from palpate_planning.wall_watch import CALM_S, LOST_MAX, LOST_S, WallWatch
+from palpate_planning.wall_watch import CALM_S, HIDDEN_MAX_S, LOST_MAX, LOST_S, WallWatch
 
 DT = 0.01
 
@@ -82,6 +82,16 @@ def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
         steps += 1
     assert losses == LOST_MAX
     assert steps * DT == pytest.approx(LOST_MAX * LOST_S, rel=0.05)
+
+
+def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> None:
+    breath = Breath()
+    watch = WallWatch(breath, Following.FOLLOW, DT)
+    breath.hear(motion(0, 0.0, calm=False)._replace(seen=False), 0)
+    for leaving, hidden in ((True, False), (False, True), (True, False)):
+        for _ in range(round(1.1 * HIDDEN_MAX_S / DT)):
+            watch.step(0, adrift=False, leaving=leaving)
+        assert watch.hidden is hidden
 
 
 def test_gated_samples_are_those_of_the_end_of_expiration() -> None:
