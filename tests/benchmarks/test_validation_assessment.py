@@ -9,7 +9,7 @@ from palpate_assessment.calibration import learned
 from palpate_assessment.detection import FEATURES
 from palpate_validation.assessment_calibration import WeighedPatient, fitted, slope
 
-TRUE = np.array((-4.0, 1.0, 0.2, 0.0, -0.5, -1.0))
+TRUE = np.array((-4.0, 1.0, 0.2, 0.0, -0.5, -0.5, -1.0))
 """Constant and weights of the features by which lumps are drawn here."""
 
 
@@ -18,9 +18,9 @@ def population(number: int, seed: int) -> list[WeighedPatient]:
     rng = np.random.default_rng(seed)
     found = []
     for k in range(number):
-        features = rng.normal((3.5, 0.0, 0.0, 0.5, 0.1), (1.2, 1.0, 0.5, 0.5, 0.2), (3, len(FEATURES)))
+        features = rng.normal((3.5, 0.0, 0.0, 0.3, 0.5, 0.1), (1.2, 1.0, 0.5, 0.3, 0.5, 0.2), (3, len(FEATURES)))
         real = rng.random(3) < expit(TRUE[0] + features @ TRUE[1:])
-        found.append(WeighedPatient(k, features.tolist(), real.tolist(), 2.0 if real.any() else 1.0, 0.02, 0.9))
+        found.append(WeighedPatient(k, features.tolist(), real.tolist(), 2.0 if real.any() else 1.0, 0.02))
     return found
 
 

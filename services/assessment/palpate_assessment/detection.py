@@ -40,9 +40,10 @@ _BORDER_M = 0.010
 
 FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
-FEATURES = ("strength", "beyond", "log-radius", "softer", "bone")
-"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, sign, and how
-much of its strength is bone's under it, which is felt as a lump is: where bone may just lie, a lump is the likelier one."""
+FEATURES = ("strength", "beyond", "log-radius", "log-radius squared", "softer", "bone")
+"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, how far that
+is from what is usual for one, sign, and how much of its strength is bone's under it, which is felt as a lump is: where bone may
+just lie, a lump is the likelier one."""
 ALIKE, HALF = 1.5, 0.5
 """Where two strokes over a lump say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
 bump is so high."""
@@ -67,7 +68,7 @@ class Candidate:
         """The FEATURES, shape (f,)."""
         size = np.log(self.bump.radius / RADII_M[2])
         under = float(bone(np.array([[self.bump.x, self.bump.y]]))[0])
-        return np.array((abs(self.t), self.beyond, size, float(self.log_contrast < 0), under**2 * abs(self.t)))
+        return np.array((abs(self.t), self.beyond, size, size**2, float(self.log_contrast < 0), under**2 * abs(self.t)))
 
     @property
     def beyond(self) -> float:
@@ -146,7 +147,7 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
         start,
         method="Nelder-Mead",
         bounds=limits,
-        options={"initial_simplex": simplex, "maxfev": 60, "xatol": 1e-4, "fatol": 1e-2},
+        options={"initial_simplex": simplex, "maxfev": 120, "xatol": 1e-4, "fatol": 1e-2},
     )
     bump = Bump(float(best.x[0]), float(best.x[1]), *map(float, np.exp(best.x[2:])))
     return bump, -float(best.fun)
