@@ -36,7 +36,8 @@ from palpate.study.statistics.estimate import LEVEL, Estimate
 from palpate.truth.felt import PALPABLE
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, learned
-from palpate_assessment.detection import FEATURES, FELT, Candidate
+from palpate_assessment.detection import FEATURES, FELT, SURE, Candidate
+from palpate_assessment.findings import causes
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
 from palpate_models.frames import Array
@@ -48,6 +49,8 @@ Mask = NDArray[np.bool_]
 _TAIL: Final = 0.25
 """Part of the healthy examinations that the tail is fitted to."""
 _RIDGE: Final = 0.1
+NONE: Final = -20.0
+"""Logit of a patient in whom nothing was weighed."""
 CLASSES: Final = ((1.05, 1.3), (1.3, 1.5), (1.5, 2.0), (2.0, 20.0))
 """Felt contrasts by which lumps are told apart."""
 WIDE_M: Final = 0.015
@@ -60,7 +63,9 @@ class WeighedPatient:
 
     seed: int
     features: list[list[float]]
-    """Of the candidates."""
+    """Of the candidates that are weighed."""
+    signs: list[list[float]]
+    """Of muscles about them."""
     real: list[bool]
     """Whether each is a lump of felt contrast FELT or more."""
     contrast: float
@@ -92,12 +97,13 @@ def weigh(seed: int) -> WeighedPatient:
     judged = None if observations is None else weigh_all(observations, calibration)
     assert known is not None
     assert judged is not None
-    _, candidates, _ = judged
+    candidates = [candidate for candidate in judged[1] if candidate.beyond > -SURE]
     palpable = [lump for lump in known.felt.lumps if lump.palpable]
 
     return WeighedPatient(
         seed=seed,
         features=[candidate.features.tolist() for candidate in candidates],
+        signs=[candidate.signs.features.tolist() for candidate in candidates],
         real=[real(candidate, known) for candidate in candidates],
         contrast=max((float(np.exp(abs(np.log(lump.contrast)))) for lump in palpable), default=1.0),
         radius_m=max((float(np.sqrt(lump.area / np.pi)) for lump in palpable), default=0.0),
@@ -114,7 +120,10 @@ def real(candidate: Candidate, known: Truth) -> bool:
 
 
 def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration:
-    """The calibration with probabilities and operating point of the cases: logistic regression, and an exponential tail."""
+    """The calibration with probabilities and operating point of the cases: logistic regression, and an exponential tail.
+
+    The regression is of a lump against all else, the tail of what is reported, with muscles among what else it may be.
+    """
     features, real = _every(cases)
 
     def loss(w: Array) -> float:
@@ -123,7 +132,7 @@ def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration
 
     weights = minimize(loss, np.zeros(features.shape[1] + 1), method="BFGS").x
     new = calibration.model_copy(update={"probability": tuple(np.round(weights, 3).tolist())})
-    greatest = np.sort([_greatest(c, new) for c in cases if c.contrast < 1 + PALPABLE])
+    greatest = np.sort([reported(c, new).max(initial=NONE) for c in cases if c.contrast < 1 + PALPABLE])
     tail = greatest[-round(_TAIL * len(greatest)) :]
     scale = max(float(tail.mean() - tail[0]), 0.1)
     location = float(tail[0]) + scale * float(np.log(_TAIL))
@@ -136,14 +145,15 @@ def _every(cases: list[WeighedPatient]) -> tuple[Array, Mask]:
     return rows, np.array([r for c in cases for r in c.real], dtype=bool)
 
 
-def _greatest(case: WeighedPatient, calibration: Calibration) -> float:
-    return float(calibration.logit(np.array(case.features)).max()) if case.features else -20.0
+def reported(case: WeighedPatient, calibration: Calibration) -> Array:
+    """Logits of the probabilities that the assessment reports of a patient's candidates, shape (k,)."""
+    return causes(calibration, np.array(case.features).reshape(-1, len(FEATURES)), np.array(case.signs).reshape(-1, 2))[0]
 
 
 def told(cases: list[WeighedPatient], calibration: Calibration, false_findings: float = 0.02) -> None:
     """Prints what the calibration makes of cases, with 95 % intervals."""
     threshold = calibration.threshold(false_findings)
-    logits = [calibration.logit(np.array(c.features).reshape(-1, len(FEATURES))) for c in cases]
+    logits = [reported(c, calibration) for c in cases]
     print(f"{len(cases)} patients, seeds {cases[0].seed} to {cases[-1].seed}; threshold: probability {expit(threshold):.3f}")
     healthy = [bool((q >= threshold).any()) for q, c in zip(logits, cases, strict=True) if c.contrast < 1 + PALPABLE]
     print(f"healthy with a finding: {_part(healthy)}")

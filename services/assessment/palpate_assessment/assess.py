@@ -20,8 +20,6 @@ from palpate_assessment.observations import FEWEST, Observations, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_models.frames import Array
 
-Mask = NDArray[np.bool_]
-
 _MOST_CONTRADICTED = 0.3
 """When more than this part of the samples contradicts the rest, it is not known which of them is right: all stay in."""
 

@@ -26,7 +26,8 @@ from palpate_models.frames import Array
 
 RADII_M = (0.008, 0.012, 0.018, 0.026, 0.036)
 PITCH_M = 0.01
-"""Radii and distance of the bumps that are tried, before place, radius and edge are found to the tenth of a millimetre."""
+"""Radii and distance of the bumps that are tried, before place, radius and edge of the strongest are found by TRIES more."""
+TRIES = 120
 EDGES_M = (EDGE_M, 0.016)
 """A lump is felt with the edge of the indenter's footprint, or with a wider one where tissue between spreads the pressure."""
 MOST = 4
@@ -44,9 +45,10 @@ FEATURES = ("strength", "beyond", "log-radius", "log-radius squared", "softer", 
 """What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, how far that
 is from what is usual for one, sign, and how much of its strength is bone's under it, which is felt as a lump is: where bone may
 just lie, a lump is the likelier one."""
+BEYOND, SOFTER = FEATURES.index("beyond"), FEATURES.index("softer")
 ALIKE, HALF = 1.5, 0.5
 """Where two strokes over a lump say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
-bump is so high."""
+bump is more than this part of the highest that any sample has: its centre may lie beyond the samples."""
 SURE = 4.0
 """So many standard deviations below FELT a contrast is surely none: 0 of 35 such candidates of tuning patients were lumps."""
 
@@ -110,13 +112,16 @@ def agreed(regression: Regression, lump: Bump, t: float) -> float:
     """The strength `t` of a lump, at most ALIKE times what is left of it without the stroke that says it most.
 
     A hiccup, or a breath that was followed too late, is a few millimetres for a second: three centimetres of one stroke. Such
-    errors are rarer and greater than Gaussian ones, so that what one stroke alone says is not believed.
+    errors are rarer and greater than Gaussian ones, so that what one stroke alone says is not believed, unless there is no other.
     """
     o = regression.observations
-    crossing = np.unique(o.stroke[lump(o.xy) > HALF])
+    if np.ptp(o.stroke) == 0:
+        return t
+    height = lump(o.xy)
+    crossing = np.unique(o.stroke[height > HALF * height.max()])
     others = [np.flatnonzero(o.stroke != stroke) for stroke in crossing]
     rests = [matched(replace(regression, observations=o.part(rest)), [lump])[1] for rest in others if len(rest) >= FEWEST]
-    left = min((float(np.sign(t) * rest[0]) for rest in rests), default=abs(t))
+    left = min((float(np.sign(t) * rest[0]) for rest in rests), default=0.0)
     return float(np.sign(t)) * min(abs(t), ALIKE * max(left, 0.0))
 
 
@@ -135,8 +140,8 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
     first = bumps[int(np.argmax(np.abs(t)))]
 
     def loss(p: Array) -> float:
-        _, strength = matched(regression, [Bump(p[0], p[1], *np.exp(p[2:]))])
-        return -abs(float(strength[0]))
+        bump = Bump(p[0], p[1], *np.exp(p[2:]))
+        return -abs(float(matched(regression, [bump])[1][0])) if _free(bump, regression.lumps) else 0.0
 
     start = np.array((first.x, first.y, np.log(first.radius), np.log(first.edge)))
     simplex = start + np.vstack((np.zeros(4), np.diag((0.004, 0.004, 0.25, 0.3))))
@@ -147,7 +152,7 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
         start,
         method="Nelder-Mead",
         bounds=limits,
-        options={"initial_simplex": simplex, "maxfev": 120, "xatol": 1e-4, "fatol": 1e-2},
+        options={"initial_simplex": simplex, "maxfev": TRIES, "xatol": 1e-4, "fatol": 1e-2},
     )
     bump = Bump(float(best.x[0]), float(best.x[1]), *map(float, np.exp(best.x[2:])))
     return bump, -float(best.fun)

@@ -11,7 +11,7 @@ from scipy.ndimage import label
 from scipy.special import expit
 
 from palpate_assessment.calibration import Calibration
-from palpate_assessment.detection import SURE, Candidate
+from palpate_assessment.detection import SOFTER, SURE, Candidate
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import UNLIKE, Regression
 from palpate_models.frames import Array
@@ -57,7 +57,8 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
     candidates = [candidate for candidate in candidates if candidate.beyond > -SURE]
     if not candidates:
         return []
-    logits, guarding = causes(regression.calibration, candidates)
+    features, signs = np.array([c.features for c in candidates]), np.array([c.signs.features for c in candidates])
+    logits, guarding = causes(regression.calibration, features, signs)
     found: list[Area] = []
     for index in np.argsort(-logits):
         if expit(logits[index]) < WEIGHED:
@@ -68,14 +69,14 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
     return found
 
 
-def causes(calibration: Calibration, candidates: Sequence[Candidate]) -> tuple[Array, Array]:
-    """The logit that each is a lump, and the probability that it is a tensed muscle, shape (k,) each.
+def causes(calibration: Calibration, features: Array, signs: Array) -> tuple[Array, Array]:
+    """The logit that each candidate is a lump, and the probability that it is a tensed muscle, shape (k,) each.
 
-    Three causes compete, of weights exp(l) a lump, exp(g) a muscle, 1 neither. A muscle that is tensed is never softer.
+    `features`, `signs`: of candidates and of muscles about them, shapes (k, f) and (k, 2). Three causes compete, of weights
+    exp(l) a lump, exp(g) a muscle, 1 neither. A muscle that is tensed is never softer.
     """
-    lump = calibration.logit(np.array([c.features for c in candidates]))
-    muscle = calibration.muscle(np.array([c.signs.features for c in candidates]))
-    muscle[[c.log_contrast < 0 for c in candidates]] = -np.inf
+    lump = calibration.logit(features)
+    muscle = np.where(features[:, SOFTER] > 0, -np.inf, calibration.muscle(signs))
     return lump - np.logaddexp(0, muscle), np.exp(muscle - np.logaddexp(np.logaddexp(0, lump), muscle))
 
 

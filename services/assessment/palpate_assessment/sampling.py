@@ -82,25 +82,26 @@ class Sampler:
 
     def add(self, state: ContactState) -> ForceSample | None:
         """Takes the next state; returns the sample that it completes, if any."""
-        sample = None
-        if state.in_contact:
-            if self._onset is None:
-                self._onset = state.time
-        else:
-            self._onset = None
-        if state.in_contact and state.counts:
-            self._block.append(state)
-            first = self._block[0]
-            way = state.position - first.position
-            if sqrt(way.dot(way)) >= self._travel or state.time - first.time >= LONGEST:
-                sample = self._average()
-        else:
-            sample = self._average()
-        return sample
+        if not state.in_contact:
+            sample, self._onset = self._average(), None
+            return sample
+        if self._onset is None:
+            self._onset = state.time
+        if not state.counts:
+            return self._average()
+        self._block.append(state)
+        first = self._block[0]
+        way = state.position - first.position
+        complete = sqrt(way.dot(way)) >= self._travel or state.time - first.time >= LONGEST
+        return self._average() if complete else None
+
+    def forget(self) -> None:
+        """Forgets the states of a sample that is not complete, and the touch."""
+        self._block, self._onset = [], None
 
     def _average(self) -> ForceSample | None:
         block, self._block = self._block, []
-        if len(block) < _FEWEST:
+        if len(block) < _FEWEST or self._onset is None:
             return None
         time = np.array([s.time for s in block])
         position = np.array([s.position for s in block])
@@ -121,7 +122,7 @@ class Sampler:
             depth=float(depth.mean()),
             force=float(force.mean()),
             force_noise=float(np.sqrt(rest @ rest / max(len(block) - 2, 1) / len(block))),
-            time_in_contact=float(time.mean()) - (self._onset if self._onset is not None else float(time[0])),
+            time_in_contact=float(time.mean()) - self._onset,
             force_limited=any(s.force_limited for s in block),
             stroke=block[0].stroke,
             depth_uncertainty=max(s.depth_uncertainty for s in block),

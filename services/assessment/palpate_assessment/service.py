@@ -168,6 +168,7 @@ class AssessmentService(Service):
         if self._moved_at is None:
             self._moved_at = t
             self._breath.forget()
+            self._sampler.forget()
             self.samples = [sample for sample in self.samples if sample.time < t - NOTICED_S]
 
     def _due(self, t: int) -> bool:

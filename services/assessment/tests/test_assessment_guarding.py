@@ -51,8 +51,11 @@ def test_lump_muscle_and_neither_compete() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     stiff, soft = (Candidate(bump, e, 6.0, Signs(0.8, 0.2)) for e in (0.5, -0.5))
     alone = replace(stiff, signs=Signs(0.0, -0.1))
-    logits, guarding = causes(learned(), (stiff, soft, alone))
-    lump_alone = learned().logit(np.array([stiff.features, soft.features]))
+    features, muscles = (
+        np.array(rows) for rows in zip(*((c.features, c.signs.features) for c in (stiff, soft, alone)), strict=True)
+    )
+    logits, guarding = causes(learned(), features, muscles)
+    lump_alone = learned().logit(features)
     assert guarding[0] > 0.1 > guarding[2]
     assert logits[0] < lump_alone[0]
     assert guarding[1] == 0

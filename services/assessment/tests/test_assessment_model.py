@@ -83,6 +83,18 @@ def test_what_one_stroke_alone_says_is_not_believed() -> None:
     assert strengths[1][1] == pytest.approx(strengths[1][0], rel=0.15)
 
 
+def test_what_the_first_line_alone_says_of_a_place_beyond_it_is_not_believed() -> None:
+    beyond = Bump(0.02, -0.08, 0.008)
+    samples = lines(level, noise=0.005)
+    first = [s.stroke == 0 and abs(s.position[0] - 0.02) < 0.0155 for s in samples]
+    o = observe([replace(s, force=1.2 * s.force) if spoiled else s for s, spoiled in zip(samples, first, strict=True)], learned())
+    assert o is not None
+    regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
+    (t,) = matched(regression, [beyond])[1]
+    assert t > 3
+    assert abs(agreed(regression, beyond, float(t))) < 0.5
+
+
 def test_a_lump_in_the_model_takes_its_contrast() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     o = observe(lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.02, 2.0)), learned())

@@ -46,6 +46,17 @@ def test_a_stroke_that_ends_hands_over_what_it_has() -> None:
     states = [state(k, x=0.0003 * k) for k in range(8)] + [state(8, depth=-0.01, force=0.0, counts=False, touching=False)]
     (sample,) = run(states)
     assert sample.position[0] == pytest.approx(0.0003 * 3.5)
+    still = [state(k, counts=False) for k in range(100)]
+    (sample,) = run(still + [state(100 + k, x=0.0003 * k) for k in range(8)] + [state(108, counts=False, touching=False)])
+    assert sample.time_in_contact == pytest.approx(1.035)
+
+
+def test_a_sample_that_was_forgotten_does_not_come_out() -> None:
+    sampler = Sampler()
+    for k in range(8):
+        sampler.add(state(k, x=0.0003 * k))
+    sampler.forget()
+    assert sampler.add(state(8, depth=-0.01, counts=False, touching=False)) is None
 
 
 def test_time_in_contact_starts_anew_with_each_stroke() -> None:
