@@ -2,7 +2,8 @@
 
 A muscle is tensed over a hand's breadth, so that a candidate on it lies on a rise of the smooth fields. Voluntary guarding fades
 while the indenter slides gently, so that the same places feel softer the longer a stroke lasts: with w(x) a muscle's shape about
-the candidate and t the time since the touch, the strength of w(x) exp(-t / LETTING_GO_S) by generalised least squares.
+the candidate and t the time since the touch, the strength of f = w(x) exp(-t / LETTING_GO_S) with a prior of FADE_SD,
+f' S^-1 y / (f' S^-1 f + FADE_SD^-2).
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The regression: log-force as a field over the belly, and errors in depth, time and force, all Gaussian.
 
-    y = z(x) + (n - n0) log(d / D) + (n / d) (onset + stroke zero + breathing left over + surface(x)) + zero of force / F + noise
+    y = z(x) + (n - n0) log(d / D) + (n / d) (onset + stroke zero + breathing left over + surface(x)) + force zero / F_s + noise
 
 z is a sum of fields of several lengths, of vertical strips that are symmetric about the midline (muscles and the linea alba), of
 bone where ribs and iliac crests may lie, and of the lumps that were detected. The amplitudes of all parts but the lumps are found
-by type-II maximum likelihood with log-normal priors (Rasmussen and Williams 2006, ch. 5): K = K0 + sum_j exp(2 a_j) K_j.
+as the mode of their posterior under log-normal priors (Rasmussen and Williams 2006, ch. 5): K = K0 + sum_j exp(2 a_j) K_j.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ ARCH_M, ARCH_SLOPE, ARCH_WIDTH_M = 0.18, 0.7, 0.025
 ILIAC_M, ILIAC_WIDTH_M = (0.135, -0.12), 0.04
 """The iliac spines beside and below the umbilicus, and how far about them bone may be felt."""
 NATURAL_SD, BONE_SD = 0.08, 0.5
-"""Prior medians of the amplitudes: of a factor of 0.2 over all lengths from 10 to 150 mm each field's share; of bone."""
+"""Prior medians of the amplitudes: each field's share of 0.2 in the logarithm over all lengths; of bone."""
 LEVEL_SD = 3.0
 """Standard deviation of the patient's own level about the median of his samples."""
 BREATHING_S = 1.0

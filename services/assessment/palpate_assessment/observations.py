@@ -39,7 +39,7 @@ class Observations:
     log_depth: Array
     """log(depth / press depth), by which an error of the exponent n counts."""
     per_metre: Array
-    """d y / d depth = n / depth [1/m], by which an error of the depth counts."""
+    """|d y / d depth| = n / depth [1/m], by which an error of the depth counts."""
     per_newton: Array
     """1 / F [1/N], by which an error of the force's zero counts: F is the stroke's median force, since a sample's own force
     must not explain itself."""

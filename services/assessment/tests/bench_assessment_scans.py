@@ -1,6 +1,6 @@
 """Scans without a robot: a sphere slid over the real tissue along a snake, with the errors that measuring has.
 
-`python bench_assessment_scans.py [SEEDS]` prints what the assessment makes of many phantoms: the figures of the README.
+`python bench_assessment_scans.py [SEEDS]` prints what the assessment makes of many phantoms.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whole scans of the default abdomen over the real tissue: the figures that the README states, on a few seeds."""
+"""Whole scans of the default abdomen over the real tissue, on a few seeds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_healthy_has_no_finding(seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-def test_guarding_is_found(seed: int) -> None:
+def test_a_large_lesion_is_found(seed: int) -> None:
     s = scored(scan(scenario_with((RLQ,), seed)))
     assert (s.matched, s.missed, s.false_findings) == (1, 0, 0)
     assert s.dice is not None
