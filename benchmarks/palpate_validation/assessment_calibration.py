@@ -6,7 +6,8 @@
 The first writes calibration.yaml anew, the second tells how the calibration does on others.
 
 Persons are examined by the quick tier with typical errors and quiet breathing; every second one is healthy, the others have one
-lump. What was weighed in each is kept in FOLDER, so that it can be made in pieces: cases that are there are not made again. What
+lump. What was weighed in each is kept in FOLDER, so that it can be made in pieces: cases that are there are not made again, and
+a changed assessment needs a new FOLDER. What
 the regression needs of contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over
 the tissue, and a press is made beside it.
 """

@@ -5,7 +5,7 @@
 The persons are those of the split tune of the studies `guarding` and, the first FIRST of each population, `operating-point`. The
 logit l of a lump stays as `assessment_calibration` fitted it: given it, the weights w of the muscle's signs s are the most likely
 ones of a logistic regression with three outcomes, lump, muscle, neither, of weights exp(l), exp(w . s), 1. What was weighed in
-each patient is kept in FOLDER: cases that are there are not made again.
+each patient is kept in FOLDER: cases that are there are not made again, and a changed assessment needs a new FOLDER.
 """
 
 from __future__ import annotations

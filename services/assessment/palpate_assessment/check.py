@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotri
 from scipy.stats import chi2
 
-from palpate_assessment.model import Regression
+from palpate_assessment.model import Regression, inverse
 from palpate_assessment.observations import Observations
 
 PIECE_M = 0.03
@@ -25,8 +24,7 @@ examinations where the model holds."""
 def contradicted(regression: Regression) -> NDArray[np.bool_]:
     """Which samples are in a piece of a stroke that the others contradict, shape (m,)."""
     o = regression.observations
-    precision = np.tril(dpotri(regression.triangle, lower=True)[0])
-    precision += np.tril(precision, -1).T
+    precision = inverse(regression.triangle)
     pull = precision @ (o.y - regression.level)
     marked = np.zeros(len(o.y), dtype=bool)
     for piece in pieces(o):

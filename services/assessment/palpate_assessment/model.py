@@ -100,6 +100,13 @@ def _smooth(a: Array, b: Array, length: float | Array) -> Array:
     return np.asarray(np.exp(-0.5 * cdist(a / length, b / length, "sqeuclidean")))
 
 
+def inverse(triangle: Array) -> Array:
+    """The inverse of a covariance whose lower Cholesky factor is `triangle`, shape (m, m)."""
+    found = np.tril(dpotri(triangle, lower=True)[0])
+    found += np.tril(found, -1).T
+    return np.asarray(found)
+
+
 def natural(a: Array, b: Array) -> list[Array]:
     """Unit covariances of the fields of natural variation between places a (k, 2) and b (l, 2), each of shape (k, l)."""
     fold = np.array((1.0, 0.0))
@@ -159,11 +166,10 @@ def amplitudes(o: Observations, calibration: Calibration, lumps: Sequence[Bump],
         variance = np.exp(2 * a)
         triangle = cholesky(rest + np.tensordot(variance, parts, 1), lower=True)
         weights = cho_solve((triangle, True), y)
-        inverse = np.tril(dpotri(triangle, lower=True)[0])
-        inverse += np.tril(inverse, -1).T
+        precision = inverse(triangle)
         difference = (a - middle) / spread
         value = 0.5 * y @ weights + np.log(np.diag(triangle)).sum() + 0.5 * difference @ difference
-        slope = variance * np.tensordot(parts, inverse - np.outer(weights, weights), 2) + difference / spread
+        slope = variance * np.tensordot(parts, precision - np.outer(weights, weights), 2) + difference / spread
         return float(value), slope
 
     bounds = list(zip(middle - 3 * spread, middle + 3 * spread, strict=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -57,9 +57,7 @@ class Observations:
 
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
         """Some of the samples."""
-        arrays = {name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray) and value.ndim < 3}
-        arrays.pop("same_stroke", None)
-        return Observations(**arrays)
+        return Observations(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
 
 def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observations | None:
