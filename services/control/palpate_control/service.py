@@ -104,9 +104,11 @@ class ControlService(Service):
             self._reference.accept(self._coming.popleft(), followed)
         if self._expires is None or joints is None:
             return self._command(t, np.zeros(DOF), self._valid)
-        if self._ceased or t > self._expires:
+        frozen = t - measured > self._setpoint_expiry  # received again and again, or with a clock that is wrong
+        if self._ceased or frozen or t > self._expires:
+            old = f"joint_states were measured {(t - measured) / MS:.0f} ms ago, limit {self._setpoint_expiry / MS:.0f} ms"
             expired = f"the last {TOPIC} expired {(t - self._expires) / MS:.0f} ms ago"
-            return self._cease(t, self._ceased or self._refused or expired)
+            return self._cease(t, self._ceased or (old if frozen else self._refused or expired))
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
             return self._stand(t, f"joint_states are {age:.0f} ms old, limit {limit:.0f} ms")

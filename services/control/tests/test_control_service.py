@@ -227,6 +227,17 @@ def test_an_arm_that_lags_by_more_than_a_setpoints_spacing_is_followed_in_its_ow
     assert peak_on_the_way(0, lagging=True) < peak_on_the_way(0) + 1.0
 
 
+def test_a_state_that_comes_again_and_again_winds_no_spring_up(rig: Rig) -> None:
+    frozen = JointState(header(0), list(JOINT_NAMES), moving(0), np.zeros(7), np.zeros(7))
+    for _ in range(400):
+        if rig.t % (10 * MS) == 0:
+            rig.send(setpoint(rig.t, joint_position=moving(rig.t)))
+        command = rig.tick(1, message=frozen)
+    assert not command.torque.any()
+    assert valid_for(command) <= 0
+    assert "joint_states were measured" in command.problem
+
+
 def test_nothing_is_compiled_in_mid_run(rig: Rig) -> None:
     """Arrays as they come from the bus are of the types that the warm-up has compiled for."""
     functions = [f for module in (impedance, safety) for f in vars(module).values() if hasattr(f, "signatures")]

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from palpate_bus.contract import contract
 from palpate_models import lbr
 from palpate_models.compiled import compiled
 from palpate_models.frames import Array
@@ -27,6 +28,8 @@ BRAKE_TICKS: Final = 100
 TORQUE_RATE: Final = 2.0
 """Largest change of a joint's command in a millisecond [N m]. libfranka ends a motion beyond 1, our controller keeps to 1 a tick.
 A command that was damaged on its way rarely stays within it."""
+VALIDITY: Final = contract().topics["control/joint_torque"].expiry
+"""So long at most [ns] a command is obeyed, whatever it says of itself, and counts the time since the one before."""
 AHEAD: Final = 500_000_000
 """A command stamped so far ahead [ns] comes from a clock that is wrong: its expiry protects nobody. More than a driver can be
 behind its own timer (`palpate_bus.runtime.wallclock.CATCH_UP`) and the command's validity: a busy machine is no wrong clock."""
@@ -130,7 +133,7 @@ class Driver:
             return _ZERO
         if lost:
             self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control, which commands, is gone")
-        elif force > self._force_emergency:
+        elif not force <= self._force_emergency:  # NaN, too
             limit = self._force_emergency
             self.hold(t, HoldCause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
         else:
@@ -166,9 +169,10 @@ class Driver:
     def _take(self, t: int, command: Command, gravity: Array) -> None:
         """Judges a command: obey it, ignore it (already expired while IDLE), or hold."""
         given_up = command.expires <= command.stamp  # however far its sender's clock is ahead of ours
-        if given_up or t > command.expires:
+        expires = min(command.expires, command.stamp + VALIDITY)
+        if given_up or t > expires:
             if self.mode is DriverMode.ACTIVE:
-                late = max(t - command.expires, 0) / 1e6
+                late = max(t - expires, 0) / 1e6
                 words = f"the last command of control expired {late:.0f} ms ago, none came after it"
                 self.hold(t, HoldCause.COMMAND_EXPIRED, f"control gives up: {command.problem}" if command.problem else words)
             return
@@ -189,7 +193,7 @@ class Driver:
         before = command.torque if self._before is None else self._before
         apart = 1.0
         if self._judged is not None:
-            apart = max((command.stamp - self._judged.stamp) / 1e6, 1.0)
+            apart = min(max((command.stamp - self._judged.stamp) / 1e6, 1.0), VALIDITY / 1e6)
         change = TORQUE_RATE * apart
         if not _obeyable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
             numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())

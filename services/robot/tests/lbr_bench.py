@@ -30,6 +30,8 @@ class DirectPort(LbrPort):
         self.t = -MS
         self.silent = False
         self.ft_silent = False
+        self.spoiled: dict[str, Any] = {}
+        """Fields of the state that are not the emulator's."""
         self.torques: list[np.ndarray] = []
         self.commanded_by: list[bytes] = []
         self._readings: list[Any] = []
@@ -43,7 +45,12 @@ class DirectPort(LbrPort):
             self.emulator.cycle()
         self._moved = True
         self._readings = [] if self.ft_silent else [self.emulator.wrench(self.t)]
-        return [] if self.silent or self.emulator.session.ended else [self.emulator.state(self.t)]
+        if self.silent or self.emulator.session.ended:
+            return []
+        state = self.emulator.state(self.t)
+        for name, value in self.spoiled.items():
+            setattr(state, name, value)
+        return [state]
 
     def wrenches(self) -> list[Any]:
         readings, self._readings = self._readings, []

@@ -73,6 +73,22 @@ def test_silent_arm_holds(rig: Rig) -> None:
     assert "joint_states" not in rig.outbox
 
 
+def test_nothing_is_pushed_on_when_states_end(rig: Rig) -> None:
+    rig.target = rig.target + 0.1
+    rig.tick(50)
+    assert np.abs(rig.port.torques[-1]).max() > 1
+    rig.port.silent = True
+    rig.tick(60)
+    assert not rig.port.torques[-1].any()
+
+
+def test_a_state_that_fri_does_not_have_holds(rig: Rig) -> None:
+    rig.port.spoiled = {"safety_state": 9}
+    rig.tick(20)
+    assert hold_cause(rig)[0] == RobotStatus.CAUSE_DEVICE
+    assert "9" in hold_cause(rig)[1]
+
+
 def test_silent_sensor_holds(rig: Rig) -> None:
     rig.port.ft_silent = True
     rig.tick(80)
@@ -107,6 +123,19 @@ def test_stops_hold_and_a_release_goes_on(rig: Rig, who: str) -> None:
     rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 0, 0, "", 1, 0.0, 0.0, 0.0, 0)]
     rig.tick(20)
     assert rig.status.mode == RobotStatus.MODE_ACTIVE
+
+
+def test_a_stop_is_not_undone_by_a_release_of_the_same_moment(rig: Rig) -> None:
+    rig.inbox.events["operator/request"] = [OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough")]
+    rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 0, 0, "", 1, 0.0, 0.0, 0.0, 0)]
+    rig.tick(20)
+    assert hold_cause(rig)[0] == RobotStatus.CAUSE_STOP_REQUESTED
+
+
+def test_a_request_that_is_unknown_is_a_stop(rig: Rig) -> None:
+    rig.inbox.events["operator/request"] = [OperatorRequest(header(rig.t), 200, "damaged")]
+    rig.tick(20)
+    assert "request = 200" in hold_cause(rig)[1]
 
 
 @pytest.mark.parametrize("period", [1, 5])

@@ -67,5 +67,22 @@ def test_the_old_driver_does_not_get_the_arm_back_a_new_one_does() -> None:
     assert watchdog.decide(2 * TIMEOUT_NS) is None
 
 
+def test_a_driver_that_died_before_the_watchdog_began_leaves_no_push() -> None:
+    watchdog, emulator = Watchdog(), Emulator(plant_input(load_scenario("clean")), Options())
+    while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
+        emulator.cycle()
+    for t in range(0, TIMEOUT_NS + 3 * MS, 2 * MS):
+        watchdog.state(t, emulator.state(1 + t))
+    assert watchdog.decide(TIMEOUT_NS + 3 * MS) is not None
+
+
+def test_an_old_speed_is_not_damped() -> None:
+    watchdog = started()
+    watchdog._arm.v[:] = 0.5
+    answer = watchdog.decide(10 * TIMEOUT_NS)
+    assert answer is not None
+    assert not answer[1].any()
+
+
 def test_before_anything_was_commanded_it_keeps_out() -> None:
     assert Watchdog().decide(10 * TIMEOUT_NS) is None

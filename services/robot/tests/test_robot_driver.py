@@ -5,7 +5,7 @@ import pytest
 
 from palpate_bus.messages.codec import message_type
 from palpate_models import lbr
-from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, Command, Driver, DriverMode, HoldCause
+from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, VALIDITY, Command, Driver, DriverMode, HoldCause
 
 MS = 1_000_000
 STILL = np.zeros(7)
@@ -97,7 +97,27 @@ def test_bad_commands_hold_and_are_counted(torque: np.ndarray, cause: HoldCause,
 def test_full_torque_in_room_left_by_gravity_is_obeyed(active: Driver) -> None:
     torque = lbr.TORQUE_LIMIT - GRAVITY
     reach = int(np.max(np.abs(torque - 2.0)) / TORQUE_RATE) + 1
-    np.testing.assert_array_equal(_update(active, reach * MS, _command(reach * MS, torque)), torque)
+    for ms in range(1, reach + 1):
+        obeyed = _update(active, ms * MS, _command(ms * MS, 2.0 + (torque - 2.0) * ms / reach))
+    np.testing.assert_array_equal(obeyed, torque)
+
+
+def test_a_command_is_not_obeyed_longer_than_the_contract_says_whatever_it_says(active: Driver) -> None:
+    endless = _command(10 * MS, valid_ms=3_600_000)
+    assert _update(active, 10 * MS + VALIDITY, endless).any()
+    assert not _update(active, 10 * MS + VALIDITY + 1, endless).any()
+    assert active.cause is HoldCause.COMMAND_EXPIRED
+
+
+def test_a_stamp_that_is_ahead_allows_no_larger_jump(active: Driver) -> None:
+    ahead = _command(490 * MS, np.full(7, 2.0) + np.array((0, 150.0, 0, 0, 0, 0, 0)))
+    assert not _update(active, 2 * MS, ahead).any()
+    assert active.cause is HoldCause.INVALID_COMMAND
+
+
+def test_a_force_that_is_no_number_holds(active: Driver) -> None:
+    assert not _update(active, 2 * MS, _command(2 * MS), force=float("nan")).any()
+    assert active.cause is HoldCause.FORCE_LIMIT
 
 
 def test_a_jump_of_the_torque_holds(active: Driver) -> None:

@@ -10,7 +10,7 @@ from palpate_supervisor.watch import Breach, Cause, Level
 GRACE = 50_000_000
 """Within this time of a release [ns] the driver's old hold is passed over: the word has to reach it."""
 RECOVERABLE = frozenset({Cause.DEPTH, Cause.WORKSPACE})
-"""Causes that only motion can end: released, they are passed over until the tool is back within the limit."""
+"""Causes that only motion can end: released, they are passed over until the tool is back within the limit, or they grow worse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,22 +38,32 @@ class Latch:
         """Every stop so far; one that grew worse counts again."""
         self._since = 0
         self._released = -GRACE
-        self._recovering: set[Cause] = set()
+        self._recovering: dict[Cause, Level] = {}
+        """What is passed over, and at which level at most."""
+        self._begun: dict[Cause, int] = {}
+        """Since when each cause stands that does not hold now [ns]."""
 
     def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
         """One period at `t` [ns]: what does not hold now, and whether an operator asks for release."""
         if not (breaches or release):
             self._recovering.clear()
+            self._begun.clear()
             return
-        self._recovering &= {breach.cause for breach in breaches}
+        causes = {breach.cause for breach in breaches}
+        self._recovering = {cause: level for cause, level in self._recovering.items() if cause in causes}
+        self._begun = {cause: self._begun.get(cause, t) for cause in causes}
         fresh = t - self._released < GRACE
-        standing = [b for b in breaches if b.cause not in self._recovering and not (fresh and b.cause is Cause.DRIVER)]
+        standing = [
+            breach
+            for breach in breaches
+            if breach.level > self._recovering.get(breach.cause, Level.OK) and not (fresh and breach.cause is Cause.DRIVER)
+        ]
         if release:
             standing = self._release(t, standing)
         for breach in sorted(standing, key=lambda breach: -breach.level):
             self._take(t, breach)
         for breach in standing:
-            if self.level is Level.SOFT_STOP and breach.cause is self.cause and t - self._since > breach.heed:
+            if self.level is Level.SOFT_STOP and t - max(self._since, self._begun[breach.cause]) > breach.heed:
                 words = f"soft stop not heeded within {breach.heed / 1e6:.0f} ms: {breach.reason}"
                 self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, words))
 
@@ -73,7 +83,7 @@ class Latch:
             self.refusals += 1
             self.reason = f"release refused: {against[0].reason}"
             return standing
-        self._recovering = {breach.cause for breach in standing} & RECOVERABLE
+        self._recovering = {breach.cause: breach.level for breach in standing if breach.cause in RECOVERABLE}
         self.level, self.cause, self.reason = Level.OK, Cause.NONE, ""
         self.releases += 1
         self._released = t

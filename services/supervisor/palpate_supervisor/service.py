@@ -46,6 +46,10 @@ class SupervisorService(Service):
         self._latch = Latch()
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
+        self._measured: list[Breach] = []
+        self._stamp: int | None = None
+        self._stamped = 0
+        """When the newest measurement was first heard [ns]."""
         self._depth = NOWHERE
         self._peak_force = self._peak_speed = 0.0
 
@@ -58,12 +62,16 @@ class SupervisorService(Service):
                 breaches.append(Breach(Level.EMERGENCY, Cause.OPERATOR, f"stopped by the operator: {request.reason}"))
             elif request.request == OperatorRequest.SOFT_STOP:
                 breaches.append(Breach(Level.SOFT_STOP, Cause.OPERATOR, f"stopped softly by the operator: {request.reason}"))
-            else:
+            elif request.request in (OperatorRequest.RELEASE, OperatorRequest.END):
                 release = True
+            else:
+                words = f"operator/request: request = {request.request} is unknown, which counts as a stop"
+                breaches.append(Breach(Level.EMERGENCY, Cause.INVALID, words))
         for mesh in inbox.new("perception/surface"):
             breaches += self._perceive(mesh)
         if inbox.new("robot/status"):
-            breaches += self._measure(inbox.latest("robot/status"))
+            self._measured = self._measure(t, inbox.latest("robot/status"))
+        breaches += self._measured  # what was measured stands until it is measured again
         self._latch.update(t, breaches, release)
         latch, tool = self._latch, self._tool
         state = SupervisorState(
@@ -109,7 +117,7 @@ class SupervisorService(Service):
             return [Breach(Level.SOFT_STOP, Cause.INVALID, f"perception/surface: {error}")]
         return []
 
-    def _measure(self, status: Any) -> list[Breach]:
+    def _measure(self, t: int, status: Any) -> list[Breach]:
         values = {"position": status.position, "velocity": status.velocity, "wrench": wrench(status.wrench)}
         for name, value in values.items():
             if not np.isfinite(value).all():
@@ -119,7 +127,13 @@ class SupervisorService(Service):
         self._peak_speed = max(self._peak_speed, tool.speed)
         depth = None if self._surface is None else self._surface.depth(tool.p_W)
         self._depth = NOWHERE if depth is None else min(max(depth, NOWHERE), 0.2)
-        found = self._watch.judge(tool, depth, nanoseconds(status.header.stamp))
+        stamp = nanoseconds(status.header.stamp)
+        if stamp != self._stamp:
+            self._stamp, self._stamped = stamp, t
+        found = self._watch.judge(tool, depth, stamp, t)
+        if t - self._stamped > self._max_age:
+            words = f"robot/status repeats what was measured {(t - self._stamped) / 1e6:.0f} ms ago"
+            found.append(Breach(Level.EMERGENCY, Cause.SILENT, f"{words}, limit {self._max_age / 1e6:.0f} ms"))
         if status.mode == RobotStatus.MODE_SAFE_HOLD:
             found.append(Breach(Level.EMERGENCY, Cause.DRIVER, f"the driver holds safely: {status.reason}"))
         return found

@@ -78,20 +78,21 @@ class LimitWatch:
         self._forces: deque[tuple[int, float]] = deque(maxlen=RATE_SAMPLES + 1)
         self._over_since: int | None = None
 
-    def judge(self, tool: Tool, depth: float | None, t: int) -> list[Breach]:
-        """Breaches of what was measured at `t` [ns]; `depth` [m] below the perceived surface, None while none is known."""
+    def judge(self, tool: Tool, depth: float | None, stamp: int, t: int) -> list[Breach]:
+        """Breaches at `t` [ns] of what was measured at `stamp` [ns]; `depth` [m] below the perceived surface, None while none is
+        known.
+        """
         p_W, speed, force = tool
-        found = self._force(force, t) + self._speed(speed, force) + self._workspace(p_W)
+        found = self._force(force, stamp, t) + self._speed(speed, force) + self._workspace(p_W)
         return found if depth is None else found + self._depth(depth, force)
 
-    def _force(self, force: float, t: int) -> list[Breach]:
+    def _force(self, force: float, stamp: int, t: int) -> list[Breach]:
         limits, forces = self._limits, self._forces
-        if forces and t <= forces[-1][0]:  # the same measurement again, or a clock that was set back: nothing to take a rate from
+        if forces and stamp <= forces[-1][0]:  # the same measurement again, or a clock that was set back: it has no rate
             forces.clear()
-            self._over_since = None
-        forces.append((t, force))
+        forces.append((stamp, force))
         begin, before = forces[0]
-        rate = (force - before) / ((t - begin) / 1e9) if len(forces) > RATE_SAMPLES else 0.0
+        rate = (force - before) / ((stamp - begin) / 1e9) if len(forces) > RATE_SAMPLES else 0.0
         soon = force + (rate * LOOKAHEAD_S if rate > FAST_NPS else 0.0)
         if force <= limits.force_soft_stop_n:
             self._over_since = None
@@ -99,26 +100,25 @@ class LimitWatch:
             self._over_since = t
         rising = soon > limits.force_soft_stop_n and rate > FAST_NPS
         lasting = self._over_since is not None and t - self._over_since >= PATIENCE
-        if not (rising or lasting or soon > limits.force_emergency_n):
+        if not (rising or lasting) and soon <= limits.force_emergency_n:
             return []
         words = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
-        if soon > limits.force_emergency_n:
+        if not soon <= limits.force_emergency_n:
             return [Breach(Level.EMERGENCY, Cause.FORCE, f"{words}, emergency limit {limits.force_emergency_n:g} N")]
         heed = HEED_RISING if rising else HEED
         return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{words}, soft-stop limit {limits.force_soft_stop_n:g} N", heed)]
 
     def _depth(self, depth: float, force: float) -> list[Breach]:
         limit = self._limits.depth_m + DEPTH_MARGIN_M
-        if depth <= limit:
-            return []
-        # Without a force there is no tissue there: the arm is beside the abdomen, which the workspace watches.
-        level = Level.EMERGENCY if depth > limit + DEPTH_MARGIN_M and force > CONTACT_N else Level.SOFT_STOP
-        words = f"depth {depth * 1e3:.1f} mm below the perceived surface"
-        return [Breach(level, Cause.DEPTH, f"{words}, limit {limit * 1e3:.1f} mm")] if force > CONTACT_N else []
+        if depth <= limit or force <= CONTACT_N:
+            return []  # without a force there is no tissue there: the arm is beside the abdomen, which the workspace watches
+        level = Level.EMERGENCY if depth > limit + DEPTH_MARGIN_M else Level.SOFT_STOP
+        words = f"depth {depth * 1e3:.1f} mm below the perceived surface, limit {limit * 1e3:.1f} mm"
+        return [Breach(level, Cause.DEPTH, words)]
 
     def _speed(self, speed: float, force: float) -> list[Breach]:
         free = self._limits.speed_mps * SPEED_MARGIN
-        if speed > free:
+        if not speed <= free:  # NaN, too
             words = f"robot/status: tool moves at {speed:.2f} m/s, limit {free:.2f} m/s"
             return [Breach(Level.EMERGENCY, Cause.SPEED, words)]
         contact = self._limits.contact_speed_mps

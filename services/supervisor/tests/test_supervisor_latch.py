@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from palpate_supervisor.latch import GRACE, Latch
 from palpate_supervisor.watch import HEED, HEED_RISING, Breach, Cause, Level
 
@@ -77,6 +79,22 @@ def test_what_only_motion_can_mend_is_passed_over_until_it_is_mended() -> None:
     latch.update(30 * MS, [], False)
     latch.update(40 * MS, [DEPTH], False)
     assert latch.level is Level.SOFT_STOP
+
+
+def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
+    latch = Latch()
+    latch.update(0, [DEPTH], False)
+    latch.update(10 * MS, [DEPTH], True)
+    latch.update(20 * MS, [replace(DEPTH, level=Level.EMERGENCY)], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.DEPTH)
+
+
+def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> None:
+    latch = Latch()
+    latch.update(0, [Breach(Level.SOFT_STOP, Cause.OPERATOR, "enough")], False)
+    for t in range(1000 * MS, 1000 * MS + HEED + 20 * MS, 10 * MS):
+        latch.update(t, [SOFT], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
 
 
 def test_a_driver_is_given_time_to_hear_of_its_release_and_no_more() -> None:

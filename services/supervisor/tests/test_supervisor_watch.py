@@ -20,7 +20,7 @@ ABOVE = np.array([0.56, 0.0, 1.0])
 def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth: float | None = None) -> list[Breach]:
     watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     for n in range(20):  # long enough for what needs patience, and without a rate
-        found = watch.judge(Tool(p_W, speed, force), depth, n * 10 * MS)
+        found = watch.judge(Tool(p_W, speed, force), depth, n * 10 * MS, n * 10 * MS)
     return found
 
 
@@ -59,7 +59,7 @@ def test_what_an_examination_does_is_no_breach(values: dict[str, object]) -> Non
 def test_a_force_that_rises_fast_is_stopped_before_the_limit() -> None:
     watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     forces = 100.0 * 0.01 * np.arange(60)  # 100 N/s, as on something rigid
-    first = next(f for n, f in enumerate(forces) if watch.judge(Tool(ABOVE, 0.0, f), None, n * 10 * MS))
+    first = next(f for n, f in enumerate(forces) if watch.judge(Tool(ABOVE, 0.0, f), None, n * 10 * MS, n * 10 * MS))
     assert 14.0 < first <= 16.0
 
 
@@ -67,19 +67,30 @@ def test_a_hole_in_the_measurements_makes_no_force_rise_faster() -> None:
     """At 20 N/s, slowly enough for planning; 60 ms are missing, which taken for one period would be 120 N/s."""
     watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     times = [n * 10 * MS for n in (*range(80), *range(86, 110))]
-    assert not any(watch.judge(Tool(ABOVE, 0.0, 20e-9 * t), None, t) for t in times)
+    assert not any(watch.judge(Tool(ABOVE, 0.0, 20e-9 * t), None, t, t) for t in times)
 
 
 def test_a_stamp_that_comes_again_is_nothing_to_take_a_rate_from() -> None:
     watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     stamps = [0, 10, 20, 30, 30, 30, 40]
-    assert not any(watch.judge(Tool(ABOVE, 0.0, 0.2 * n), None, t * MS) for n, t in enumerate(stamps))
+    assert not any(watch.judge(Tool(ABOVE, 0.0, 0.2 * n), None, t * MS, n * 10 * MS) for n, t in enumerate(stamps))
+
+
+def test_a_force_that_stays_over_the_limit_is_stopped_however_often_its_stamp_comes_again() -> None:
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    found = [watch.judge(Tool(ABOVE, 0.0, 30.0), None, 0, n * 10 * MS) for n in range(20)]
+    assert [breach.cause for breach in found[-1]] == [Cause.FORCE]
+
+
+def test_what_is_no_number_is_a_breach() -> None:
+    assert {breach.cause for breach in judge(speed=np.nan)} == {Cause.SPEED}
+    assert {breach.cause for breach in judge(force=np.nan)} == {Cause.FORCE}
 
 
 def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
     watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     for n, force in enumerate((*np.linspace(10.0, 24.9, 100), 25.3, 25.4, 25.2, 24.0, 21.0)):
-        assert watch.judge(Tool(ABOVE, 0.0, float(force)), None, n * 10 * MS) == []
+        assert watch.judge(Tool(ABOVE, 0.0, float(force)), None, n * 10 * MS, n * 10 * MS) == []
 
 
 def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:

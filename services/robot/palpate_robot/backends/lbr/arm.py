@@ -82,8 +82,10 @@ class Arm:
         else:
             self.v = np.zeros(lbr.HOME.shape)
         self.q, self._stamp, self.heard = q, stamp, t
-        self.session = SessionState(state.session_state)
-        self._trouble = _trouble(state)
+        try:
+            self.session, self._trouble = SessionState(state.session_state), _trouble(state)
+        except ValueError as error:  # a value that FRI does not have
+            self.session, self._trouble = SessionState.IDLE, f"LBRState: {error}"
         return True
 
     def trouble(self, t: int) -> str:

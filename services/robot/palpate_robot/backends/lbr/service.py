@@ -102,6 +102,9 @@ class LbrService(Service):
                 self._drive(t, inbox, joints)
         if self._arm.heard is not None:
             self._judge_connection(t)
+            if self._driver.held and t - self._arm.heard > STATE_AGE_NS and self._applied.any():  # an old speed is a push
+                self._applied = np.zeros(7)
+                self._port.command(self._arm.q, self._applied)  # once: then the watchdog hears nothing, and takes over
         if not t % STATUS_PERIOD:
             outbox["robot/status"] = self._status(t)
         if self._emulated:

@@ -25,7 +25,7 @@ from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.frames import Array
 from palpate_models.scenario import LbrConnection
-from palpate_robot.backends.lbr.arm import Arm
+from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm
 from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
 
 log = logging.getLogger("watchdog")
@@ -49,8 +49,10 @@ class Watchdog:
         """Whether it has taken over."""
 
     def state(self, t: int, state: Any) -> None:
-        """An LBRState came."""
+        """An LBRState came. Whoever commanded before this process began may be dead already, so the time runs from then."""
         self._arm.update(t, state)
+        if self._commanded is None and self._arm.session is SessionState.COMMANDING_ACTIVE:
+            self._commanded = t
 
     def command(self, t: int, sender: bytes) -> None:
         """A command of a driver came. A new driver ends the hold; the old one, come back to life, does not."""
@@ -64,7 +66,10 @@ class Watchdog:
             return None
         if t - self._commanded > self._timeout:
             self.holding = True
-        return (self._arm.q, -DAMPING * self._arm.v) if self.holding else None
+        if not self.holding:
+            return None
+        known = self._arm.heard is not None and t - self._arm.heard <= STATE_AGE_NS  # an old speed is a constant push
+        return self._arm.q, -DAMPING * self._arm.v if known else np.zeros(7)
 
 
 def main() -> int:
