@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from palpate_bus.contract import contract
 from palpate_bus.messages.codec import message_type
 from palpate_models import lbr
 from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, VALIDITY, Command, Driver, DriverMode, HoldCause
@@ -36,6 +37,10 @@ def test_numbers_are_those_of_the_message() -> None:
         assert getattr(status, f"MODE_{mode.name}") == mode
     for cause in HoldCause:
         assert getattr(status, f"CAUSE_{cause.name}") == cause
+
+
+def test_validity_is_that_of_the_contract() -> None:
+    assert contract().topics["control/joint_torque"].expiry == VALIDITY
 
 
 def test_idle_until_the_first_valid_command() -> None:
