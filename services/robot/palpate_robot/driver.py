@@ -28,7 +28,7 @@ TORQUE_RATE: Final = 2.0
 """Largest change of a joint's command in a millisecond [N m]. libfranka ends a motion beyond 1, our controller keeps to 1 a tick.
 A command that was damaged on its way rarely stays within it."""
 VALIDITY: Final = 50_000_000
-"""As the contract has it. So long at most [ns] a command is obeyed, whatever it says of itself, and counts the time since the one before."""
+"""So long [ns] a command is obeyed at most, as in the contract, and counts the time since the one before."""
 AHEAD: Final = 500_000_000
 """A command stamped so far ahead [ns] comes from a clock that is wrong: its expiry protects nobody. More than a driver can be
 behind its own timer (`palpate_bus.runtime.wallclock.CATCH_UP`) and the command's validity: a busy machine is no wrong clock."""
