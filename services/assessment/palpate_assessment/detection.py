@@ -42,10 +42,10 @@ _BORDER_M = 0.010
 FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
 FEATURES = ("strength", "beyond", "log-radius", "log-radius squared", "softer", "bone")
-"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, size, how far that
-is from what is usual for one, sign, and how much of its strength is bone's under it, which is felt as a lump is: where bone may
-just lie, a lump is the likelier one."""
-BEYOND, SOFTER = FEATURES.index("beyond"), FEATURES.index("softer")
+"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, its size and how
+far that is from the usual one, its sign, and how much of its strength is bone's under it, which is felt as a lump is: where
+bone may just lie, a lump is the likelier one."""
+SOFTER = FEATURES.index("softer")
 ALIKE, HALF = 1.5, 0.5
 """Where two strokes over a lump say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
 bump is more than this part of the highest that any sample has: its centre may lie beyond the samples."""

@@ -41,7 +41,7 @@ class Latch:
         self._recovering: dict[Cause, Level] = {}
         """What is passed over, and at which level at most."""
         self._begun: dict[Cause, int] = {}
-        """Since when each cause stands that does not hold now [ns]."""
+        """Since when each cause that stands now has stood without a break [ns]."""
 
     def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
         """One period at `t` [ns]: what does not hold now, and whether an operator asks for release."""
@@ -63,7 +63,8 @@ class Latch:
         for breach in sorted(standing, key=lambda breach: -breach.level):
             self._take(t, breach)
         for breach in standing:
-            if self.level is Level.SOFT_STOP and t - max(self._since, self._begun[breach.cause]) > breach.heed:
+            began = self._since if breach.cause is self.cause else max(self._since, self._begun[breach.cause])
+            if self.level is Level.SOFT_STOP and t - began > breach.heed:
                 words = f"soft stop not heeded within {breach.heed / 1e6:.0f} ms: {breach.reason}"
                 self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, words))
 

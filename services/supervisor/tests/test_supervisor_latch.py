@@ -89,6 +89,13 @@ def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.DEPTH)
 
 
+def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
+    latch = Latch()
+    for n in range(HEED // (10 * MS) + 4):
+        latch.update(n * 10 * MS, [SOFT] if n % 2 == 0 else [], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
+
+
 def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> None:
     latch = Latch()
     latch.update(0, [Breach(Level.SOFT_STOP, Cause.OPERATOR, "enough")], False)
