@@ -38,6 +38,8 @@ POLL_S = 0.02
 OBSERVERS_FINISH_S = 60.0
 SILENT_S = 2.0
 """When all services are silent for so long, it is their way to the conductor that is at fault."""
+INTERRUPTED_S = 0.5
+"""... and when they are for so long and come again, it was; they report every 0.2 s."""
 
 
 class Conductor:
@@ -86,6 +88,14 @@ class Conductor:
         self._started_at = 0.0
         self._complained = False
         self.started_at_perf = 0.0
+
+    @property
+    def interruption(self) -> str:
+        """That the transport was interrupted for a while, as it seems here; empty if it was not, or in lockstep, where all may think."""
+        silent = self.watchdog.longest_silence
+        if not self._wallclock or silent < INTERRUPTED_S or self._heartbeat.stood_still_s:
+            return ""
+        return f"for {silent:.1f} s nothing was heard of any service: the transport or the whole machine stood still"
 
     @property
     def elapsed_s(self) -> float:
@@ -159,6 +169,7 @@ class Conductor:
         self._started_at = monotonic()
         self.started_at_perf = perf_counter()
         self.watchdog.forgive()
+        self.watchdog.longest_silence = 0.0
         self.grants.begin()
         try:
             self._conduct(died, tell)
