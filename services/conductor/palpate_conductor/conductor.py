@@ -91,7 +91,10 @@ class Conductor:
 
     @property
     def interruption(self) -> str:
-        """That the transport was interrupted for a while, as it seems here; empty if it was not, or in lockstep, where all may think."""
+        """That the transport was interrupted for a while, as it seems here; empty if it was not.
+
+        Of a lockstep run nothing is said: there all services may be silent because one of them takes its time.
+        """
         silent = self.watchdog.longest_silence
         if not self._wallclock or silent < INTERRUPTED_S or self._heartbeat.stood_still_s:
             return ""
