@@ -144,6 +144,15 @@ def test_a_patient_who_moves_is_noticed_within_a_second(kind: str) -> None:
     assert patient.motion.at_s < moved[0] <= patient.motion.at_s + 1.0
 
 
+def test_a_shift_along_a_body_that_is_much_the_same_along_its_length_is_noticed() -> None:
+    settings = ("exam.region_m=[0.12, 0.12]", "phantom.motion.kind=shift", "phantom.motion.at_s=60")
+    result, patient = followed(*settings, scenario="person", seed=2063235108, seconds=50.0)
+    assert abs(patient.motion.pose(70.0)[1, 3]) > 9.9e-3
+    moved = np.array(result.t_s)[np.array(result.state) == SurfaceMotion.MOVED]
+    assert len(moved)
+    assert 60.0 < moved[0] <= 61.5
+
+
 @pytest.mark.parametrize("kind", ["shift", "turn"])
 def test_a_second_look_tells_where_the_patient_who_moved_lies(kind: str) -> None:
     case = load_scenario("restless", ("exam.region_m=[0.1, 0.1]", f"phantom.motion.kind={kind}", "phantom.motion.at_s=14"), 3)
