@@ -24,6 +24,8 @@ NOWHERE = -1.0
 MISSED = (("control", Level.EMERGENCY), ("planning", Level.EMERGENCY), ("assessment", Level.SOFT_STOP))
 """Roles and what their loss calls for: without the first two the arm must stand still, without assessment there is no reason to
 go on pressing."""
+RETREAT = 4000 * MS
+"""So long planning may take to be out of contact and on the way home after a loss [ns]; nothing brings the lost one back."""
 WATCHED = ("robot/status", "exam/state")
 """Topics whose age is watched: the arm's and planning's."""
 SETTLE = 1000 * MS
@@ -95,7 +97,8 @@ class SupervisorService(Service):
 
     def _presence(self, t: int, inbox: Inbox) -> list[Breach]:
         """Who is gone, and who has said nothing for too long."""
-        found = [Breach(level, Cause.LOST, f"the service of role {role} is gone") for role, level in MISSED if inbox.lost(role)]
+        gone = [(role, level) for role, level in MISSED if inbox.lost(role)]
+        found = [Breach(level, Cause.LOST, f"the service of role {role} is gone", RETREAT) for role, level in gone]
         self._began = t if self._began is None else self._began
         if t - self._began <= SETTLE:
             return found

@@ -68,3 +68,15 @@ def test_a_surface_that_is_none_stops_softly_and_ends_nobody(vertices: int, norm
     state: Any = create(load_scenario("healthy")).step(0, inbox)["supervisor/state"]
     assert (state.level, state.cause) == (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.CAUSE_INVALID)
     assert "perception/surface" in state.reason
+
+
+def test_without_the_assessment_planning_has_time_to_retreat() -> None:
+    """Its loss stands for good: that says nothing of whether the arm retreats."""
+    service, state = create(load_scenario("healthy")), None
+    inbox = HandInbox()
+    inbox.gone.add("assessment")
+    for t in range(0, SETTLE, 10 * MS):
+        state = service.step(t, inbox)["supervisor/state"]
+    assert (state.level, state.cause) == (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.CAUSE_LOST)
+    state = service.step(5000 * MS, inbox)["supervisor/state"]
+    assert state.level == SupervisorState.LEVEL_EMERGENCY, "but not for ever"
