@@ -206,7 +206,13 @@ class Transport:
         return time_ns()
 
     def publisher(self, topic: str, key: str, qos: Qos, gid: bytes) -> Sender:
-        """The sending end of a topic; `key` is its key on the bus."""
+        """The sending end of a topic; `key` is its key on the bus.
+
+        By the wall clock no sender waits for a reader that does not keep up: a frozen recorder would stop physics and planning.
+        Only what is sent once waits.
+        """
+        if Settings.read().runtime == "wallclock" and not qos.transient_local:
+            qos = qos.model_copy(update={"congestion": "DROP"})
         return Publisher(self.session, key, qos, gid, self.now, self.tagger(key))
 
     def subscription(self, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None) -> Subscription:
