@@ -44,6 +44,8 @@ class Descent:
         """Before a descent: at rest, soon, above the skin."""
         self._rested = self._deepest = 0.0
         self._onset = Onset()
+        self.pushed = False
+        """Whether a force was felt higher than the skin can be: something else pushes the tool, or the wall has leapt."""
         self._felt = self._sure = False
         """Whether the skin has been touched, and whether where is known as surely as it will be."""
 
@@ -69,7 +71,9 @@ class Descent:
         there = motion.depth.step(self._deepest, PROBE_MPS if near else DESCEND_MPS)
         if near:
             self._onset.add(contact.depth, contact.force, t, contact.wall.displacement)
-        if contact.force >= FELT_N or (there and contact.touching):
+        if contact.force >= FELT_N and not near:
+            self.pushed = True
+        elif contact.force >= FELT_N or (there and contact.touching):
             self.touched, outward = motion.wall.touched(contact.foot, self._onset.touch(), self.stroke, t)
             motion.shift(outward)
             self._felt = True

@@ -22,7 +22,7 @@ from palpate_planning.motion_planning import NoPathError
 from palpate_planning.palpation import HIDES, Palpation, PalpationStep, StrokeStage
 from palpate_planning.path import compile_ahead
 from palpate_planning.periods import MS, SECOND, Periods
-from palpate_planning.requests import PLANNING_TIME
+from palpate_planning.requests import PLANNING_TIME, PressRequest
 from palpate_planning.segments import STRETCHED, Segment
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
@@ -96,6 +96,8 @@ class ExamSequence:
         self._planning: BackgroundTask[ExamPlan] | None = None
         self._pressing: BackgroundTask[tuple[Segment, ...]] | None = None
         """The press that is being laid."""
+        self._request: PressRequest | None = None
+        """What the search asks for, until the arm can do it: it asks once."""
         self._requested = self._pressed = 0
         """Numbers of the search's requests: the latest, and the latest that is over."""
         self._moves = 0
@@ -139,6 +141,8 @@ class ExamSequence:
         self._trigger, self._path, self._touched, self._correction = False, None, None, None
         if now.averaged is not None:
             self._averaged = now.averaged
+        if now.request is not None:
+            self._request = now.request
         if now.motion is not None:
             self._sense.wall.breath.hear(now.motion, now.t)
         course.contact = self._sense.sense(now.reading, now.t)
@@ -208,6 +212,7 @@ class ExamSequence:
     def _give_up(self, now: Observation, why: str) -> None:
         """Ends an examination that cannot be planned; what was felt before, if anything was, is assessed all the same."""
         if self._moves or self._replans:
+            self._correct()
             self._course.go_home(now, "")
         else:
             self._course.abort(now, why)
@@ -277,6 +282,7 @@ class ExamSequence:
         """Goes home; but where a patient has moved, or the arm would stretch or hides him, goes on with what is left."""
         assert now.reading is not None
         self._course.arm.hold(now.reading.q)
+        self._pressing = None  # it was laid on the surface of this plan
         if palpation.ahead and palpation.moved and self._moves < MOVES_MAX:
             self._moves, self._wanted = self._moves + 1, palpation.ahead
             self._asked, self._looked, self._bend = None, 0, None
@@ -300,8 +306,8 @@ class ExamSequence:
         plan = self._course.plan
         if plan is None or plan.presses is None:
             return
-        if now.request is not None:
-            request, presses = now.request, plan.presses
+        if self._request is not None:
+            request, presses, self._request = self._request.moved(self._sense.wall.shift_A), plan.presses, None
             if request.xy is None:
                 palpation.close()
             else:

@@ -14,7 +14,7 @@ from palpate_planning.contact import ContactMeasurement
 from palpate_planning.descent import ALLOWANCE_M, SIGMAS, Descent
 from palpate_planning.recovery import MOVED_M, Recovery
 from palpate_planning.segments import HOVER_M, STRETCHED, Segment
-from palpate_planning.stroke_motion import StrokeMotion
+from palpate_planning.stroke_motion import ENDED_M, StrokeMotion
 from palpate_planning.wall import TouchedSkin, Wall
 from palpate_planning.wall_watch import WallWatch
 
@@ -33,6 +33,8 @@ STEADY_FRACTION = 0.5
 """Samples count from this part of the path's speed on."""
 STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
+PUSHED = "a force was felt where no skin can be"
+"""Why a descent is repeated."""
 HIDES = "the arm hides the wall from the camera"
 """Why strokes end where the arm stays in the camera's way: that stroke is passed over."""
 UNNOTICED_M = 0.03
@@ -175,11 +177,19 @@ class Palpation:
         path = self._motion.segment.path
         if self._motion.segment.contact and not self._motion.segment.touch:
             behind = UNNOTICED_M if self._watch.moved else 0.0
-            ahead += [int(i) for i in path.targets[path.visits > self._motion.along.position - behind]]
+            ahead += [int(i) for i in path.targets[path.visits > self._felt_until - behind]]
         self._recovery.skipped |= dict.fromkeys(ahead, why)
         self.ahead = frozenset(later if why == HIDES else ahead)
         if self.stage is not StrokeStage.LIFT:
             self._enter(StrokeStage.LIFT)
+
+    @property
+    def _felt_until(self) -> float:
+        """Up to where the stroke under way has been felt [m]: not at all, before its first target, while it has not slid."""
+        if self._recovery.resume_at is not None:
+            return self._recovery.resume_at - ENDED_M
+        felt = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
+        return self._motion.along.position - (0.0 if felt else ENDED_M)
 
     def pause(self) -> None:
         """Lifts off along the normal and waits there; `resume` comes back to where it was."""
@@ -187,6 +197,16 @@ class Palpation:
         if self.stage in PRESSING:
             stop = self._motion.along.position + self._motion.stopping_distance
             self._recovery.resume_at = min(stop, self._motion.segment.path.length)
+            self._enter(StrokeStage.LIFT)
+        else:
+            self._rise()
+
+    def _rise(self) -> None:
+        """From low above the skin to where a wall that leaps does not reach; `_lift` goes on from there."""
+        if self.stage is StrokeStage.REST and self._joined:
+            self._recovery.resume_at = self._motion.along.position
+            self._enter(StrokeStage.LIFT)
+        elif self.stage is StrokeStage.TRANSFER and self._motion.segment.free is None:
             self._enter(StrokeStage.LIFT)
 
     def resume(self, t: int, contact: ContactMeasurement) -> None:
@@ -238,7 +258,8 @@ class Palpation:
             self._hold()
         elif self.stage is StrokeStage.WAIT:
             self._wait()
-        self._motion.regulate(contact, in_contact=contact.touching and self.stage is not StrokeStage.LIFT)
+        lifting = self.stage is StrokeStage.LIFT
+        self._motion.regulate(contact, in_contact=contact.touching and not lifting, pressing=lifting or self.stage in PRESSING)
         return self._report(t, contact, rate)
 
     def _heed_the_elbow(self, contact: ContactMeasurement) -> None:
@@ -259,8 +280,14 @@ class Palpation:
             self.leave(self._watch.ended)
         elif self._watch.spoiled and self.stage in PRESSING:
             back = REPEAT_M if sliding else 0.0
-            self._recovery.repeat(self._motion.segment.path, self._motion.along.position, back, "the wall could not be followed")
-            self._enter(StrokeStage.LIFT)
+            self._repeat(back, "the wall could not be followed")
+        elif self._watch.leaps:
+            self._rise()
+
+    def _repeat(self, back: float, why: str) -> None:
+        """Lifts off, and takes the stroke up again `back` [m] before where it is, for `why`."""
+        self._recovery.repeat(self._motion.segment.path, self._motion.along.position, back, why)
+        self._enter(StrokeStage.LIFT)
 
     def _enter(self, stage: StrokeStage) -> None:
         self.stage = stage
@@ -302,6 +329,8 @@ class Palpation:
             if self._descent.missed:
                 end = self.abandon if self.stroke == 1 else self.leave
                 end(self._descent.missed)
+            elif self._descent.pushed:
+                self._repeat(0.0, PUSHED)
         elif self._motion.segment.touch:
             self._enter(StrokeStage.LIFT)
         else:
@@ -350,7 +379,8 @@ class Palpation:
 
     def _height(self, t: int) -> float:
         """How high to lift at `t` [ns]; in metres."""
-        if self.failed or self.left or not self._watch.calm or self._number == len(self._segments) - 1:
+        sure = self._watch.calm and not self._recovery.paused
+        if self.failed or self.left or not sure or self._number == len(self._segments) - 1:
             return self._motion.free_height(t)
         if self._recovery.resume_at is not None:
             return HOP_M

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -28,6 +28,10 @@ class PressRequest:
     depth_m: float = 0.0
     reason: str = ""
     """Why it is over."""
+
+    def moved(self, shift_A: Array) -> PressRequest:
+        """The same place of a body that lies `shift_A` [m], shape (2,), from where it lay at the first look."""
+        return self if self.xy is None else replace(self, xy=self.xy + shift_A)
 
 
 class PressPlanner:

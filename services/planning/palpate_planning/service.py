@@ -11,7 +11,7 @@ import numpy as np
 
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.conformance import Checker
-from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SearchRequest, SupervisorState
+from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SearchRequest, SupervisorState, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import vector, wrench
 from palpate_bus.messages.stamps import header
@@ -116,7 +116,7 @@ class PlanningService(Service):
     def _fitting(self, inbox: Inbox, topic: str) -> Iterator[Message | None]:
         """The new messages of a topic; None for one that breaks its row of the contract, which is counted and told in the log."""
         for message in inbox.new(topic):
-            wrong = self._checks[topic](message)
+            wrong = self._checks[topic](message) or _too_short(message)
             if wrong:
                 self._refused += 1
                 logging.getLogger(self.role).warning("%s of %s refused: %s", topic, contract().topics[topic].producer, wrong[0])
@@ -146,12 +146,14 @@ class PlanningService(Service):
         mesh = self._mesh
         if not len(targets.positions) or mesh is None:
             return PerceptionFailure(targets.message or "perception found no targets, or no surface that can be used")
-        vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
-        normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
-        triangles = np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)
-        if triangles.max(initial=-1) >= len(vertices):
-            return PerceptionFailure(f"perception/surface: triangles of vertex {triangles.max()}, it has {len(vertices)}")
+        if len(targets.lines) != len(targets.positions):
+            return PerceptionFailure(f"perception/targets: {len(targets.lines)} lines for {len(targets.positions)} positions")
         try:
+            vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
+            normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
+            triangles = np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)
+            if triangles.max(initial=-1) >= len(vertices):
+                return PerceptionFailure(f"perception/surface: triangles of vertex {triangles.max()}, it has {len(vertices)}")
             surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA, np.asarray(mesh.breathing))
         except ValueError as error:
             return PerceptionFailure(f"perception/surface: {error}")
@@ -182,7 +184,8 @@ class PlanningService(Service):
         for message in inbox.new("exam/request"):
             over = message.request == SearchRequest.DONE
             xy = None if over else np.array((message.place.x, message.place.y))
-            return PressRequest(int(message.number), xy, float(message.depth), message.reason)
+            depth = min(float(message.depth), self._known.limits.depth_m)  # a policy may ask for more
+            return PressRequest(int(message.number), xy, depth, message.reason)
         return None
 
     def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
@@ -194,6 +197,13 @@ class PlanningService(Service):
         if heard is not None and t - heard > self._supervisor_silence:
             gone += (f"the supervisor, silent for {(t - heard) / MS:.0f} ms",)
         return gone
+
+
+def _too_short(message: Message) -> list[str]:
+    """What is wrong with the lengths of a message of perception's, which the contract's rows do not tell."""
+    if isinstance(message, SurfaceMotion) and len(message.forecast) < SurfaceMotion.FORECASTS:
+        return [f"forecast has {len(message.forecast)} values, {SurfaceMotion.FORECASTS} are wanted"]
+    return []
 
 
 def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...]) -> tuple[str, bool]:

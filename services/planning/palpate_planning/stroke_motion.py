@@ -82,6 +82,8 @@ class StrokeMotion:
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0
+        self._going = True
+        """Whether the free motion goes on."""
         self._aside: Array | None = None
         """Where the arm was at the start of a free motion, less where that begins [rad], shape (7,); None before it is known."""
         self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m
@@ -159,7 +161,8 @@ class StrokeMotion:
         return self.along.step(goal, max(self._speed_limit.at(self.along.position), CREEP_MPS))
 
     def brake(self) -> None:
-        """Comes to rest along the path."""
+        """Comes to rest along the path; a free motion stays where it is."""
+        self._going = False
         if self.along.velocity > 1e-4:
             self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, CREEP_MPS))
 
@@ -183,12 +186,18 @@ class StrokeMotion:
         """Goes on by `rate` samples of the segment's free motion; returns whether it is at its end."""
         assert self.segment.free is not None
         last = len(self.segment.free) - 1.0
+        self._going = True
         self._sample = min(self._sample + rate, last)
         return self._sample >= last
 
-    def regulate(self, contact: ContactMeasurement, *, in_contact: bool) -> None:
-        """Regulates the measured depth towards the target depth; `in_contact` lets errors be integrated."""
-        self.regulation = self._regulator.update(self.depth.position, contact.depth, contact.force, contact.load, in_contact)
+    def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pressing: bool) -> None:
+        """Regulates the measured depth towards the target depth.
+
+        `in_contact` lets errors be integrated, `pressing` the force be fed forward: on the way above the skin nothing that comes
+        against the tool is pushed back.
+        """
+        force = contact.force if pressing else 0.0
+        self.regulation = self._regulator.update(self.depth.position, contact.depth, force, contact.load, in_contact)
 
     @property
     def short_of_depth(self) -> bool:
@@ -198,7 +207,7 @@ class StrokeMotion:
     def setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
         """The set-point at `t` [ns]; a free motion goes on by `rate` samples a period."""
         if self.segment.free is not None:
-            return self._free_setpoint(t, contact, rate)
+            return self._free_setpoint(t, contact, rate if self._going else 0.0)
         regulation, point, speed, dt = self.regulation, self.point, self.along.velocity, self._period_s
         outward = self.wall.outward(point.p, t)
         rising = (self.wall.outward(point.p + point.dp * speed * dt, t + round(dt * SECOND)) - outward) / dt

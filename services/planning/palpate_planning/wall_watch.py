@@ -26,11 +26,13 @@ class WallWatch:
     def __init__(self, breath: Breath, following: Following, period_s: float) -> None:
         self._breath, self._gated, self._period_s = breath, following is Following.GATE, period_s
         self._calm_for, self._restless_for, self._adrift_for, self._hidden_for = CALM_S, 0.0, 0.0, 0.0
-        """For how long the wall was followed well, for how long it was not, for how long there was no contact at depth, and for
-        how long it was not followed because it was not seen [s]."""
+        """For how long the wall was followed well, since when it was not for long enough, for how long there was no contact at
+        depth, and for how long it was not followed because it was not seen [s]."""
         self._losses = 0
         self.spoiled = False
         """Whether what is measured now is worth nothing: the indenter has to lift off."""
+        self.leaps = False
+        """Whether the wall is seen to do what was not expected: where it will be next is not known."""
         self.open = True
         """Whether samples may be taken at this moment of the breath."""
         self.moved = False
@@ -52,13 +54,15 @@ class WallWatch:
         """Judges the moment `t` [ns]; `adrift`: at depth, and yet nothing is felt; `leaving`: the arm is on a free motion."""
         breath, dt = self._breath, self._period_s
         calm = breath.calm(t)
-        self._calm_for, self._restless_for = (self._calm_for + dt, 0.0) if calm else (0.0, self._restless_for + dt)
+        self._calm_for = self._calm_for + dt if calm else 0.0
+        self._restless_for = 0.0 if self.calm else self._restless_for + dt
         self._hidden_for = self._hidden_for + dt if breath.hidden and not calm and not leaving else 0.0
         self._adrift_for = self._adrift_for + dt if adrift else 0.0
         lost = self._adrift_for > LOST_S
         if lost:
             self._losses, self._adrift_for = self._losses + 1, 0.0
         self.spoiled = lost or not calm
+        self.leaps = not (calm or breath.hidden)
         self.open = not self._gated or abs(breath.displacement(t)) < GATE_M
         self.moved = self.moved or breath.moved
         if self.moved:

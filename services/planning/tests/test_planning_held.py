@@ -48,7 +48,7 @@ def test_released_it_goes_on_and_misses_nothing(phase: Phase, soft: bool) -> Non
 
 
 def test_a_soft_stop_in_contact_retreats_along_the_normal_and_waits() -> None:
-    world = stopped_in(Phase.SCAN, soft=True, seconds=0.5)
+    world = stopped_in(Phase.SCAN, soft=True, seconds=0.8)
     assert world.pressed == 0.0
     assert world.depth < -0.005
     where = world.kinematics.pose(world.q)[:3, 3]
