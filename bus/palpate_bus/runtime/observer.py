@@ -92,12 +92,15 @@ class ObservedService:
         """Newest simulated time [ns] seen."""
         self._stepped = NEVER
 
-    def drain_and_step(self) -> bool:
-        """Takes in what has come and steps the service if its period has passed; whether anything came."""
+    def drain_and_step(self, last: bool = False) -> bool:
+        """Takes in what has come and steps the service if its period has passed; whether anything came.
+
+        The `last` time it steps for whatever has come: by the wall clock events come after the last periodic message.
+        """
         busy = self._drain()
         period = self.stepper.role.period
         due = self.now - self.now % period
-        if busy and due >= 0 and (due > self._stepped or not self.stepper.ports):
+        if busy and due >= 0 and (due > self._stepped or last or not self.stepper.ports):
             for port, packet in self.stepper.step(due):
                 self.publishers[port.topic.name].put(packet.payload, packet.sequence)
             self._stepped = due

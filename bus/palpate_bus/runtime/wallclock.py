@@ -169,6 +169,8 @@ class WallClockNode(Node):
             self._receive(0)
             if all(b.holds_any for b in needed):
                 break
+            if self._end is not None:  # what is missing does not come any more
+                return self._end + 1
             message = self._link.poll(HANDSHAKE_POLL_S if needed else None)
             if message is not None:
                 self._obey(message)

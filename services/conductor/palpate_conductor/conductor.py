@@ -87,6 +87,8 @@ class Conductor:
         self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace)
         self._started_at = 0.0
         self._complained = False
+        self._silent_s = 0.0
+        """For how long nothing was heard of any service, at most, before the first had finished [s]."""
         self.started_at_perf = 0.0
 
     @property
@@ -95,10 +97,9 @@ class Conductor:
 
         Of a lockstep run nothing is said: there all services may be silent because one of them takes its time.
         """
-        silent = self.watchdog.longest_silence
-        if not self._wallclock or silent < INTERRUPTED_S or self._heartbeat.stood_still_s:
+        if not self._wallclock or self._silent_s < INTERRUPTED_S:
             return ""
-        return f"for {silent:.1f} s nothing was heard of any service: the transport or the whole machine stood still"
+        return f"for {self._silent_s:.1f} s nothing was heard of any service: the transport or the whole machine stood still"
 
     @property
     def elapsed_s(self) -> float:
@@ -172,15 +173,14 @@ class Conductor:
         self._started_at = monotonic()
         self.started_at_perf = perf_counter()
         self.watchdog.forgive()
-        self.watchdog.longest_silence = 0.0
         self.grants.begin()
         try:
             self._conduct(died, tell)
             self.outcome.wall_time_s = monotonic() - self._started_at
             self._end(died)
-        except (RunFailed, KeyboardInterrupt) as failure:
+        except (Exception, KeyboardInterrupt, SystemExit) as failure:  # whatever it is, what was measured is to be told
             self.outcome.interrupted = isinstance(failure, KeyboardInterrupt)
-            why = f"interrupted at {max(self._observed.now, 0) / NS:.3f} s" if self.outcome.interrupted else str(failure)
+            why = self._why(failure)
             self._hear_who_missed_us()
             self.outcome.failure = self.outcome.failure or why
             self.outcome.wall_time_s = monotonic() - self._started_at
@@ -188,8 +188,17 @@ class Conductor:
         self._operator_requests.close()
         self._contract.close()
         self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
-        self._observed.drain_and_step()
+        self._observed.drain_and_step(last=True)
         return self.outcome
+
+    def _why(self, failure: BaseException) -> str:
+        """In words."""
+        if isinstance(failure, KeyboardInterrupt):
+            return f"interrupted at {max(self._observed.now, 0) / NS:.3f} s"
+        if isinstance(failure, RunFailed):
+            return str(failure)
+        log.error("the conductor failed", exc_info=failure)
+        return f"the conductor failed: {type(failure).__name__}: {failure}"
 
     def _handshake(self, died: Callable[[], Mapping[str, str]]) -> None:
         ready: dict[str, list[str]] = {}
@@ -198,6 +207,7 @@ class Conductor:
         told = False
         while len(ready) < len(self._roles) or any(ready.values()):
             self._heartbeat.turn()
+            self._contract.attend()  # it hears the answers, too, and must not fill up
             self._say(RunControl.HELLO)
             sleep(0.05)
             for role, message, detail in self._heard():
@@ -266,6 +276,8 @@ class Conductor:
             self._operator_requests.attend(self._collector.collected.supervisor)
             self._contract.attend()
             self._extend()
+            if not finished:  # then it may say nothing any more
+                self._silent_s = max(self._silent_s, self.watchdog.silent_for())
             self._watch()
             tell(self)
             sleep(POLL_S)
@@ -365,7 +377,8 @@ class Conductor:
         for one in lost:
             self._say(RunControl.LOST, self.outcome.lost[one], role=one, reason=how)
         reached = max(progress.tick for progress in self.watchdog.progress.values())
-        self.grants.grant(reached - reached % MS + AFTER_LOSS, last=True)
+        end = reached - reached % MS + AFTER_LOSS
+        self.grants.grant(min(end, self.grants.horizon) if self.grants.last else end, last=True)
 
     def _close(self, role: str, detail: dict[str, Any]) -> None:
         self.outcome.reports[role] = detail

@@ -61,9 +61,10 @@ class OperatorRequestServer:
     def _take(self, query: Any, supervisor: Any | None) -> None:
         try:
             asked = json.loads(query.payload.to_bytes())
-            word, reason, ms = asked["word"], str(asked["reason"]), int(asked.get("ms", 0))
+            reason = str(asked["reason"]).encode(errors="replace").decode()  # a terminal's odd bytes keep no stop back
+            word, ms = asked["word"], int(asked.get("ms", 0))
             request = None if word in TIME_REQUESTS else WORDS[word]
-        except (AttributeError, KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
             self._reply(query, False, f"no request: want a word out of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
             return
         if request is None:

@@ -27,8 +27,6 @@ class RunWatchdog:
         """`producers` gives the producing role of each topic."""
         self.progress = {role: RoleProgress() for role in roles}
         self._producers = producers
-        self.longest_silence = 0.0
-        """For how long nothing was heard of any service, and then something was again [s]."""
 
     def report(self, role: str, tick: int, waiting_for: str) -> None:
         """Takes a report. A role that the run does not have is ignored."""
@@ -36,7 +34,6 @@ class RunWatchdog:
         if progress is None:
             return
         now = monotonic()
-        self.longest_silence = max(self.longest_silence, self.silent_for())
         progress.reported = now
         progress.waiting_for = waiting_for
         if tick > progress.tick:

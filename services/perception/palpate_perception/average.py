@@ -1,6 +1,6 @@
 """Where the wall lies by the mean of all small images, relative to the surface that a burst showed.
 
-A burst lasts less than a second, and what the camera gets wrong for a few seconds is frozen into the surface it shows. The small
+A burst lasts two seconds, and what the camera gets wrong for a few seconds is frozen into the surface it shows. The small
 images go on for minutes. Pixel i, which saw the wall at the outward displacement y_i, tells of the wall without its breath
 
     r_i = mean of (y_i - m_i d)

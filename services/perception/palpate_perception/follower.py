@@ -80,7 +80,8 @@ class Follower:
 
     def _look(self, t_s: float, depth: Image, camera: Intrinsics, q: Array | None) -> None:
         if self._watching and t_s >= self._asked_s:
-            self._watch = self._watch or Watch(camera, self._X_WA, self._exam)
+            if self._watch is None or not self._watch.camera.same(camera):
+                self._watch = Watch(camera, self._X_WA, self._exam)  # a camera that is another one is watched anew
             self._watch.add(t_s, depth, self._arm, q)
 
     def _follow(self, t_s: float, depth: Image, q: Array | None) -> Followed:

@@ -92,8 +92,8 @@ class PerceptionService(Service):
         burst.waiting += [image for image in images if nanoseconds(image.header.stamp) >= burst.asked]
         self._fuse(burst, inbox)
         full = burst.fusion is not None and burst.fusion.frames >= burst.wanted
-        given_up = bool(burst.wrong) or inbox.lost("camera") or (not full and t >= burst.deadline)
         watched = self._follower.watched or t >= burst.asked + LONGEST_S * NS + PATIENCE_NS
+        given_up = bool(burst.wrong) or inbox.lost("camera") or (not full and watched and t >= burst.deadline)
         if not given_up and not (full and watched):
             return {}
         self._burst = None

@@ -69,6 +69,8 @@ UNUSUAL: Final = 3.0
 """... and more than so many times the usual does not count for more: it may be a motion that has begun."""
 DRIFT_S: Final = 8.0
 """What comes more slowly than this is no motion of the patient, but the camera's drift: bodies shift at once."""
+GAP_S: Final = 0.2
+"""An image does not speak for more time than this, however long nothing was seen before it: the patient may have moved then."""
 MOVED_IMAGES: Final = 3
 """... if so many images in a row say so."""
 
@@ -142,9 +144,12 @@ class Tracker:
         if float(weight @ self.wall.lifts**2) < LEAST_SHARE * self._whole:
             return self._told(State.MOVED if self._moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
+        if not weight.any():
+            return self._told(State.MOVED if self._moved else State.LOST, expected)
         still = y - self.wall.lifts * d
-        self._weigh_error(t_s - self._last_s, still, weight)
-        self._weigh_motion(t_s - self._last_s, still, weight)
+        elapsed = min(t_s - self._last_s, GAP_S)
+        self._weigh_error(elapsed, still, weight)
+        self._weigh_motion(elapsed, still, weight)
         self._last_s = t_s
         noise = float(np.sqrt(1 / (weight @ self.wall.lifts**2) + self._shared))
         surprise = abs(d - expected)
@@ -225,7 +230,7 @@ def jackknife(left: Array, weight: Array, lifts: Array, patch: NDArray[np.intp])
     None where one patch tells more than all others together, so that nothing is known of what they share.
     """
     told, pull = np.bincount(patch, weight * lifts**2), np.bincount(patch, weight * lifts * left)
-    if told.max() > 0.5 * told.sum():
+    if not told.any() or told.max() > 0.5 * told.sum():
         return None
     return float(np.sum((pull / (told.sum() - told)) ** 2))
 

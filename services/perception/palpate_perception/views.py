@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from palpate_models.frames import Array
 
 HEIGHT_M: Final = (-0.16, 0.06)
@@ -23,3 +25,7 @@ class Intrinsics:
     """Calibrated pose of the optical frame in world, shape (4, 4)."""
     shape: tuple[int, int]
     """Height and width of the full image."""
+
+    def same(self, other: Intrinsics) -> bool:
+        """Whether the other is of the same image from the same place."""
+        return self.shape == other.shape and np.array_equal(self.K, other.K) and np.array_equal(self.X_WC, other.X_WC)

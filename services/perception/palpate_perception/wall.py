@@ -35,6 +35,8 @@ CUTOFF_M: Final = 0.06
 """Shorter waves of the wall are not seen by pixels 14 mm apart."""
 DEGREE: Final = 4
 """Total degree of the mode's polynomial."""
+UNKNOWN_M: Final = 2e-3
+"""Noise of a pixel about which the frames tell nothing."""
 VALID: Final = 0.7
 """A pixel that was seen in fewer of the frames is left out."""
 STEEP: Final = 0.35
@@ -143,7 +145,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[S
     pixel, gain = pixel[keep], 1 / slope[keep]
     mean, sigma, p_A, n_A = mean[keep], sigma[keep], p_A[keep], n_A[keep]
 
-    outward = np.nan_to_num((frames.reshape(len(frames), -1)[:, pixel] - mean) / gain)
+    outward = (without_gaps(frames.reshape(len(frames), -1)[:, pixel]) - mean) / gain
     mode = _mode(outward, np.abs(gain) / sigma, p_A, exam)
     lifts = mode(p_A)
     weight = lifts * (gain / sigma) ** 2
@@ -161,9 +163,23 @@ def steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
     flat = frames.reshape(len(frames), -1)
     pixel = np.flatnonzero(np.isfinite(flat).mean(axis=0) > VALID)
     seen = flat[:, pixel]
-    step = np.nan_to_num(np.diff(seen, axis=0))
-    sigma = np.sqrt(np.mean(step**2, axis=0) / 2) if len(frames) > 2 else np.full(len(pixel), 2e-3)
+    step = np.diff(without_gaps(seen), axis=0)
+    between = np.isfinite(seen[1:]) & np.isfinite(seen[:-1])  # a step into a gap or out of it is not noise alone
+    noise = np.sqrt(np.sum(np.where(between, step, 0.0) ** 2, axis=0) / np.maximum(between.sum(axis=0), 1) / 2)
+    sigma = np.where(between.any(axis=0), noise, UNKNOWN_M) if len(frames) > 2 else np.full(len(pixel), UNKNOWN_M)
     return pixel, np.nanmean(seen, axis=0), np.maximum(sigma, 1e-4)
+
+
+def without_gaps(seen: Array) -> Array:
+    """Depths of pixels, shape (frames, n), with what a frame lacks (NaN) between those before and after it.
+
+    Real cameras' holes flicker: a pixel that is not seen for a frame does not stand still in it.
+    """
+    filled, k = seen.copy(), np.arange(len(seen))
+    for column in np.flatnonzero(~np.isfinite(seen).all(axis=0)):
+        known = np.isfinite(seen[:, column])
+        filled[:, column] = np.interp(k, k[known], seen[known, column])
+    return filled
 
 
 def _mode(outward: Array, certainty: Array, p_A: Array, exam: Exam) -> BreathingMode:

@@ -16,6 +16,7 @@ from palpate_models.scenario import Robot
 from palpate_perception.arm import ArmMask, passes
 from palpate_perception.breath_filter import BreathFilter, strongest_rate
 from palpate_perception.tracker import jackknife
+from palpate_perception.wall import steady, without_gaps
 from palpate_perception.watch import rises
 
 
@@ -166,3 +167,21 @@ def test_a_second_look_tells_where_the_patient_who_moved_lies(kind: str) -> None
     p_A = apply(inverse(np.array(exam_input(case).X_WA)), np.asarray(result.surface.vertices, np.float64).reshape(-1, 3))
     centre = (p_A[:, :2].min(axis=0) + p_A[:, :2].max(axis=0)) / 2
     assert np.abs(centre - case.exam.centre_m - result.shift[-1]).max() < 3e-3, "the mesh lies where the body lies"
+
+
+def test_pixels_whose_holes_flicker_show_the_whole_breath_and_no_less_noise() -> None:
+    """A pixel that was not seen for a frame did not stand still in it."""
+    rng = np.random.default_rng(1)
+    breath = 0.004 * np.sin(np.arange(80) * 2 * np.pi / 40)
+    frames = 1.0 + breath[:, None] + rng.normal(0.0, 0.002, (80, 200))
+    frames[rng.random(frames.shape) < 0.2] = np.nan
+    filled = without_gaps(frames)
+    assert np.isfinite(filled).all()
+    assert np.ptp(filled.mean(axis=1)) > 0.95 * np.ptp(breath)
+    _, _, sigma = steady(frames.reshape(80, 10, 20))
+    assert abs(np.median(sigma) - 0.002) < 0.0002
+
+
+def test_a_jackknife_of_nothing_tells_nothing() -> None:
+    nothing = np.zeros(6)
+    assert jackknife(nothing, nothing, np.ones(6), np.array([0, 0, 1, 1, 2, 2])) is None
