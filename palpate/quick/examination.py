@@ -31,6 +31,7 @@ from palpate_planning.palpation import (
     HOLD_S,
     HOP_M,
     LIFT_MPS,
+    PUSHING,
     SETTLE_MAX_S,
     SETTLED_M,
     SETTLED_S,
@@ -249,7 +250,7 @@ class QuickExamination:
         self._count += 1
         measured = (self._depth, self._force, self._load, (_NOWHERE, _NOWHERE), self._touching)
         contact = ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, loop.uncertainty_m), *measured)
-        motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT)
+        motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT, pushing=stage in PUSHING)
         at = int(motion.along.position * way.per_m + 0.5)
         self._depth = motion.regulation.reference + loop.regulation(k)
         share = way.breathing[at]

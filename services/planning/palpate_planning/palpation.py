@@ -59,6 +59,8 @@ class StrokeStage(Enum):
 
 PRESSING: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE, StrokeStage.DESCEND)
 """Stages in which the tissue is pressed, or is about to be."""
+PUSHING: Final = (*PRESSING, StrokeStage.LIFT)
+"""Stages in which the measured force is fed forward."""
 AT_DEPTH: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE)
 
 
@@ -258,8 +260,8 @@ class Palpation:
             self._hold()
         elif self.stage is StrokeStage.WAIT:
             self._wait()
-        lifting = self.stage is StrokeStage.LIFT
-        self._motion.regulate(contact, in_contact=contact.touching and not lifting, pressing=lifting or self.stage in PRESSING)
+        in_contact = contact.touching and self.stage is not StrokeStage.LIFT
+        self._motion.regulate(contact, in_contact=in_contact, pushing=self.stage in PUSHING)
         return self._report(t, contact, rate)
 
     def _heed_the_elbow(self, contact: ContactMeasurement) -> None:

@@ -190,13 +190,13 @@ class StrokeMotion:
         self._sample = min(self._sample + rate, last)
         return self._sample >= last
 
-    def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pressing: bool) -> None:
+    def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pushing: bool) -> None:
         """Regulates the measured depth towards the target depth.
 
-        `in_contact` lets errors be integrated, `pressing` the force be fed forward: on the way above the skin nothing that comes
+        `in_contact` lets errors be integrated, `pushing` the force be fed forward: on the way above the skin nothing that comes
         against the tool is pushed back.
         """
-        force = contact.force if pressing else 0.0
+        force = contact.force if pushing else 0.0
         self.regulation = self._regulator.update(self.depth.position, contact.depth, force, contact.load, in_contact)
 
     @property
