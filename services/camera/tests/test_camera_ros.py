@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +34,17 @@ FRAME = "camera_depth_optical_frame"
 METRES = np.array([[1.0, np.nan, 0.731], [0.5, 2.25, 1.125]], dtype=np.float32)
 
 
+TAKEN = count(5)
+"""Stamps of images [ns], each newer than the one before."""
+
+
 def ros_image(encoding: str = "16UC1", big_endian: bool = False) -> Any:
     order = ">" if big_endian else "<"
     millimetres = np.nan_to_num(METRES * 1000).round().astype(f"{order}u2")
     pixels = millimetres if encoding == "16UC1" else METRES.astype(f"{order}f4")
     padded = np.zeros((2, 3 * pixels.itemsize + 5), np.uint8)  # drivers may pad their rows
     padded[:, : 3 * pixels.itemsize] = pixels.view(np.uint8).reshape(2, -1)
-    return Image(header(5, FRAME), 2, 3, encoding, int(big_endian), padded.shape[1], padded.ravel())
+    return Image(header(next(TAKEN), FRAME), 2, 3, encoding, int(big_endian), padded.shape[1], padded.ravel())
 
 
 def ros_info(d: float = 0.0) -> Any:
@@ -95,7 +100,18 @@ def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
     port.waiting = [ros_image()]
     assert set(service.step(300_000_000, inbox)) == small
     assert service.step(400_000_000, inbox) == {}, "no new image"
-    assert service.finish() == {"bursts": 1, "frames": 2, "frames_rejected": 0, "problem": ""}
+    assert service.finish() == {"bursts": 1, "frames": 2, "frames_rejected": 0, "frames_repeated": 0, "problem": ""}
+
+
+def test_an_image_that_is_repeated_is_not_passed_on_as_new() -> None:
+    port = Port()
+    service = RosCameraService(port)
+    image = ros_image()
+    port.waiting = [image]
+    assert service.step(0, HandInbox())
+    port.waiting = [image]
+    assert service.step(100_000_000, HandInbox()) == {}
+    assert service.finish()["frames_repeated"] == 1
 
 
 def test_the_pose_is_the_whole_chain() -> None:

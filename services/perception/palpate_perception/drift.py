@@ -45,13 +45,15 @@ class CameraDrift:
         """Where they showed it [m], shape (n,)."""
         self.r_W: Array = r_W[table]
         """Viewing rays of unit z in world axes, shape (n, 3)."""
-        self._drift, self._last_s = 0.0, t_s
+        self.drift = 0.0
+        """By the images so far [m]."""
+        self._last_s = t_s
 
     def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> float:
         """The drift [m] by an image exposed at `t_s` [s]: depths of these pixels [m], and which the arm may hide, (n,) each."""
         seen = np.isfinite(depth) & ~hidden
         if np.count_nonzero(seen) >= LEAST_PIXELS:
             now = float(np.median((depth - self.depth)[seen]))
-            self._drift += (1 - np.exp((self._last_s - t_s) / SLOWNESS_S)) * (now - self._drift)
+            self.drift += (1 - np.exp((self._last_s - t_s) / SLOWNESS_S)) * (now - self.drift)
         self._last_s = t_s
-        return self._drift
+        return self.drift

@@ -67,6 +67,7 @@ class Follower:
         watch, self._watch, self._watching = self._watch, None, False
         if watch is None:
             return None
+        drifted = 0.0 if self._drift is None else self._drift.drift
         try:
             wall, times, d, self._drift = watch.learn()
         except UnseenWallError:
@@ -74,7 +75,7 @@ class Follower:
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         corners = np.array([(cx + i * width / 2, cy + j * height / 2, 0.0) for i in (-1, 1) for j in (-1, 1)])
         if self._tracker is not None and self._tracker.moved:
-            self.shift = self.shift + shift_between(self._tracker.wall, wall, corners.mean(axis=0))
+            self.shift = self.shift + shift_between(self._tracker.wall, wall, corners.mean(axis=0), drifted)
         self._tracker = Tracker(wall, times, d, corners)
         return wall, times, d
 

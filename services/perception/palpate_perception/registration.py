@@ -33,10 +33,13 @@ def reasons(lifts: Array, n_A: Array, from_middle: Array) -> Array:
     return np.column_stack((lifts, n_A[:, :2], turn))
 
 
-def shift_between(before: SeenWall, after: SeenWall, middle: Array) -> Array:
-    """How far the skin about `middle`, in A [m], shape (3,), has moved along the table [m], in A, shape (2,)."""
+def shift_between(before: SeenWall, after: SeenWall, middle: Array, drift: float) -> Array:
+    """How far the skin about `middle`, in A [m], shape (3,), has moved along the table [m], in A, shape (2,).
+
+    Meanwhile the camera's depth has drifted by `drift` [m]: along a slanting view that would look like a shift.
+    """
     _, i, j = np.intersect1d(before.pixel, after.pixel, assume_unique=True, return_indices=True)
-    y = 2 * (after.depth[j] - before.depth[i]) / (after.gain[j] + before.gain[i])
+    y = 2 * (after.depth[j] - drift - before.depth[i]) / (after.gain[j] + before.gain[i])
     n_A = (before.n_A[i] + after.n_A[j]) / 2
     X = reasons((before.lifts[i] + after.lifts[j]) / 2, n_A, (before.p_A[i] + after.p_A[j]) / 2 - middle)
     motion: Array = np.zeros(4)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
 from palpate_bus.messages.images import depth_in_metres
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.ros_node import RosNode
@@ -84,7 +84,9 @@ class RosCameraService(Service):
         self._port, self._frame = port, frame
         self._X_WC = _await_pose(port, frame, world, wait_s)
         self._wanted = 0
-        self._facts = {"bursts": 0, "frames": 0, "frames_rejected": 0}
+        self._stamp = 0
+        """When the newest image was taken, by the driver's clock [ns]; 0: none, or the driver does not say."""
+        self._facts = {"bursts": 0, "frames": 0, "frames_rejected": 0, "frames_repeated": 0}
         self._problem = ""
 
     def start(self) -> Outbox:
@@ -102,6 +104,11 @@ class RosCameraService(Service):
             self._facts["bursts"] += len(triggers)
         if not images or info is None:
             return {}
+        stamp = nanoseconds(images[-1].header.stamp)
+        if self._stamp and stamp == self._stamp:  # a relay or a driver that hangs shows a wall that stands still
+            self._facts["frames_repeated"] += 1
+            return {}
+        self._stamp = stamp
         try:
             _agree(images[-1], info, self._frame)
             depth = depth_in_metres("depth image", images[-1])
@@ -118,7 +125,7 @@ class RosCameraService(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """How much was passed on, and why something was not."""
+        """How much was passed on or repeated, and why something was not passed on."""
         return {**self._facts, "problem": self._problem}
 
 
