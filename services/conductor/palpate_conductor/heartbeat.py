@@ -34,7 +34,9 @@ class Heartbeat:
         self._deadline_s = longest_silence_s(rules, wallclock)
         self._publisher = member.internal_publisher(HEARTBEAT, CONTROL_TYPE, QOS)
         self._beat = codec.encoder(CONTROL_TYPE)(RunControl(RunControl.HEARTBEAT, os.getpid(), False, "", home()))
-        self._turned = monotonic()
+        self._turned = self._beaten = monotonic()
+        self._missed_at = 0.0
+        """When the heart beat again after it had missed beats for longer than services wait."""
         self._over = Event()
         self._thread = Thread(target=self._run, name="heartbeat", daemon=True)
         self._stood_still_s = 0.0
@@ -42,19 +44,21 @@ class Heartbeat:
 
     def start(self) -> None:
         """Begins to beat."""
-        self._turned = monotonic()
+        self._turned = self._beaten = monotonic()
         self._thread.start()
 
     def turn(self) -> None:
         """Says that the conductor's loop turns."""
         now = monotonic()
-        if now - self._turned > self._deadline_s:
-            self._stood_still_s, self._moved_on = now - self._turned, now
+        stood_still_s = now - self._turned
+        missed = now - self._beaten > self._deadline_s or now - self._missed_at < stood_still_s
+        if stood_still_s > self._deadline_s and missed:
+            self._stood_still_s, self._moved_on = stood_still_s, now
         self._turned = now
 
     @property
     def stood_still_s(self) -> float:
-        """How long [s] the conductor's loop has just stood still, longer than its services wait; 0 when it has not."""
+        """How long [s] the conductor has just stood still, its heart for longer than its services wait; 0 when it has not."""
         return self._stood_still_s if monotonic() - self._moved_on < RECENT_S else 0.0
 
     def stop(self) -> None:
@@ -66,6 +70,9 @@ class Heartbeat:
     def _run(self) -> None:
         sequence = 0
         while not self._over.wait(self._period_s):
-            if monotonic() - self._turned <= HUNG_S:
+            now = monotonic()
+            if now - self._turned <= HUNG_S:
+                self._missed_at = now if now - self._beaten > self._deadline_s else self._missed_at
+                self._beaten = now
                 sequence += 1
                 self._publisher.put(self._beat, sequence)

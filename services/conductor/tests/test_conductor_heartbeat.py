@@ -26,3 +26,19 @@ def test_less_than_the_services_wait_is_no_standstill(
         assert heart.stood_still_s == pytest.approx(stood_still_s)
     finally:
         close_session(session)
+
+
+def test_a_loop_that_stands_still_while_the_heart_beats_is_missed_by_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else what really ended a run would be overwritten by "conductor lost"."""
+    session = open_session(BusOptions())
+    now = 100.0
+    monkeypatch.setattr(heartbeat, "monotonic", lambda: now)
+    try:
+        heart = Heartbeat(Member(session, "conductor", contract(), 0), contract(), wallclock=True)
+        heart.turn()
+        now += 0.4
+        heart._beaten = now - 0.1
+        heart.turn()
+        assert heart.stood_still_s == 0.0
+    finally:
+        close_session(session)

@@ -64,8 +64,11 @@ class PerceptionService(Service):
     def _follow(self, image: Message, inbox: Inbox) -> Message:
         """What a small image tells."""
         stamp, status = nanoseconds(image.header.stamp), inbox.latest("robot/status")
-        depth = depth_in_metres("camera/follow/depth", image)
         camera = messages.intrinsics(inbox, "camera/follow/camera_info", image)
+        try:
+            depth = depth_in_metres("camera/follow/depth", image)
+        except ValueError:  # of another encoding: nothing is seen
+            depth, camera = np.empty((0, 0), np.float32), None
         q = None if status is None else np.asarray(status.position, np.float64)
         return messages.motion(stamp, self._follower.take(stamp / NS, depth, camera, q))
 
