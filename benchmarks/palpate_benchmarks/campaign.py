@@ -28,6 +28,7 @@ from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.conduct import conduct
+from palpate_conductor.grants import WALLCLOCK_LEAD
 from palpate_conductor.outcome import Patience, RunFailed
 from palpate_conductor.result import RunProgress, RunResult
 from palpate_conductor.timing import Timing
@@ -202,10 +203,16 @@ class _Watch:
             self.seen_scan = progress.t
         if progress.t - self.seen_scan < self.case.at_s * NS and wanted == ExamState.PHASE_SCAN:
             return
-        self.finding.injected_s = progress.t / NS
+        self.finding.injected_s = _now_s(progress, wallclock=self.case.wallclock)
         self.since = monotonic()
         number = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}.get(self.case.kind, signal.SIGUSR1)
         self.local.running[self.target].send_signal(number)
+
+
+def _now_s(progress: RunProgress, *, wallclock: bool) -> float:
+    """Simulated time [s]: that of what was heard last. By the wall clock it is what has passed: the conductor may hear late."""
+    heard = progress.t / NS
+    return max(heard, heard / progress.real_time_factor - WALLCLOCK_LEAD / NS) if wallclock else heard
 
 
 def _signs(progress: RunProgress) -> list[str]:
