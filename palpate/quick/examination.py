@@ -27,20 +27,18 @@ from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasure
 from palpate_planning.coverage import strokes, transfer
 from palpate_planning.descent import ALLOWANCE_M, DESCEND_MPS, PROBE_MPS, REST_S, SIGMAS, TARE_S
 from palpate_planning.palpation import (
-    AT_DEPTH,
     HOLD_S,
     HOP_M,
     LIFT_MPS,
-    PUSHING,
     SETTLE_MAX_S,
     SETTLED_M,
     SETTLED_S,
     STEADY_FRACTION,
     STOPPED,
-    StrokeStage,
 )
 from palpate_planning.path import Ints, SurfacePath, lay
 from palpate_planning.segments import Segment
+from palpate_planning.stages import AT_DEPTH, PUSHING, StrokeStage
 from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
 from palpate_planning.surface import Foot, PerceivedSurface
 from palpate_planning.touch import FELT_N

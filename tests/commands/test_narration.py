@@ -16,7 +16,7 @@ from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunProgress
 from palpate_models.scenario import Exam
-from palpate_planning.palpation import StrokeStage
+from palpate_planning.stages import StrokeStage
 from palpate_planning.status import PHASE_OF, Phase
 
 EXAM = Exam(region_m=(0.10, 0.06))

@@ -48,8 +48,8 @@ def conduct(
         with rare_collections():
             outcome = conductor.run(died, report)
         failure = outcome.failure or given_up(collector.collected)
-        if failure and conductor.interruption:
-            failure = f"{failure}; {conductor.interruption}"
+        if failure and (interruption := conductor.watchdog.interruption):
+            failure = f"{failure}; {interruption}"
     except RunFailed as error:
         outcome = conductor.outcome
         failure = str(error)

@@ -24,7 +24,7 @@ from palpate_conductor.grants import Grants
 from palpate_conductor.handover import Places
 from palpate_conductor.heartbeat import Heartbeat
 from palpate_conductor.operator import OperatorRequestServer
-from palpate_conductor.outcome import Patience, RunFailed, RunOutcome
+from palpate_conductor.outcome import Patience, RunFailed, RunOutcome, in_words
 from palpate_conductor.service_health import service_statuses
 from palpate_conductor.timing import Timing
 from palpate_conductor.watchdog import RunWatchdog
@@ -38,8 +38,6 @@ POLL_S = 0.02
 OBSERVERS_FINISH_S = 60.0
 SILENT_S = 2.0
 """When all services are silent for so long, it is their way to the conductor that is at fault."""
-INTERRUPTED_S = 0.5
-"""... and when they are for so long and come again, it was; they report every 0.2 s."""
 
 
 class Conductor:
@@ -87,19 +85,7 @@ class Conductor:
         self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace)
         self._started_at = 0.0
         self._complained = False
-        self._silent_s = 0.0
-        """For how long nothing was heard of any service, at most, before the first had finished [s]."""
         self.started_at_perf = 0.0
-
-    @property
-    def interruption(self) -> str:
-        """That the transport was interrupted for a while, as it seems here; empty if it was not.
-
-        Of a lockstep run nothing is said: there all services may be silent because one of them takes its time.
-        """
-        if not self._wallclock or self._silent_s < INTERRUPTED_S:
-            return ""
-        return f"for {self._silent_s:.1f} s nothing was heard of any service: the transport or the whole machine stood still"
 
     @property
     def elapsed_s(self) -> float:
@@ -180,7 +166,7 @@ class Conductor:
             self._end(died)
         except (Exception, KeyboardInterrupt, SystemExit) as failure:  # whatever it is, what was measured is to be told
             self.outcome.interrupted = isinstance(failure, KeyboardInterrupt)
-            why = self._why(failure)
+            why = in_words(failure, self._observed.now)
             self._hear_who_missed_us()
             self.outcome.failure = self.outcome.failure or why
             self.outcome.wall_time_s = monotonic() - self._started_at
@@ -190,15 +176,6 @@ class Conductor:
         self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
         self._observed.drain_and_step(last=True)
         return self.outcome
-
-    def _why(self, failure: BaseException) -> str:
-        """In words."""
-        if isinstance(failure, KeyboardInterrupt):
-            return f"interrupted at {max(self._observed.now, 0) / NS:.3f} s"
-        if isinstance(failure, RunFailed):
-            return str(failure)
-        log.error("the conductor failed", exc_info=failure)
-        return f"the conductor failed: {type(failure).__name__}: {failure}"
 
     def _handshake(self, died: Callable[[], Mapping[str, str]]) -> None:
         ready: dict[str, list[str]] = {}
@@ -276,8 +253,8 @@ class Conductor:
             self._operator_requests.attend(self._collector.collected.supervisor)
             self._contract.attend()
             self._extend()
-            if not finished:  # then it may say nothing any more
-                self._silent_s = max(self._silent_s, self.watchdog.silent_for())
+            if self._wallclock and not finished:  # then it may say nothing any more
+                self.watchdog.note_silence()
             self._watch()
             tell(self)
             sleep(POLL_S)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.lockstep import NEVER, run_hash
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -57,3 +61,13 @@ class RunOutcome:
 
 class RunFailed(RuntimeError):
     """The run ended early. Names the service and the cause."""
+
+
+def in_words(failure: BaseException, t: int) -> str:
+    """Why a run ended at `t` [ns]. What nobody expected goes to the log with its traceback."""
+    if isinstance(failure, KeyboardInterrupt):
+        return f"interrupted at {max(t, 0) / NS:.3f} s"
+    if isinstance(failure, RunFailed):
+        return str(failure)
+    log.error("the conductor failed", exc_info=failure)
+    return f"the conductor failed: {type(failure).__name__}: {failure}"

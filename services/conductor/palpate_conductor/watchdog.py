@@ -6,6 +6,9 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from time import monotonic
 
+INTERRUPTED_S = 0.5
+"""When all services are silent for so long, it is their way to the conductor that is interrupted; they report every 0.2 s."""
+
 
 @dataclass
 class RoleProgress:
@@ -27,6 +30,7 @@ class RunWatchdog:
         """`producers` gives the producing role of each topic."""
         self.progress = {role: RoleProgress() for role in roles}
         self._producers = producers
+        self._longest_silence = 0.0
 
     def report(self, role: str, tick: int, waiting_for: str) -> None:
         """Takes a report. A role that the run does not have is ignored."""
@@ -43,6 +47,18 @@ class RunWatchdog:
     def silent_for(self) -> float:
         """Seconds since any service was heard of, whatever it said: they report while they wait, too."""
         return monotonic() - max(progress.reported for progress in self.progress.values())
+
+    def note_silence(self) -> None:
+        """Remembers how long nothing has been heard of any service."""
+        self._longest_silence = max(self._longest_silence, self.silent_for())
+
+    @property
+    def interruption(self) -> str:
+        """That the transport was interrupted for a while, as it seems here; empty if it was not."""
+        silent = self._longest_silence
+        if silent < INTERRUPTED_S:
+            return ""
+        return f"for {silent:.1f} s nothing was heard of any service: the transport or the whole machine stood still"
 
     def stalled_for(self) -> float:
         """Seconds since any service finished a tick."""

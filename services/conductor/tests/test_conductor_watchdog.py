@@ -1,5 +1,6 @@
 """Who blocks whom."""
 
+from palpate_conductor.outcome import in_words
 from palpate_conductor.watchdog import RunWatchdog
 
 PRODUCERS = {"joint_states": "robot", "control/joint_torque": "control", "sim/contact_wrench": "tissue", "exam/state": "planning"}
@@ -69,3 +70,20 @@ def test_when_none_is_heard_it_is_the_transport() -> None:
     assert w.silent_for() > 99.0
     w.report("robot", 1_000_000, "")
     assert w.silent_for() < 50.0
+
+
+def test_a_silence_of_all_is_told_when_a_run_has_failed() -> None:
+    w = watchdog()
+    w.progress["robot"].reported -= 2.0
+    w.note_silence()
+    assert w.interruption == "", "one role was silent, the others were heard"
+    for progress in w.progress.values():
+        progress.reported -= 2.0
+    w.note_silence()
+    w.report("robot", 1_000_000, "")
+    assert "for 2.0 s nothing was heard of any service" in w.interruption
+
+
+def test_what_nobody_expected_is_a_failure_too() -> None:
+    assert in_words(ValueError("odd"), 0) == "the conductor failed: ValueError: odd"
+    assert in_words(KeyboardInterrupt(), 2_500_000_000) == "interrupted at 2.500 s"

@@ -19,12 +19,13 @@ from palpate_planning.free_motion import FreeMotion, TrajectoryFollower
 from palpate_planning.kinematics import STRAIGHT_RAD, ArmKinematics
 from palpate_planning.look import look_postures
 from palpate_planning.motion_planning import NoPathError
-from palpate_planning.palpation import HIDES, Palpation, PalpationStep, StrokeStage
+from palpate_planning.palpation import HIDES, Palpation
 from palpate_planning.path import compile_ahead
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.requests import PLANNING_TIME, PressRequest
 from palpate_planning.segments import STRETCHED, Segment
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
+from palpate_planning.stages import PalpationStep, StrokeStage
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import Stops
 from palpate_planning.timing import RestartRamp

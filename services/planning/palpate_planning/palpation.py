@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from enum import Enum
-from typing import Final, NamedTuple
-
 import numpy as np
 
-from palpate_bus.setpoint import Setpoint
 from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.descent import ALLOWANCE_M, SIGMAS, Descent
 from palpate_planning.recovery import MOVED_M, Recovery
 from palpate_planning.segments import HOVER_M, STRETCHED, Segment
+from palpate_planning.stages import AT_DEPTH, PRESSING, PUSHING, PalpationStep, StrokeStage
 from palpate_planning.stroke_motion import ENDED_M, StrokeMotion
-from palpate_planning.wall import TouchedSkin, Wall
+from palpate_planning.wall import Wall
 from palpate_planning.wall_watch import WallWatch
 
 HOP_M = 0.010
@@ -41,46 +38,6 @@ UNNOTICED_M = 0.03
 """So much of the stroke before a patient was seen to have moved does not count: it is noticed after a second."""
 REPEAT_M = 0.010
 """So much of the stroke before the interruption is repeated: it is noticed after about 0.2 s."""
-
-
-class StrokeStage(Enum):
-    """Part of a stroke."""
-
-    REST = "resting above the skin"
-    DESCEND = "descending"
-    SETTLE = "settling at depth"
-    SLIDE = "sliding at depth"
-    HOLD = "holding at depth"
-    LIFT = "lifting"
-    TRANSFER = "moving to the next stroke"
-    WAIT = "waiting for the next stroke"
-    DONE = "done"
-
-
-PRESSING: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE, StrokeStage.DESCEND)
-"""Stages in which the tissue is pressed, or is about to be."""
-PUSHING: Final = (*PRESSING, StrokeStage.LIFT)
-"""Stages in which the measured force is fed forward."""
-AT_DEPTH: Final = (StrokeStage.SLIDE, StrokeStage.HOLD, StrokeStage.SETTLE)
-
-
-class PalpationStep(NamedTuple):
-    """What a step of the palpation did."""
-
-    setpoint: Setpoint
-    stage: StrokeStage
-    depth_setpoint: float
-    """[m]"""
-    steady: bool
-    """Whether a measurement of this step is a valid sample."""
-    limited: bool
-    """Whether force keeps the indenter from the depth asked for."""
-    target: int
-    """Index of the latest target reached."""
-    taring: bool = False
-    """Whether the arm rests in free air: what the sensor reads now is bias."""
-    touched: TouchedSkin | None = None
-    """The touch of this step, if there was one."""
 
 
 class Palpation:

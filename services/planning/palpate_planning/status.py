@@ -11,8 +11,8 @@ from palpate_models.frames import Array
 from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen
-from palpate_planning.palpation import StrokeStage
 from palpate_planning.requests import PressRequest
+from palpate_planning.stages import StrokeStage
 from palpate_planning.wall import TouchedSkin
 
 

@@ -8,7 +8,7 @@ from planning_fakes import World, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models import lbr
-from palpate_planning.palpation import StrokeStage
+from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
 
 PHASES = [Phase.HOME, Phase.LOOK, Phase.PLAN, Phase.APPROACH, Phase.INDENT, Phase.SCAN, Phase.RETRACT, Phase.RETURN]

@@ -14,10 +14,11 @@ from palpate_models.scenario import Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import TrajectoryFollower
 from palpate_planning.kinematics import ArmKinematics
-from palpate_planning.palpation import Palpation, StrokeStage
+from palpate_planning.palpation import Palpation
 from palpate_planning.path import SurfacePath
 from palpate_planning.periods import MS
 from palpate_planning.segments import Segment
+from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
 from palpate_planning.surface import Foot
 from palpate_planning.timing import BRAKED_NS, JOINT_ACCELERATION, RESTART_NS, JointTrajectory, RestartRamp, joint_trajectory

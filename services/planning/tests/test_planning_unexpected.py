@@ -7,8 +7,8 @@ from planning_fakes import World, known
 
 from palpate_models.scenario import Following
 from palpate_planning.breath import Breath, BreathObservation
-from palpate_planning.palpation import StrokeStage
 from palpate_planning.requests import PressRequest
+from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
 from palpate_planning.wall_watch import CALM_PATIENCE_S, WallWatch
 
