@@ -291,13 +291,12 @@ class Conductor:
     def _missing(self, died: Callable[[], Mapping[str, str]]) -> dict[str, str]:
         """Roles that are not there, with how they went."""
         ended = {role: how for role, how in died().items() if role not in self._places.taken}
-        if self._member.gone() and self._member.transport_lost():
+        gone = self._member.gone()
+        hows = {role: self._freezes.gone(role) for role in gone - self.outcome.lost.keys() - ended.keys()}
+        if gone and self._member.transport_lost():  # looked at last: services are missed before their router is
             reached = max(progress.tick for progress in self.watchdog.progress.values())
             raise RunFailed(f"transport lost at {max(reached, 0) / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault")
-        return {
-            **{role: self._freezes.gone(role) for role in self._member.gone() - self.outcome.lost.keys() - ended.keys()},
-            **ended,
-        }
+        return {**hows, **ended}
 
     def _miss(self, role: str, how: str) -> None:
         """Keeps the place of a role that is gone, or marks it lost."""
