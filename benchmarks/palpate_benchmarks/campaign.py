@@ -161,6 +161,8 @@ class _Watch:
     since: float = 0.0
     held: int = 0
     seen_scan: int | None = None
+    before: Sequence[str] = ()
+    """What was said before the damage."""
     signs: list[str] = field(default_factory=list)
 
     def tell(self, progress: RunProgress) -> None:
@@ -168,7 +170,7 @@ class _Watch:
         if self.finding.injected_s is None:
             self._strike(progress)
             return
-        new = [sign for sign in _signs(progress) if sign not in self.signs]
+        new = [sign for sign in _signs(progress) if sign not in (*self.signs, *self.before)]
         if new and not self.signs:
             self.finding.detected_ms = round((monotonic() - self.since) * 1e3, 1)
             self.finding.sign = new[0]
@@ -204,7 +206,7 @@ class _Watch:
         if progress.t - self.seen_scan < self.case.at_s * NS and wanted == ExamState.PHASE_SCAN:
             return
         self.finding.injected_s = _now_s(progress, wallclock=self.case.wallclock)
-        self.since = monotonic()
+        self.since, self.before = monotonic(), _signs(progress)
         number = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}.get(self.case.kind, signal.SIGUSR1)
         self.local.running[self.target].send_signal(number)
 
@@ -294,7 +296,7 @@ def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
     collected = result.collected
     last = RunProgress(0, 0.0, collected, ())
     if finding.injected_s is not None:
-        watch.signs += [sign for sign in _signs(last) if sign not in watch.signs]
+        watch.signs += [sign for sign in _signs(last) if sign not in (*watch.signs, *watch.before)]
         failed = result.failure is not None and result.failure not in UNHARMED
         if finding.detected_ms is None and (watch.signs or failed):
             finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
