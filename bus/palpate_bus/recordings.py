@@ -15,6 +15,7 @@ import yaml
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from zstandard import ZstdError
 
 from palpate_bus.contract import Contract
 
@@ -77,7 +78,7 @@ class Recording:
             ]
             try:
                 yield from each[0] if len(each) == 1 else heapq.merge(*each, key=attrgetter("stamp"))
-            except (McapError, EOFError, struct.error) as error:
+            except (McapError, EOFError, struct.error, ZstdError) as error:
                 raise RecordingError(f"{self.path}: breaks off: {error!r}; {_RECOVER}") from error
 
     def check(self, rules: Contract, topics: Collection[str], *, whole: bool = True) -> None:
@@ -151,7 +152,7 @@ def open_recording(path: Path) -> Recording:
     return Recording(path, files, types, counts, thinned, min(first), max(last), scenario)
 
 
-BROKEN = (McapError, EOFError, RuntimeError, ValueError, struct.error)
+BROKEN = (McapError, EOFError, RuntimeError, ValueError, ZstdError, struct.error)
 """What reading across a break raises: a short record, a chunk that does not decompress, a wrong checksum."""
 
 

@@ -115,8 +115,7 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         logging.basicConfig(level=settings.log, format=f"%(asctime)s {name} %(levelname)s %(message)s", stream=sys.stderr)
         rules = contract()
         places = hosted()
-        if all(rules.roles[place.role].observer for place in places):
-            signal.signal(signal.SIGTERM, signal.default_int_handler)  # what was recorded is completed first
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # what is open is closed first
         services = [place.make() for place in places]
         if all(stands_back(rules.roles[place.role], settings.runtime) for place in places):
             in_the_background()

@@ -29,10 +29,13 @@ class Queue:
     garbage = 0
 
     def __init__(self, *payloads: bytes) -> None:
-        self.waiting = deque(payloads)
+        self.waiting = deque(enumerate(payloads, 1))
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
-        return ReceivedSample(1, 0, self.waiting.popleft()) if self.waiting else None
+        if not self.waiting:
+            return None
+        number, payload = self.waiting.popleft()
+        return ReceivedSample(number, 0, payload)
 
 
 class Kept(Service):
@@ -54,6 +57,12 @@ class Kept(Service):
         return {"kept": len(self.messages)}
 
 
+def chunk(topic: str, stamp: int, sequence: int) -> bytes:
+    writer = ChunkWriter("robot", (topic,))
+    writer.add(topic, STATE, stamp, sequence)
+    return writer.chunk(50 * MS)
+
+
 class Bus:
     """A member of a bus on which a conductor says `commands`, one a look, and the robot has sent a chunk."""
 
@@ -64,14 +73,14 @@ class Bus:
         self.conductor_there = bool(commands)
         self.commands = [codec.encode(command, CONTROL_TYPE) for command in commands]
         self.reports: list[ServiceReport] = []
-        writer = ChunkWriter("robot", ("joint_states",))
-        writer.add("joint_states", STATE, 7 * MS, 8)
-        self.chunk = writer.chunk(50 * MS)
+        self.chunks = Queue(chunk("joint_states", 7 * MS, 8))
+        self.there: deque[str] = deque()
+        """Who is still on the bus, a look each; then nobody."""
 
     def internal_subscription(self, name: str, type_name: str) -> Queue:
         if name == "palpate/control":
             return Queue(*self.commands)
-        return Queue(self.chunk) if name == "palpate/record/robot" else Queue()
+        return self.chunks if name == "palpate/record/robot" else Queue()
 
     def subscription(self, topic: Topic) -> Queue:
         return Queue()
@@ -86,7 +95,7 @@ class Bus:
         return frozenset() if self.conductor_there else frozenset({"conductor"})
 
     def alive(self, roles: frozenset[str]) -> frozenset[str]:
-        return frozenset()
+        return frozenset({self.there.popleft()} & roles) if self.there else frozenset()
 
     def transport_lost(self) -> bool:
         return False
@@ -140,3 +149,55 @@ def test_told_to_leave_by_a_signal_it_completes_what_it_has() -> None:
         signal.signal(signal.SIGTERM, before)
     assert kept.finished
     assert kept.messages == [("joint_states", 7 * MS, 8)]
+
+
+@pytest.mark.parametrize("command", [RunControl.END, RunControl.ABORT], ids=["end", "abort"])
+def test_what_the_conductors_word_has_overtaken_is_kept(command: int) -> None:
+    kept = Kept()
+    member: Any = Bus(said(RunControl.HELLO), said(command))
+    member.there = deque(["robot", "robot"])
+    alive, looks = member.alive, []
+
+    def sends_once_more(roles: frozenset[str]) -> frozenset[str]:
+        looks.append(roles)
+        if len(looks) == 2:
+            member.chunks.waiting.append((2, chunk("joint_states", 57 * MS, 58)))
+        return frozenset(alive(roles))
+
+    member.alive = sends_once_more
+    node = RecorderNode(kept, member)
+    if command == RunControl.ABORT:
+        with pytest.raises(RunAborted):
+            node.run()
+    else:
+        node.run()
+    assert [stamp for _, stamp, _ in kept.messages] == [7 * MS, 57 * MS]
+    assert kept.finished
+
+
+@pytest.mark.parametrize(
+    "again",
+    [(1, ("joint_states", 7 * MS, 8)), (2, ("joint_states", -1, 9)), (2, ("planning/setpoint", 8 * MS, 9))],
+    ids=["again", "before the start", "another's topic"],
+)
+def test_a_chunk_that_cannot_be_is_garbage(again: tuple[int, tuple[str, int, int]]) -> None:
+    kept = Kept()
+    member: Any = Bus(said(RunControl.HELLO), said(RunControl.END))
+    number, message = again
+    member.chunks.waiting.append((number, chunk(*message)))
+    RecorderNode(kept, member).run()
+    assert kept.messages == [("joint_states", 7 * MS, 8)]
+    assert json.loads(member.reports[-1].detail)["garbage"] == 1
+
+
+def test_whatever_goes_wrong_what_was_kept_is_completed() -> None:
+    kept = Kept()
+    member: Any = Bus(said(RunControl.HELLO))
+
+    def out_of_memory(roles: frozenset[str]) -> frozenset[str]:
+        raise MemoryError
+
+    member.alive, member.conductor_there = out_of_memory, False
+    with pytest.raises(MemoryError):
+        RecorderNode(kept, member).run()
+    assert kept.finished

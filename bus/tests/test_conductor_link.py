@@ -32,9 +32,20 @@ DEADLINE_S = contract().internal[HEARTBEAT].deadline / 1e9
 class Queue:
     waiting: deque[bytes] = field(default_factory=deque)
     garbage: int = 0
+    given: int = 0
+    """Number of the message that was given last; one that is replayed has it again."""
+    latest: bytes = b""
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
-        return ReceivedSample(1, 0, self.waiting.popleft()) if self.waiting else None
+        if not self.waiting:
+            return None
+        payload = self.waiting.popleft()
+        self.given += bool(payload)
+        self.latest = payload or self.latest
+        return ReceivedSample(self.given, 0, self.latest)
+
+    def replay(self) -> None:
+        self.waiting.append(b"")
 
 
 class Bus:
@@ -157,3 +168,20 @@ def test_one_without_a_heartbeat_is_given_the_time_that_a_start_takes(wallclock:
     wallclock.say(RunControl.GRANT)
     link.poll()
     assert wallclock.silence(link, 9.0) == float("inf")
+
+
+def test_a_heartbeat_that_is_replayed_is_no_sign_of_life(wallclock: Bus) -> None:
+    link = wallclock.link(grace_s=9.0)
+    begin = wallclock.now
+    while not link.lost and wallclock.now - begin < 1.0:
+        wallclock.queues[HEARTBEAT].replay()
+        wallclock.now += STEP_S
+        link.poll()
+    assert wallclock.now - begin < 0.3
+
+
+def test_a_control_message_that_is_replayed_is_not_obeyed(wallclock: Bus) -> None:
+    link = wallclock.link()
+    wallclock.queues["palpate/control"].replay()
+    assert link.poll() is None
+    assert link.repeated == 1

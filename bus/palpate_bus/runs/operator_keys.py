@@ -15,6 +15,7 @@ import os
 import sys
 import termios
 import tty
+from contextlib import suppress
 from select import select
 from types import TracebackType
 from typing import Any, Self
@@ -46,7 +47,8 @@ class OperatorKeys:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._before:
-            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+            with suppress(termios.error):  # the terminal is gone
+                termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
             self._before = []
 
     def pressed(self) -> list[str]:

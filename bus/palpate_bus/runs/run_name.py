@@ -6,6 +6,7 @@ scenario, seed and time may tell of the patient.
 
 from __future__ import annotations
 
+import fcntl
 import json
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -15,6 +16,8 @@ from typing import Final
 from uuid import uuid4
 
 FILE: Final = "run.json"
+LOCK: Final = "run.lock"
+"""The file of a results folder whose lock its run holds; it names the process. The kernel drops the lock when that ends."""
 _LENGTH: Final = 12
 
 
@@ -25,6 +28,16 @@ def name_run(folder: Path) -> str:
     facts = {"run": name, "began": began, "palpate": version("palpate")}
     (folder / FILE).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     return name
+
+
+def in_use(folder: Path) -> bool:
+    """Whether a run still writes into a results folder. Raises OSError for one that cannot be looked into."""
+    with suppress(FileNotFoundError), (folder / LOCK).open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def run_of(folder: Path) -> str:

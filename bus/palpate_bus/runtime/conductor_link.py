@@ -71,6 +71,10 @@ class ConductorLink:
         self._grace_s = grace_s / (Settings.read().rate or 1.0)
         self._patience_s = CONDUCTOR_AWAITED_S
         self._granted = self._beating = False
+        self._said = self._beaten = 0
+        """Numbers of the newest control message and heartbeat: one that comes again is no word of the conductor."""
+        self.repeated = 0
+        """Control messages that came again."""
         self._silent_s = 0.0
         self._looked = self._sought = self._lost_at = monotonic()
         self._missed = False
@@ -85,6 +89,10 @@ class ConductorLink:
     def poll(self, timeout: float | None = None) -> Any | None:
         """The next control message, or None. Raises RunAborted when told so, or when the conductor was lost for the grace."""
         while (sample := self._control.get(timeout)) is not None:
+            if sample.sequence <= self._said:
+                self.repeated += 1
+                continue
+            self._said = sample.sequence
             try:
                 message = self._decode(sample.payload)
             except codec.CodecError:
@@ -114,7 +122,8 @@ class ConductorLink:
         since, self._looked = min(now - self._looked, LONGEST_LOOK_S), now
         beat = None
         while (sample := self._beats.get(0)) is not None:
-            beat = sample
+            if sample.sequence > self._beaten:
+                self._beaten, beat = sample.sequence, sample
         if beat is not None:
             self._take(beat.payload)
             return

@@ -26,6 +26,7 @@ class Seat:
         self.reports = Reports(member)
         self.tick = NEVER
         """The last tick that was stepped [ns]."""
+        self._closed = False
 
     def progress(self, waiting_for: str = "") -> None:
         """Reports progress if the last report is old enough."""
@@ -34,7 +35,7 @@ class Seat:
     def finish(self, counts: Mapping[str, Any]) -> None:
         """Closes the service and reports its end; `counts` is what the node has counted for it."""
         self.output.flush(self.tick)
-        facts = dict(self.service.finish())
+        facts = dict(self.close())
         detail = {"blame": self.stepper.blame.per_step_us(), "facts": facts, **counts}
         self.reports.say(ServiceReport.FINISHED, self.tick, detail=detail)
 
@@ -44,7 +45,14 @@ class Seat:
             self.output.flush(self.tick)  # what others have heard belongs in the recording
         self.reports.say(ServiceReport.FAILED, self.tick, detail={"error": why})
         with suppress(Exception):
-            self.service.finish()  # what it has open is closed
+            self.close()
+
+    def close(self) -> Mapping[str, Any]:
+        """Has the service close what it has open, once; returns its facts."""
+        if self._closed:
+            return {}
+        self._closed = True
+        return self.service.finish()
 
 
 class Node(ABC):
@@ -58,7 +66,10 @@ class Node(ABC):
         """Whose turn it is."""
 
     def run(self) -> None:
-        """Runs the services to the end of the run. Raises what a service raises, after reporting it, or RunAborted."""
+        """Runs the services to the end of the run, and closes each in any case.
+
+        Raises what a service raises, after reporting it, RunAborted, or KeyboardInterrupt when asked to leave.
+        """
         try:
             self._join()
             for seat in self._seats:
@@ -71,7 +82,7 @@ class Node(ABC):
                 self._acting = seat
                 seat.finish(self._counts(seat))
             self._await_end()
-        except RunAborted:
+        except (RunAborted, KeyboardInterrupt):
             for seat in self._seats:
                 with suppress(Exception):
                     seat.output.flush(seat.tick)  # what others have heard belongs in the recording
@@ -79,7 +90,8 @@ class Node(ABC):
                     seat.reports.miss_conductor(seat.tick, self._link.lost)
                 elif self._link.told:
                     seat.reports.obey(seat.tick, self._link.told)
-                seat.service.finish()
+                with suppress(Exception):
+                    seat.close()
             raise
         except Exception as error:
             culprit = self._acting

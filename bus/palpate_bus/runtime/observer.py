@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from time import sleep
+from contextlib import suppress
+from time import monotonic, sleep
 from typing import Any
 
 import zenoh
@@ -28,6 +29,8 @@ IDLE_S = 0.005
 RING = 64
 """Messages of a periodic topic kept for an observer that sees the latest: enough for one of its periods at 1 kHz."""
 FIFO = 1 << 17
+LEAVE_S = 2.0
+"""For how long an observer waits for those to leave whom it observes, once the run has ended; they do at once."""
 OBSERVERS_STAY_S = 8.0
 """For how long an observer stays at most without a conductor: longer than all whom it observes, see `wallclock`."""
 
@@ -184,16 +187,36 @@ class ObservingNode(ABC):
                 elif message.command == RunControl.END:
                     break
                 else:
+                    if message.command == RunControl.LOST:
+                        self._observed -= {message.role}
                     self._obey(message)
-            while self._drain():
-                pass
-        except (RunAborted, KeyboardInterrupt) as ended:
-            log.warning("run aborted: %s", str(ended) or "the process was asked to leave")
+            self._take_the_rest()
+        except RunAborted as ended:
+            log.warning("run aborted: %s", ended)
+            self._take_the_rest()
+            self._service.finish()
+            raise
+        except KeyboardInterrupt:
+            log.warning("run aborted: the process was asked to leave")
             self._drain()
             self._service.finish()
             raise
+        except Exception:
+            with suppress(Exception):
+                self._service.finish()  # what was taken in is kept
+            raise
         facts = dict(self._service.finish())
         self._reports.say(ServiceReport.FINISHED, self._reached(), detail={"facts": facts, **self._details()})
+
+    def _take_the_rest(self) -> None:
+        """Takes in what still comes: the conductor's word may overtake what others sent before it, by ways of their own."""
+        end = monotonic() + LEAVE_S
+        while self._member.alive(self._observed) and monotonic() < end:
+            if not self._drain():
+                sleep(IDLE_S)
+        sleep(IDLE_S)  # nor are a token's end and the data before it in order
+        while self._drain():
+            pass
 
     def _hello(self) -> None:
         self._drain()

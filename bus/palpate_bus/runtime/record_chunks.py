@@ -79,6 +79,8 @@ def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
         raise codec.CodecError(f"{CHUNK_TYPE}: columns of {', '.join(str(len(column)) for column in columns)} messages")
     if sum(columns[3]) != len(data):
         raise codec.CodecError(f"{CHUNK_TYPE}: messages of {sum(columns[3])} bytes in {len(data)} bytes")
+    if columns[1] and min(columns[1]) < 0:
+        raise codec.CodecError(f"{CHUNK_TYPE}: a message of {min(columns[1])} ns, before the start")
     if columns[0] and max(columns[0]) >= len(chunk.topics):
         raise codec.CodecError(f"{CHUNK_TYPE}: a message of topic {max(columns[0])} of {len(chunk.topics)}")
 

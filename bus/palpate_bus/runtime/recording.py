@@ -47,6 +47,8 @@ class RecorderNode(ObservingNode):
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
+        self._numbers = dict.fromkeys(producers, 0)
+        """By role, the number of its newest chunk."""
         # Messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others.
         direct = [topic for topic, _ in member.rules.inputs(service.role) if member.rules.roles[topic.producer].observer]
         direct.sort(key=lambda topic: topic.name != CLOCK)
@@ -72,6 +74,7 @@ class RecorderNode(ObservingNode):
             self._lost.add(message.role)
         elif message.command == RunControl.HANDOVER and message.role in self._chunks:
             self._chunks[message.role].hand_over()
+            self._numbers[message.role] = 0
 
     def _report(self) -> None:
         """Reports progress, and at once, and once, that nothing is recorded any more."""
@@ -85,6 +88,10 @@ class RecorderNode(ObservingNode):
         for role, chunks in self._chunks.items():
             while (sample := chunks.get(0)) is not None:
                 busy = True
+                if sample.sequence <= self._numbers[role]:  # it came again
+                    self._garbage += 1
+                    continue
+                self._numbers[role] = sample.sequence
                 try:
                     tick, messages = unpack_chunk(sample.payload)
                 except codec.CodecError as error:
@@ -92,8 +99,9 @@ class RecorderNode(ObservingNode):
                     self._garbage += 1
                     continue
                 for name, payload, stamp, sequence in messages:
-                    if name in self._topics:
-                        self._record(self._topics[name], payload, stamp, sequence)
+                    topic = self._topics.get(name)
+                    if topic is not None and topic.producer == role:
+                        self._record(topic, payload, stamp, sequence)
                     else:
                         self._garbage += 1
                 self._covered[role] = tick

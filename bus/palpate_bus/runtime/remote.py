@@ -48,6 +48,8 @@ class RemoteInputs:
         self._last: dict[str, tuple[int, int]] = {}
         """By topic, number and sending time of its newest message."""
         self._event_topics = {role: event_topics(self._rules, role) for role in producers}
+        self._closed = dict.fromkeys(producers, 0)
+        """By role, the number of its newest Advance."""
 
     def unheard(self) -> list[str]:
         """The keys, without their hash, of the awaited inputs on which no hello has come."""
@@ -115,6 +117,10 @@ class RemoteInputs:
         self._last[buffer.topic.name] = (sample.sequence, sample.sent)
 
     def _settle(self, producer: str, sample: ReceivedSample) -> None:
+        last = self._closed[producer]
+        if sample.sequence != last + 1:
+            raise LockstepError(f"palpate/advance/{producer}: message {sample.sequence} came after {last}")
+        self._closed[producer] = sample.sequence
         advance = _decode(sample.payload)
         for name, sequence in zip(self._event_topics[producer], advance.sequences, strict=True):
             buffer = self._stepper.buffers.get(name)

@@ -167,8 +167,10 @@ class WallClockNode(Node):
         needed = [b for b in self._stepper.buffers.values() if _awaited(b.edge, b.topic)]
         while True:
             self._receive(0)
-            if all(b.holds_any for b in needed):
+            missing = next((b.topic.name for b in needed if not b.holds_any), "")
+            if not missing:
                 break
+            self._seat.progress(missing)
             if self._end is not None:  # what is missing does not come any more
                 return self._end + 1
             message = self._link.poll(HANDSHAKE_POLL_S if needed else None)
@@ -182,6 +184,10 @@ class WallClockNode(Node):
         for name, buffer in self._stepper.buffers.items():
             data = self._data[name]
             while (sample := data.get(0)) is not None:
+                if data.replaced:  # what came before was a stranger's
+                    data.replaced = False
+                    self._sequences[name] = 0
+                    buffer.pending.clear()
                 last = self._sequences[name]
                 if sample.sequence <= last and not buffer.topic.open:
                     continue

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import count
 from queue import Empty, SimpleQueue
-from time import time_ns
+from time import monotonic, time_ns
 from typing import Any, NamedTuple, Protocol
 
 import zenoh
@@ -96,9 +96,9 @@ class Publisher:
 class Subscription:
     """Receives on one key.
 
-    After its hello only the first sender's messages count: bytes without a valid attachment are counted in `garbage`, those of
-    another sender in `foreign`, and where messages carry tags, those without the right one in `forged`. A topic that is open to
-    all takes every sender's messages, if they can be decoded.
+    Only the messages of the sender that says hello first count, and before any has, those of the first. Bytes without a valid
+    attachment are counted in `garbage`, those of another sender in `foreign`, and where messages carry tags, those without the
+    right one in `forged`. A topic that is open to all takes every sender's messages, if they can be decoded.
     """
 
     def __init__(
@@ -121,6 +121,8 @@ class Subscription:
         self.forged = 0
         self._tagger = tagger
         self.heard = False
+        self.replaced = False
+        """Whether a hello has told that what came before was another's; who reads sets it back."""
         self._gid: bytes | None = None
         self._retired: bytes | None = None
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
@@ -136,38 +138,46 @@ class Subscription:
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
         """The next message; None when `timeout` [s] passes without one. A timeout of 0 does not wait."""
+        end = monotonic() + timeout if timeout else 0.0
         while True:
-            if not timeout and self._queue.empty():  # nobody else takes from it; far cheaper than the exception
+            left = end - monotonic() if timeout else 0.0  # what is set aside wins no time
+            if left <= 0 and self._queue.empty():  # nobody else takes from it; far cheaper than the exception
                 return None
             try:
-                raw = self._queue.get(timeout=timeout) if timeout else self._queue.get_nowait()
+                raw = self._queue.get(timeout=left) if left > 0 else self._queue.get_nowait()
             except Empty:
                 return None
-            try:
-                attachment: bytes = raw.attachment.to_bytes()  # type: ignore[union-attr]  # none is an AttributeError
-                sequence, sent, gid = unpack(attachment)
-            except (WireError, AttributeError):
-                self.garbage += 1
-                continue
-            payload = raw.payload.to_bytes()
-            if self._tagger is not None and not self._tagger.holds(attachment, payload):
-                self.forged += 1
-                continue
-            if gid != self._gid:
-                if (self._gid is not None or gid == self._retired) and self._decode is None:
-                    self.foreign += 1
-                    continue
-                self._gid = gid
-            if not payload:
-                self.heard = self.heard or sequence == HELLO
-                continue
-            if sequence == HELLO and self._decode is None:  # some clients of rmw_zenoh's wire number their messages from 0
-                self.garbage += 1
-                continue
-            if self._decode is not None and decoded(self._decode, payload) is None:
-                self.garbage += 1
-                continue
-            return ReceivedSample(sequence, sent, payload)
+            sample = self._taken(raw)
+            if sample is not None:
+                return sample
+
+    def _taken(self, raw: zenoh.Sample) -> ReceivedSample | None:
+        """What came in, or None for what is set aside."""
+        try:
+            attachment: bytes = raw.attachment.to_bytes()  # type: ignore[union-attr]  # none is an AttributeError
+            sequence, sent, gid = unpack(attachment)
+        except (WireError, AttributeError):
+            self.garbage += 1
+            return None
+        payload = raw.payload.to_bytes()
+        if self._tagger is not None and not self._tagger.holds(attachment, payload):
+            self.forged += 1
+            return None
+        if gid != self._gid:
+            greets = sequence == HELLO and not payload and not self.heard  # only a sender of this run says hello
+            if self._decode is None and (gid == self._retired or (self._gid is not None and not greets)):
+                self.foreign += 1
+                return None
+            self.replaced = self._gid is not None
+            self._gid = gid
+        if not payload:
+            self.heard = self.heard or sequence == HELLO
+            return None
+        # Some clients of rmw_zenoh's wire number their messages from 0.
+        if sequence == HELLO if self._decode is None else decoded(self._decode, payload) is None:
+            self.garbage += 1
+            return None
+        return ReceivedSample(sequence, sent, payload)
 
     @property
     def suspicion(self) -> str:

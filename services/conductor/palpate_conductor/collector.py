@@ -62,6 +62,8 @@ class Collector(Service):
         self.collected = Collected()
         self.diagnose = diagnose
         self._tree = tree
+        self._felt = False
+        """Whether there are samples of this run: those of a run that it goes on with are of before its start."""
         self._said = -HEALTH_PERIOD
         self._drawn = -TREE_PERIOD
 
@@ -73,14 +75,16 @@ class Collector(Service):
         c.exam_time = -1 if seen is None else seen
         c.indentation.extend(inbox.new("truth/indentation"))
         c.motions.extend(inbox.new("perception/motion"))
-        c.samples.extend(inbox.new("assessment/samples"))
+        samples = inbox.new("assessment/samples")
+        c.samples.extend(samples)
+        self._felt = self._felt or any(sample.header.stamp.sec >= 0 for sample in samples)
         for status in inbox.new("robot/status"):
             last = c.status_changes[-1] if c.status_changes else None
             if last is None or (last.mode, last.cause) != (status.mode, status.cause):
                 c.status_changes.append(status)
         c.supervisor = inbox.latest("supervisor/state")
         c.phantom = inbox.latest("truth/phantom")
-        if not c.samples:  # later looks are at a patient who has moved: what is felt is told where the first look saw it
+        if not self._felt:  # later looks are at a patient who has moved: what is felt is told where the first look saw it
             c.surface = inbox.latest("perception/surface")
             c.targets = inbox.latest("perception/targets")
         c.correction = inbox.latest("exam/correction")

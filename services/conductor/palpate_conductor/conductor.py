@@ -164,6 +164,7 @@ class Conductor:
             self._conduct(died, tell)
             self.outcome.wall_time_s = monotonic() - self._started_at
             self._end(died)
+            tell(self)
         except (Exception, KeyboardInterrupt, SystemExit) as failure:  # whatever it is, what was measured is to be told
             self.outcome.interrupted = isinstance(failure, KeyboardInterrupt)
             why = in_words(failure, self._observed.now)
@@ -372,10 +373,11 @@ class Conductor:
                 if message.state == ServiceReport.FINISHED:
                     waiting.discard(role)
                     self._close(role, detail)
+                    self._suspect(filter(None, [detail.get("facts", {}).get("trouble")]))
             for role, how in died().items():
                 if role in waiting:
                     waiting.discard(role)
-                    log.warning("%s died while closing: %s", role, how)
+                    self._tell(f"{role} died while closing: {how}")
             sleep(POLL_S)
         for role in waiting:
-            log.warning("%s did not finish within %.0f s", role, OBSERVERS_FINISH_S)
+            self._tell(f"{role} did not finish within {OBSERVERS_FINISH_S:.0f} s")

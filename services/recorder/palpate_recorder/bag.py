@@ -44,6 +44,8 @@ class Channel:
     """Whether late joiners get the last message."""
     kept_every_ms: int = 0
     """One message in this time is kept; 0: every one."""
+    open: bool = False
+    """Whether several send on it, each with numbers of its own."""
 
     @property
     def qos(self) -> list[dict[str, Any]]:
@@ -141,6 +143,7 @@ class BagWriter:
         self._flush_at: int | None = None
         self._file_bytes = file_bytes
         self._compression = compression
+        self._completed = False
         self._begin_file()
 
     @property
@@ -149,9 +152,10 @@ class BagWriter:
         return tuple(file.path for file in self._files)
 
     def _begin_file(self) -> None:
-        self._file = _File(self.folder / f"{self.folder.name}_{len(self._files)}.mcap")
-        self._files.append(self._file)
-        self._stream = self._file.path.open("wb")
+        file = _File(self.folder / f"{self.folder.name}_{len(self._files)}.mcap")
+        self._stream = file.path.open("wb")  # where it cannot be, the files before are the recording
+        self._file = file
+        self._files.append(file)
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=self._compression)
         self._writer.start(profile="ros2", library="palpate-recorder")
         self._writer.add_metadata("palpate", {"run": self._run})
@@ -175,7 +179,7 @@ class BagWriter:
     def write(self, topic: str, payload: bytes | memoryview, stamp: int, sequence: int) -> None:
         """Appends one message, stamped `stamp` [ns], unless its channel is not due. Raises KeyError for an unknown topic."""
         count = self.counts[topic]
-        if sequence > count.last + 1:
+        if sequence > count.last + 1 and not self.channels[topic].open:
             count.missing += sequence - count.last - 1
         count.last = sequence
         if stamp < count.due:
@@ -205,15 +209,17 @@ class BagWriter:
 
     def close(self) -> None:
         """Completes the file with its index and writes `metadata.yaml`. A second call does nothing."""
-        if self._stream.closed:
+        if self._completed:
             return
         metadata = self.metadata()
-        self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(metadata, sort_keys=False)})
-        self._end_file()
+        if not self._stream.closed:
+            self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(metadata, sort_keys=False)})
+            self._end_file()
         text = yaml.safe_dump({"rosbag2_bagfile_information": metadata}, sort_keys=False)
         temporary = self.metadata_path.with_suffix(".yaml.part")
         temporary.write_text(text, encoding="utf-8")
         temporary.replace(self.metadata_path)
+        self._completed = True
 
     def metadata(self) -> dict[str, Any]:
         """rosbag2's description of what has been written so far."""

@@ -42,6 +42,7 @@ def channels(rows: Contract, *, full: bool) -> list[Channel]:
             depth=rows.qos[topic.qos].depth,
             transient_local=rows.qos[topic.qos].transient_local,
             kept_every_ms=0 if full else topic.record_ms,
+            open=topic.open,
         )
         for topic, _ in rows.inputs("recorder")
     ]
