@@ -277,6 +277,8 @@ class ExamSequence:
             self._sense.weight.start_tare()
         if step.stage is StrokeStage.DONE:
             self._end_strokes(now, course.palpation)
+            if course.palpation.failed:
+                return None  # it rests where it is, which may be off the way that was planned
         return step.setpoint
 
     def _end_strokes(self, now: Observation, palpation: Palpation) -> None:
@@ -284,12 +286,14 @@ class ExamSequence:
         assert now.reading is not None
         self._course.arm.hold(now.reading.q)
         self._pressing = None  # it was laid on the surface of this plan
-        if palpation.ahead and palpation.moved and self._moves < MOVES_MAX:
-            self._moves, self._wanted = self._moves + 1, palpation.ahead
+        more = palpation.open_ended or bool(palpation.ahead)
+        ahead = None if palpation.open_ended else palpation.ahead
+        if more and palpation.moved and self._moves < MOVES_MAX:
+            self._moves, self._wanted = self._moves + 1, ahead
             self._asked, self._looked, self._bend = None, 0, None
             self._course.enter(Phase.LOOK, now.t, "the patient has moved: looking again")
-        elif palpation.ahead and palpation.left in (STRETCHED, HIDES) and self._replans < REPLANS_MAX:
-            self._replans, self._wanted = self._replans + 1, palpation.ahead
+        elif more and palpation.left in (STRETCHED, HIDES) and self._replans < REPLANS_MAX:
+            self._replans, self._wanted = self._replans + 1, ahead
             self._bend = max(self._bend or STRAIGHT_RAD, palpation.bend_needed)
             self._course.enter(Phase.PLAN, now.t, f"{palpation.left}: planning anew")
         else:

@@ -28,6 +28,8 @@ HOLD_S = 0.3
 """Time at a point in which samples are taken."""
 STEADY_FRACTION = 0.5
 """Samples count from this part of the path's speed on."""
+WAIT_MAX_S = 60.0
+"""The arm waits no longer to be asked for the next stroke."""
 STOPPED = 0.1
 """Below this part of its speed the descent counts as stopped by force."""
 PUSHED = "a force was felt where no skin can be"
@@ -106,6 +108,11 @@ class Palpation:
         """Whether it waits for further segments."""
         return self.stage is StrokeStage.WAIT and len(self._segments) == self._number + 1
 
+    @property
+    def open_ended(self) -> bool:
+        """Whether further segments may be asked for, whatever is left of those there are."""
+        return self._more
+
     def extend(self, segments: tuple[Segment, ...]) -> None:
         """Further segments, which begin where the last one ends."""
         self._segments += segments
@@ -117,9 +124,11 @@ class Palpation:
     # --- interruptions ------------------------------------------------------------------------------------------------
 
     def abandon(self, why: str) -> None:
-        """Lifts off and ends."""
+        """Lifts off and ends. A free motion ends at once: there is no skin to lift off from, and the arm may be off its way."""
         self._recovery.give_up(why)
-        if self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
+        if self._motion.segment.free is not None:
+            self._enter(StrokeStage.DONE)
+        elif self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
             self._enter(StrokeStage.LIFT)
 
     def leave(self, why: str) -> None:
@@ -197,7 +206,7 @@ class Palpation:
         if self.stage not in (StrokeStage.SLIDE, StrokeStage.HOLD):
             self._descent.make_sure()
         if contact.load > self._limits.force_soft_stop_n and self.stage in PRESSING:
-            self._recovery.soft_stop(contact.load, self._motion.segment.path, self._motion.along.position)
+            self._recovery.soft_stop(contact.load, self._motion.segment, self._motion.along.position)
             self._enter(StrokeStage.LIFT)
         self._heed_the_elbow(contact)
         self._heed_the_wall(t, contact)
@@ -245,7 +254,7 @@ class Palpation:
 
     def _repeat(self, back: float, why: str) -> None:
         """Lifts off, and takes the stroke up again `back` [m] before where it is, for `why`."""
-        self._recovery.repeat(self._motion.segment.path, self._motion.along.position, back, why)
+        self._recovery.repeat(self._motion.segment, self._motion.along.position, back, why)
         self._enter(StrokeStage.LIFT)
 
     def _enter(self, stage: StrokeStage) -> None:
@@ -267,6 +276,8 @@ class Palpation:
     def _wait(self) -> None:
         """Above the skin, until it is known what comes next."""
         self._motion.depth.step(-HOVER_M, LIFT_MPS)
+        if self._time > WAIT_MAX_S:
+            self.left = f"no further stroke was asked for within {WAIT_MAX_S:g} s"
         if self.failed or self.left:
             self._enter(StrokeStage.DONE)
         elif not self._recovery.paused and (len(self._segments) > self._number + 1 or not self._more):

@@ -10,8 +10,10 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.frames import Array
 from palpate_models.scenario import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.path import PathPoint, SurfacePath
+from palpate_planning.coverage import Bools
+from palpate_planning.path import PathPoint
 from palpate_planning.poses import centre
+from palpate_planning.segments import Segment
 from palpate_planning.timing import JerkLimitedAxis
 
 SOFT_STOPS_MAX = 3
@@ -77,25 +79,31 @@ class Recovery:
         self.failed = self.failed or why
         self.paused = False
 
-    def soft_stop(self, force: float, path: SurfacePath, s: float) -> None:
+    def soft_stop(self, force: float, segment: Segment, s: float) -> None:
         """Passes over the targets near path length s; with the last of `SOFT_STOPS_MAX` stops it gives up."""
+        path = segment.path
         self._soft_stops += 1
         why = f"soft stop at {force:.1f} N, limit {self._limits.force_soft_stop_n:g} N"
         passed = (path.visits > s - 1e-6) & (path.visits < s + self._exam.spacing_m)
-        self.skipped |= dict.fromkeys((int(i) for i in path.targets[passed]), why)
+        self._pass_over(segment, passed, why)
         ahead = path.visits[path.visits >= s + self._exam.spacing_m]
         self.resume_at = float(ahead[0]) if len(ahead) else None
         if self._soft_stops >= SOFT_STOPS_MAX:
             self.failed = f"{why}, {self._soft_stops} times"
 
-    def repeat(self, path: SurfacePath, s: float, back: float, why: str) -> None:
+    def repeat(self, segment: Segment, s: float, back: float, why: str) -> None:
         """Takes the stroke up again `back` [m] before path length s, where it was spoiled; or passes over its rest, for `why`."""
         again = self._repeats > 0 and s < self._spoiled_at + NEAR_M
         self._spoiled_at, self._repeats = s, self._repeats + 1 if again else 1
         self.resume_at = max(s - back, 0.0)
         if self._repeats > REPEATS_MAX:
-            self.skipped |= dict.fromkeys((int(i) for i in path.targets[path.visits > s - 1e-6]), why)
+            self._pass_over(segment, segment.path.visits > s - 1e-6, why)
             self.resume_at, self._repeats = None, 0
+
+    def _pass_over(self, segment: Segment, visits: Bools, why: str) -> None:
+        """A target where the skin is only touched is pressed later all the same."""
+        if not segment.touch:
+            self.skipped |= dict.fromkeys((int(i) for i in segment.path.targets[visits]), why)
 
     def measure_displacement(self, contact: ContactMeasurement, point: PathPoint, radius: float) -> float:
         """How far [m] the arm stands beside its path point, across the normal; the way back starts from there.

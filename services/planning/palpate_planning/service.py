@@ -39,6 +39,8 @@ NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
 """Roles whose loss ends the exam before there are targets."""
 SEEN = ("perception/surface", "perception/targets", "perception/motion", "perception/correction")
 """Topics of perception that the arm is moved by: a message that breaks the contract is passed over."""
+ONE_PLACE_M = 1e-4
+"""Two targets in turn that are nearer to each other than this have no way between them."""
 SEEING = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
 
@@ -157,8 +159,12 @@ class PlanningService(Service):
             surface = PerceivedSurface.from_mesh(vertices, normals, self._X_WA, np.asarray(mesh.breathing))
         except ValueError as error:
             return PerceptionFailure(f"perception/surface: {error}")
+        positions = np.array([vector(p) for p in targets.positions])
+        at_one_place = np.flatnonzero(np.linalg.norm(np.diff(positions, axis=0), axis=1) < ONE_PLACE_M)
+        if len(at_one_place):
+            return PerceptionFailure(f"perception/targets: {at_one_place[0]} and {at_one_place[0] + 1} are at one place")
         return PerceivedAbdomen(
-            positions=np.array([vector(p) for p in targets.positions]),
+            positions=positions,
             lines=np.asarray(targets.lines, dtype=np.int64),
             vertices=vertices,
             triangles=triangles,
@@ -216,6 +222,8 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
             return f"stopped by the operator: {request.reason}", False
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
         return f"the driver holds safely: {status.reason}", False
+    if status is not None and status.mode == RobotStatus.MODE_IDLE and status.reason:
+        return f"the robot is not ready: {status.reason}", False
     if state is None or state.level == SupervisorState.LEVEL_OK:
         return "", False
     soft = state.level == SupervisorState.LEVEL_SOFT_STOP

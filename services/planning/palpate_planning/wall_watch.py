@@ -16,6 +16,8 @@ LOST_S = 0.3
 """Without contact at depth for so long, the wall is not where it was touched: it is touched anew."""
 LOST_MAX = 5
 """With this many losses of contact the strokes end."""
+SHUT_MAX_S = 15.0
+"""When breathing is gated, and for so long it was never near the end of expiration, nothing waits for that in contact."""
 GATE_M = 0.001
 """So far from the end of expiration, where the wall moves most, samples are taken when breathing is gated."""
 
@@ -25,9 +27,9 @@ class WallWatch:
 
     def __init__(self, breath: Breath, following: Following, period_s: float) -> None:
         self._breath, self._gated, self._period_s = breath, following is Following.GATE, period_s
-        self._calm_for, self._restless_for, self._adrift_for, self._hidden_for = CALM_S, 0.0, 0.0, 0.0
+        self._calm_for, self._restless_for, self._adrift_for, self._hidden_for, self._shut_for = CALM_S, 0.0, 0.0, 0.0, 0.0
         """For how long the wall was followed well, since when it was not for long enough, for how long there was no contact at
-        depth, and for how long it was not followed because it was not seen [s]."""
+        depth, for how long it was not followed because it was not seen, and since when samples may not be taken [s]."""
         self._losses = 0
         self.spoiled = False
         """Whether what is measured now is worth nothing: the indenter has to lift off."""
@@ -53,17 +55,19 @@ class WallWatch:
     def step(self, t: int, *, adrift: bool, leaving: bool = False) -> None:
         """Judges the moment `t` [ns]; `adrift`: at depth, and yet nothing is felt; `leaving`: the arm is on a free motion."""
         breath, dt = self._breath, self._period_s
-        calm = breath.calm(t)
+        self.open = not self._gated or abs(breath.displacement(t)) < GATE_M
+        self._shut_for = 0.0 if self.open else self._shut_for + dt
+        followed = breath.calm(t)
+        calm = followed and self._shut_for <= SHUT_MAX_S
         self._calm_for = self._calm_for + dt if calm else 0.0
         self._restless_for = 0.0 if self.calm else self._restless_for + dt
-        self._hidden_for = self._hidden_for + dt if breath.hidden and not calm and not leaving else 0.0
+        self._hidden_for = self._hidden_for + dt if breath.hidden and not followed and not leaving else 0.0
         self._adrift_for = self._adrift_for + dt if adrift else 0.0
         lost = self._adrift_for > LOST_S
         if lost:
             self._losses, self._adrift_for = self._losses + 1, 0.0
         self.spoiled = lost or not calm
-        self.leaps = not (calm or breath.hidden)
-        self.open = not self._gated or abs(breath.displacement(t)) < GATE_M
+        self.leaps = not (followed or breath.hidden)
         self.moved = self.moved or breath.moved
         if self.moved:
             self.ended = "the patient has moved"

@@ -74,7 +74,9 @@ class BusWorld(World):
         self.exam = self.service._exam
         self.inbox = HandInbox()
         self.seen: Callable[[Any], None] = lambda surface: None
-        """What becomes of a perceived surface on its way."""
+        """What becomes of a perceived surface on its way, ..."""
+        self.targets: Callable[[Any], None] = lambda targets: None
+        """... and of the targets."""
         self.states: list[Any] = []
         self.events: list[str] = []
 
@@ -96,7 +98,9 @@ class BusWorld(World):
             normals = [Vector3(0.0, 0.0, 1.0)] * len(found)
             points = [Point(*map(float, p)) for p in found]
             lines = np.asarray(mesh.lines, dtype=np.uint32)
-            inbox.put("perception/targets", PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, ""))
+            targets = PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, "")
+            self.targets(targets)
+            inbox.put("perception/targets", targets)
         if self.exam.status.phase is Phase.ASSESS:
             inbox.put("assessment/findings", Findings(header(t, "abdomen"), [], [], True))
         out = sent(self.service.step(t, inbox))
@@ -150,7 +154,7 @@ def test_the_arm_is_held_where_it_was_found() -> None:
     assert np.all(out["planning/setpoint"].joint_stiffness > 0)
 
 
-@pytest.mark.parametrize("cause", ["hold", "operator", "soft", "robot"])
+@pytest.mark.parametrize("cause", ["hold", "unready", "operator", "soft", "robot"])
 def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     service = create(Scenario(robot=BASE))
     inbox = HandInbox()
@@ -161,6 +165,8 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     if cause == "hold":
         hold = status(10_000_000, q, np.zeros(6), RobotStatus.MODE_SAFE_HOLD, "force 41 N, limit 40 N")
         inbox.put("robot/status", hold)
+    elif cause == "unready":
+        inbox.put("robot/status", status(10_000_000, q, np.zeros(6), RobotStatus.MODE_IDLE, "MONITORING_READY"))
     elif cause == "operator":
         inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
     elif cause == "soft":
@@ -169,7 +175,8 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     else:
         inbox.gone.add("robot")
     state = sent(service.step(20_000_000, inbox))["exam/state"]
-    assert {"hold": "force 41 N", "operator": "enough", "soft": "depth 27 mm", "robot": "lost robot"}[cause] in state.message
+    words = {"hold": "force 41 N", "unready": "MONITORING", "operator": "enough", "soft": "depth 27 mm", "robot": "lost robot"}
+    assert words[cause] in state.message
     if cause == "robot":
         assert state.phase == Phase.ABORTED
         assert state.end_tick == 1_020_000_000
@@ -193,6 +200,20 @@ def test_a_surface_that_is_damaged_is_looked_at_again() -> None:
     assert world.exam.status.phase is Phase.DONE
     assert len(damaged) == 3
     assert world.service.finish()["refused_messages"] == 1
+
+
+def test_targets_at_one_place_are_looked_for_again() -> None:
+    world, looks = BusWorld(), []
+
+    def double(targets: Any) -> None:
+        looks.append(targets)
+        if len(looks) == 1:
+            targets.positions[1] = targets.positions[0]
+
+    world.targets = double
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert len(looks) == 2
 
 
 def test_a_motion_that_is_damaged_is_passed_over() -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from planning_fakes import World, known
 
 from palpate_models.scenario import Following
 from palpate_planning.breath import Breath, BreathObservation
+from palpate_planning.palpation import WAIT_MAX_S
 from palpate_planning.requests import PressRequest
 from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
-from palpate_planning.wall_watch import CALM_PATIENCE_S, WallWatch
+from palpate_planning.timing import JointTrajectory
+from palpate_planning.wall_watch import CALM_PATIENCE_S, CALM_S, SHUT_MAX_S, WallWatch
 
 SMALL = {"region_m": (0.025, 0.0125)}
 
@@ -84,3 +88,76 @@ def test_a_place_asked_for_moves_with_the_body() -> None:
     assert moved.xy is not None
     assert np.allclose(moved.xy, (0.018, 0.017))
     assert PressRequest(4, None).moved(np.ones(2)).xy is None
+
+
+def test_nothing_waits_in_contact_for_a_breath_that_does_not_come_to_rest() -> None:
+    breath = Breath()
+    watch = WallWatch(breath, Following.GATE, 0.1)
+    inspired = BreathObservation(0, np.full(11, 0.006), 1e-4, calm=True)
+    for k in range(round((SHUT_MAX_S + CALM_PATIENCE_S + 1) / 0.1)):
+        t = k * 100_000_000
+        breath.hear(inspired._replace(stamp=t), t)
+        watch.step(t, adrift=False)
+        assert watch.spoiled == (k * 0.1 > SHUT_MAX_S - 0.05)
+        assert not watch.leaps
+    assert watch.ended
+    for _ in range(round(1.5 * CALM_S / 0.1)):
+        t += 100_000_000
+        breath.hear(inspired._replace(stamp=t, forecast=np.zeros(11)), t)
+        watch.step(t, adrift=False)
+    assert watch.calm
+
+
+def test_a_wall_that_stays_out_is_not_pressed_for_long() -> None:
+    held_from = 1e9
+    world = World(known(breathing="gate", **SMALL), excursion=lambda t: 0.0 if t < held_from else 0.004)
+    reached(world, StrokeStage.SLIDE, stroke=2)
+    held_from = world.t / 1e9
+    world.run(seconds=200.0)
+    pressed = [depth > 0.002 for *_, depth, _ in world.rows]
+    assert sum(pressed) * 0.01 < 2 * SHUT_MAX_S
+    assert "could not be followed" in world.exam.status.message or world.exam.status.phase is Phase.DONE
+
+
+def test_a_push_while_the_skin_is_only_touched_skips_no_target() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.DESCEND, stroke=1)
+    tissue = world.force
+    world.force = lambda depth: 40.0
+    world.step()
+    world.step()
+    world.force = tissue
+    world.run()
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.exam.status.targets_skipped == 0
+
+
+def test_an_arm_that_was_moved_off_a_free_motion_is_not_drawn_back_to_it() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.TRANSFER, stroke=1)
+    palpation = world.exam._course.palpation
+    assert palpation is not None
+    posture = JointTrajectory(np.tile(world.q, (50, 1)), np.zeros((50, 7)))
+    palpation._motion.segment = replace(palpation._motion.segment, free=posture)
+    for _ in range(5):
+        world.step()
+    world.stop = "the driver holds safely"
+    world.step()
+    world.q = world.q + 0.1
+    world.end = "ended by the operator: enough"
+    world.step()
+    world.stop = ""
+    for _ in range(10):
+        before = world.q.copy()
+        assert np.abs(world.step().setpoint.q - before).max() < 0.01
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+
+
+def test_a_search_that_asks_for_nothing_is_not_waited_for() -> None:
+    world = World(known(pattern="search", **SMALL))
+    world.run(lambda: world.exam.status.message == StrokeStage.WAIT.value)
+    began = world.t
+    world.run(seconds=2 * WAIT_MAX_S + 60.0)
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert (world.t - began) / 1e9 < WAIT_MAX_S + 15.0

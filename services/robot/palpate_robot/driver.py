@@ -27,6 +27,8 @@ BRAKE_TICKS: Final = 100
 TORQUE_RATE: Final = 2.0
 """Largest change of a joint's command in a millisecond [N m]. libfranka ends a motion beyond 1, our controller keeps to 1 a tick.
 A command that was damaged on its way rarely stays within it."""
+FIRST_TORQUE: Final = 20.0
+"""Largest first command of a joint [N m] [A]: the arm rests, and a set-point that lies where it is asks for next to nothing."""
 VALIDITY: Final = 50_000_000
 """So long [ns] a command is obeyed at most, as in the contract, and counts the time since the one before."""
 AHEAD: Final = 500_000_000
@@ -189,11 +191,12 @@ class Driver:
         if command.stamp > t + AHEAD:
             self._reject(t, HoldCause.INVALID_COMMAND, f"control stamps its command {(command.stamp - t) / 1e6:.0f} ms ahead")
             return
-        before = command.torque if self._before is None else self._before
+        first = self._before is None
+        before = _ZERO if self._before is None else self._before
         apart = 1.0
         if self._judged is not None:
             apart = min(max((command.stamp - self._judged.stamp) / 1e6, 1.0), VALIDITY / 1e6)
-        change = TORQUE_RATE * apart
+        change = FIRST_TORQUE if first else TORQUE_RATE * apart
         if not _obeyable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
             numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())
             for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, *numbers, strict=True):
@@ -205,8 +208,9 @@ class Driver:
                     self._reject(t, HoldCause.TORQUE_LIMIT, text)
                     return
                 if not -change <= torque - last <= change:
-                    text = f"control commands {joint} {torque:.1f} N m after {last:.1f} N m, {apart:.0f} ms apart"
-                    self._reject(t, HoldCause.INVALID_COMMAND, f"{text}, limit {TORQUE_RATE:g} N m/ms")
+                    after, rate = f"after {last:.1f} N m, {apart:.0f} ms apart", f"{TORQUE_RATE:g} N m/ms"
+                    how, most = ("to begin with", f"{FIRST_TORQUE:g} N m") if first else (after, rate)
+                    self._reject(t, HoldCause.INVALID_COMMAND, f"control commands {joint} {torque:.1f} N m {how}, limit {most}")
                     return
         self._before = command.torque
 

@@ -7,7 +7,7 @@ import pytest
 from lbr_bench import SCENARIO, Rig, active_rig
 
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models import lbr
 from palpate_models.load import ScenarioError, load_scenario
 from palpate_robot.backends.lbr.arm import GravityModel
@@ -65,12 +65,13 @@ def hold_cause(rig: Rig) -> tuple[int, str]:
 
 
 def test_silent_arm_holds(rig: Rig) -> None:
-    rig.port.silent = True
+    rig.port.silent, silent_since = True, rig.t
     rig.tick(60)
     cause, reason = hold_cause(rig)
     assert cause == RobotStatus.CAUSE_DEVICE
     assert "no LBRState" in reason
     assert "joint_states" not in rig.outbox
+    assert nanoseconds(rig.status.header.stamp) <= silent_since, "what was measured then is not measured now"
 
 
 def test_nothing_is_pushed_on_when_states_end(rig: Rig) -> None:

@@ -6,7 +6,18 @@ import pytest
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import message_type
 from palpate_models import lbr
-from palpate_robot.driver import BRAKE, BRAKE_TICKS, HOLD_DAMPING, TORQUE_RATE, VALIDITY, Command, Driver, DriverMode, HoldCause
+from palpate_robot.driver import (
+    BRAKE,
+    BRAKE_TICKS,
+    FIRST_TORQUE,
+    HOLD_DAMPING,
+    TORQUE_RATE,
+    VALIDITY,
+    Command,
+    Driver,
+    DriverMode,
+    HoldCause,
+)
 
 MS = 1_000_000
 STILL = np.zeros(7)
@@ -136,10 +147,12 @@ def test_a_jump_of_the_torque_holds(active: Driver) -> None:
     assert "lbr_A4 -72.2 N m after 72.2 N m, 1 ms apart, limit 2 N m/ms" in active.reason
 
 
-def test_the_first_command_after_a_release_is_judged_against_nothing(active: Driver) -> None:
-    active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")
-    active.release(3 * MS)
-    assert _update(active, 5 * MS, _command(4 * MS, np.full(7, 20.0))).any()
+def test_the_first_command_after_a_release_is_judged_by_its_size(active: Driver) -> None:
+    for torque, obeyed in ((FIRST_TORQUE, True), (1.1 * FIRST_TORQUE, False)):
+        active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")
+        active.release(3 * MS)
+        assert _update(active, 5 * MS, _command(4 * MS, np.full(7, torque))).any() == obeyed
+    assert active.reason == "control commands lbr_A1 22.0 N m to begin with, limit 20 N m"
 
 
 def test_a_command_from_a_clock_that_is_ahead_is_refused(active: Driver) -> None:

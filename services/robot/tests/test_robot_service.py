@@ -251,7 +251,7 @@ def test_a_controller_that_gives_up_is_heard_however_far_its_clock_is_ahead(rig:
 def test_runaway_command_is_stopped_at_a_limit(rig: Rig) -> None:
     rig.tick()
     while rig.robot.finish()["mode"] != "SAFE_HOLD" and rig.t < 3_000 * MS:
-        rig.command(np.array([0, 0, 0, 0, 0, 0, 38.0]))
+        rig.command(np.array([0, 0, 0, 0, 0, 0, 19.0]))
         rig.tick()
     (hold,) = rig.robot.finish()["holds"]
     assert hold["cause"] in ("VELOCITY_LIMIT", "POSITION_LIMIT")

@@ -11,6 +11,8 @@ GRACE = 50_000_000
 """Within this time of a release [ns] the driver's old hold is passed over: the word has to reach it."""
 RECOVERABLE = frozenset({Cause.DEPTH, Cause.WORKSPACE})
 """Causes that only motion can end: released, they are passed over until the tool is back within the limit, or they grow worse."""
+FURTHER_M = 0.010
+"""A tool that goes this much further beyond its limit than it was when released is stopped again [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +40,8 @@ class Latch:
         """Every stop so far; one that grew worse counts again."""
         self._since = 0
         self._released = -GRACE
-        self._recovering: dict[Cause, Level] = {}
-        """What is passed over, and at which level at most."""
+        self._recovering: dict[Cause, Breach] = {}
+        """What is passed over, as it was when released."""
         self._begun: dict[Cause, int] = {}
         """Since when each cause that stands now has stood without a break [ns]."""
 
@@ -50,14 +52,10 @@ class Latch:
             self._begun.clear()
             return
         causes = {breach.cause for breach in breaches}
-        self._recovering = {cause: level for cause, level in self._recovering.items() if cause in causes}
+        self._recovering = {cause: released for cause, released in self._recovering.items() if cause in causes}
         self._begun = {cause: self._begun.get(cause, t) for cause in causes}
         fresh = t - self._released < GRACE
-        standing = [
-            breach
-            for breach in breaches
-            if breach.level > self._recovering.get(breach.cause, Level.OK) and not (fresh and breach.cause is Cause.DRIVER)
-        ]
+        standing = [breach for breach in breaches if not (self._recovers(breach) or (fresh and breach.cause is Cause.DRIVER))]
         if release:
             standing = self._release(t, standing)
         for breach in sorted(standing, key=lambda breach: -breach.level):
@@ -67,6 +65,13 @@ class Latch:
             if self.level is Level.SOFT_STOP and t - began > breach.heed:
                 words = f"soft stop not heeded within {breach.heed / 1e6:.0f} ms: {breach.reason}"
                 self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, words))
+
+    def _recovers(self, breach: Breach) -> bool:
+        """Whether it was released and has not grown worse since."""
+        released = self._recovering.get(breach.cause)
+        if released is None:
+            return False
+        return breach.level <= released.level and breach.beyond <= released.beyond + FURTHER_M
 
     def _take(self, t: int, breach: Breach) -> None:
         if breach.level > self.level:
@@ -84,7 +89,7 @@ class Latch:
             self.refusals += 1
             self.reason = f"release refused: {against[0].reason}"
             return standing
-        self._recovering = {breach.cause: breach.level for breach in standing if breach.cause in RECOVERABLE}
+        self._recovering = {breach.cause: breach for breach in standing if breach.cause in RECOVERABLE}
         self.level, self.cause, self.reason = Level.OK, Cause.NONE, ""
         self.releases += 1
         self._released = t

@@ -6,6 +6,8 @@ from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
 
+import numpy as np
+
 from palpate_models.frames import Array
 from palpate_models.scenario import Limits
 from palpate_supervisor.tool import Tool
@@ -66,6 +68,8 @@ class Breach:
     reason: str
     heed: int = HEED
     """How long a soft stop for it may take to help [ns]."""
+    beyond: float = 0.0
+    """How far the tool is beyond the limit [m], of depth and of the workspace."""
 
 
 class LimitWatch:
@@ -114,7 +118,7 @@ class LimitWatch:
             return []  # without a force there is no tissue there: the arm is beside the abdomen, which the workspace watches
         level = Level.EMERGENCY if depth > limit + DEPTH_MARGIN_M else Level.SOFT_STOP
         words = f"depth {depth * 1e3:.1f} mm below the perceived surface, limit {limit * 1e3:.1f} mm"
-        return [Breach(level, Cause.DEPTH, words)]
+        return [Breach(level, Cause.DEPTH, words, beyond=depth - limit)]
 
     def _speed(self, speed: float, force: float) -> list[Breach]:
         free = self._limits.speed_mps * SPEED_MARGIN
@@ -129,11 +133,10 @@ class LimitWatch:
         return []
 
     def _workspace(self, p_W: Array) -> list[Breach]:
-        p_A = self._R_AW @ p_W + self._p_AW
-        for axis, value, low, high in zip(
-            "xyz", p_A.tolist(), self._limits.workspace_min_m, self._limits.workspace_max_m, strict=True
-        ):
-            if not low <= value <= high:
-                words = f"tool at {axis} = {value:.3f} m in the abdomen frame, allowed {low:g} to {high:g} m"
-                return [Breach(Level.EMERGENCY, Cause.WORKSPACE, words)]
-        return []
+        p_A, low, high = self._R_AW @ p_W + self._p_AW, self._limits.workspace_min_m, self._limits.workspace_max_m
+        beyond = np.maximum(low - p_A, p_A - high)
+        k = int(np.argmax(beyond))  # of NaN, too
+        if beyond[k] <= 0.0:
+            return []
+        words = f"tool at {'xyz'[k]} = {p_A[k]:.3f} m in the abdomen frame, allowed {low[k]:g} to {high[k]:g} m"
+        return [Breach(Level.EMERGENCY, Cause.WORKSPACE, words, beyond=float(beyond[k]))]

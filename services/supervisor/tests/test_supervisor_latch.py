@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from palpate_supervisor.latch import GRACE, Latch
+from palpate_supervisor.latch import FURTHER_M, GRACE, Latch
 from palpate_supervisor.watch import HEED, HEED_RISING, Breach, Cause, Level
 
 MS = 1_000_000
@@ -118,3 +118,14 @@ def test_a_release_of_nothing_is_harmless() -> None:
     latch = Latch()
     latch.update(0, [], True)
     assert (latch.level, latch.releases, latch.stops) == (Level.OK, 1, [])
+
+
+def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
+    latch = Latch()
+    outside = Breach(Level.EMERGENCY, Cause.WORKSPACE, "tool at y = 0.12 m", beyond=0.02)
+    latch.update(0, [outside], False)
+    latch.update(10 * MS, [outside], True)
+    latch.update(20 * MS, [replace(outside, beyond=0.02 + 0.9 * FURTHER_M)], False)
+    assert latch.level is Level.OK
+    latch.update(30 * MS, [replace(outside, beyond=0.02 + 1.1 * FURTHER_M)], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.WORKSPACE)

@@ -41,6 +41,7 @@ def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object],
     (breach,) = judge(**values)  # type: ignore[arg-type]
     assert (breach.level, breach.cause) == (level, cause)
     assert any(character.isdigit() for character in breach.reason)
+    assert (breach.beyond > 0) == (cause in (Cause.DEPTH, Cause.WORKSPACE))
 
 
 @pytest.mark.parametrize(

@@ -32,14 +32,9 @@ float64[7] external_torque
 float64[7] ipo_joint_position
 float64 tracking_performance
 """
-DEFINITIONS = {
-    "lbr_fri_idl/msg/LBRState": _STATE,
-    "lbr_fri_idl/msg/LBRJointPositionCommand": "float64[7] joint_position\n",
-    "lbr_fri_idl/msg/LBRTorqueCommand": "float64[7] joint_position\nfloat64[7] torque\n",
-    "lbr_fri_idl/msg/LBRWrenchCommand": "float64[7] joint_position\nfloat64[6] wrench\n",
-}
 STATE = "lbr_fri_idl/msg/LBRState"
 TORQUE_COMMAND = "lbr_fri_idl/msg/LBRTorqueCommand"
+DEFINITIONS = {STATE: _STATE, TORQUE_COMMAND: "float64[7] joint_position\nfloat64[7] torque\n"}
 
 
 def register() -> None:
@@ -55,8 +50,6 @@ def register() -> None:
 register()
 LBRState: Any = codec.message_type(STATE)
 LBRTorqueCommand: Any = codec.message_type(TORQUE_COMMAND)
-LBRJointPositionCommand: Any = codec.message_type("lbr_fri_idl/msg/LBRJointPositionCommand")
-LBRWrenchCommand: Any = codec.message_type("lbr_fri_idl/msg/LBRWrenchCommand")
 
 
 class SessionState(IntEnum):

@@ -188,14 +188,16 @@ class LbrService(Service):
         return self._command
 
     def _status(self, t: int) -> Message:
-        driver = self._driver
+        driver, measured = self._driver, t
         if self._summed:
             self._means = self._sums / self._summed
             self._sums, self._summed = np.zeros(20), 0
+        elif self._arm.heard is not None:
+            measured = self._arm.heard  # nothing was measured since
         means = self._means
         reason = driver.reason or self._arm.trouble(t)
         return RobotStatus(
-            header(t), int(driver.mode), int(driver.cause), reason, means[:7], means[7:14], _wrench(means[14:]),
+            header(measured), int(driver.mode), int(driver.cause), reason, means[:7], means[7:14], _wrench(means[14:]),
             self._applied.copy(), driver.rejected,
         )  # fmt: skip
 
