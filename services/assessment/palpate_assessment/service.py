@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -78,17 +79,17 @@ class AssessmentService(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Samples as they come, a map every few seconds, and once the scan is over the final map and the findings."""
-        for surface in inbox.new("perception/surface"):
-            self.perceive(surface)
-        for motion in inbox.new("perception/motion"):
-            self.hear(motion)
-        for correction in inbox.new("exam/correction"):
-            self.correct(correction)
         phase = None
         new, self._untold = self._untold[:TOLD_AT_ONCE], self._untold[TOLD_AT_ONCE:]
+        others = self._others(inbox)
         for state in inbox.new("exam/state"):
+            while others and others[0][0] <= nanoseconds(state.header.stamp):
+                _, take, message = others.popleft()
+                take(message)
             phase = int(state.phase)
             new += self.take(state)
+        for _, take, message in others:
+            take(message)
         outbox: dict[str, Message | list[Message]] = {}
         if new:
             outbox["assessment/samples"] = [sample_message(s) for s in new]
@@ -98,6 +99,16 @@ class AssessmentService(Service):
         elif phase in SCANNING and self._due(t):
             outbox |= self._grow(t)
         return outbox
+
+    def _others(self, inbox: Inbox) -> deque[tuple[int, Callable[[Message], None], Message]]:
+        """What came beside the states, by its stamp [ns], with what takes it. One step may bring a whole recording."""
+        takers: dict[str, Callable[[Message], None]] = {
+            "perception/surface": self.perceive,
+            "perception/motion": self.hear,
+            "exam/correction": self.correct,
+        }
+        came = [(nanoseconds(m.header.stamp), take, m) for topic, take in takers.items() for m in inbox.new(topic)]
+        return deque(sorted(came, key=lambda one: one[0]))
 
     def hear(self, motion: Message) -> None:
         """Takes the next `perception/motion`."""
@@ -137,10 +148,10 @@ class AssessmentService(Service):
             raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
         self._perceived, self._skin = message, None
         p_A = apply(self._X_AW, np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3))
-        self._breath.perceive(p_A, np.asarray(message.breathing, dtype=np.float64))
         if self._surface is not None and self.samples:
-            return  # a look at a patient who has moved: all is told where the first look saw it
+            return  # a look at a patient who has moved: all is told where the first look saw it, and so breathing's shares hold
         self._surface = p_A
+        self._breath.perceive(p_A, np.asarray(message.breathing, dtype=np.float64))
         self._coarse = self._grid(GROWING_PITCH)
 
     def _grid(self, pitch: float) -> MapGrid:

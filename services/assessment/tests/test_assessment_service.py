@@ -13,9 +13,9 @@ from palpate.report.scoring import Truth, score
 from palpate_assessment.assess import Reason
 from palpate_assessment.service import GROWING_EVERY, AssessmentService, create
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, StiffnessMap
+from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import encode
-from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.load import exam_input
 from palpate_models.patient import Lesion, Phantom
 from palpate_models.scenario import Exam, Scenario
@@ -162,3 +162,31 @@ def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
 
 def test_reasons_have_the_numbers_of_the_message() -> None:
     assert all(getattr(StiffnessMap, reason.name) == reason for reason in Reason)
+
+
+def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) -> None:
+    """The breath that was seen counts for each state, however many images came since."""
+    states = small.states[:1500]
+    first, last = (nanoseconds(states[k].header.stamp) for k in (0, -1))
+    mesh = small.surface
+    share = np.ones(len(mesh.vertices) // 3, np.float32)
+    surface = SurfaceMesh(mesh.header, mesh.vertices, mesh.normals, mesh.triangles, share)
+    motions = [
+        SurfaceMotion(
+            header(t, "abdomen"), SurfaceMotion.QUIET, 0.003 * np.sin(t / 6e8), np.zeros(11), 1e-4, Vector3(0.0, 0.0, 0.0)
+        )
+        for t in range(first, last, 100_000_000)
+    ]
+    known = exam_input(small.scenario)
+    live, later = AssessmentService(known), AssessmentService(known)
+    live.step(first, FakeInbox({"perception/surface": [surface]}))
+    coming = list(motions)
+    for state in states:
+        t, seen = nanoseconds(state.header.stamp), []
+        while coming and nanoseconds(coming[0].header.stamp) + 100_000_000 <= t:
+            seen.append(coming.pop(0))
+        live.step(t, FakeInbox({"exam/state": [state], "perception/motion": seen}))
+    later.step(last, FakeInbox({"exam/state": states, "perception/motion": motions, "perception/surface": [surface]}))
+    count = len(live.samples)
+    assert count > 50
+    assert [sample.depth for sample in later.samples[:count]] == [sample.depth for sample in live.samples]

@@ -25,7 +25,7 @@ from palpate_assessment.calibration import learned
 from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, bone, natural
 from palpate_models import press
 from palpate_models.frames import Array
-from palpate_search.presses import Budget, Press, Task
+from palpate_search.presses import SHALLOWEST_M, Budget, Press, Task
 
 RADII_M: Final = (0.014, 0.022, 0.030)
 """Radii of the lumps that are looked for, as they are felt."""
@@ -75,6 +75,8 @@ class Posterior:
         self.task = task
         self.accepted = tuple(accepted)
         self.presses: list[Press] = []
+        self.vain = 0
+        """Presses that were asked for and gave no sample."""
         places = task.places
         self.centres: Array = np.tile(places, (len(RADII_M), 1))
         """Centres of the hypotheses' lumps [m], shape (h, 2)."""
@@ -123,6 +125,11 @@ class Posterior:
     def by_place(self) -> Array:
         """Probability that a lump's centre is at each place, shape (p,)."""
         return np.asarray(self.probability.reshape(len(RADII_M), -1).sum(axis=0))
+
+    @property
+    def asked(self) -> int:
+        """How many presses were asked for and are over."""
+        return len(self.presses) + self.vain
 
     @property
     def here(self) -> Array | None:
@@ -176,7 +183,7 @@ class Posterior:
     def add(self, felt: Press) -> None:
         """Takes one more press into account."""
         calibration = learned()
-        depth, force = max(felt.depth, 0.002), max(felt.force, 0.1)
+        depth, force = max(felt.depth, SHALLOWEST_M), max(felt.force, 0.1)
         log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty
         y = float(np.log(force)) - calibration.exponent * log_depth - np.log(USUAL_N)
         xy, n = felt.xy[None], len(self.presses)
@@ -217,7 +224,7 @@ class Posterior:
         other = Posterior(self.task, (*self.accepted, bump), self._models)
         for felt in self.presses:
             other.add(felt)
-        other.open = self.open
+        other.open, other.vain = self.open, self.vain
         return other
 
     def left(self, spent_s: float) -> Budget:

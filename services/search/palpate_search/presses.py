@@ -14,6 +14,8 @@ PLACES_M = 0.010
 """Distance of the places that are weighed."""
 BORDER_M = 0.010
 """Presses keep so far from the edge of the region, in which the arm's reach and the skin are known."""
+SHALLOWEST_M = 0.002
+"""A depth below this counts as this: it may be measured as none."""
 SHALLOWER = 0.6
 """The shallowest press that is worth it, and ..."""
 DEEPER = 1.4
@@ -44,6 +46,8 @@ class Press:
     """Whether depth yielded to the force limit."""
     depth_uncertainty: float = 0.001
     """Standard deviation of the depth, as the examination tells it [m]."""
+    stroke: int = 0
+    """Number of the descent in which it was felt."""
 
     @property
     def xy(self) -> Array:

@@ -16,7 +16,7 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import Array
 from palpate_models.load import exam_input
 from palpate_models.scenario import Scenario
-from palpate_search.choice import policy
+from palpate_search.choice import PolicyError, policy
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Press, Task
 
@@ -28,6 +28,7 @@ ELSEWHERE_M: Final = 0.005
 """A place is out of the arm's reach if no press came nearer to it than this."""
 AROUND: Final = 6
 """So many presses outline a lump that was found."""
+ROUNDED_M: Final = 1e-9
 FEWEST: Final = 12
 """So many presses at least: with fewer the assessment says nothing."""
 
@@ -60,18 +61,23 @@ class SearchService(Service):
         """A request when the examination is ready for one."""
         self._felt += [_press(sample) for sample in inbox.new("assessment/samples")]
         state = inbox.latest("exam/state")
+        if state is not None and state.patient_moved:  # what was felt since the last request may lie elsewhere
+            self._felt.clear()
+            self._asked = None
         if state is None or state.phase not in PALPATING or self._ended or state.target_index != self._number:
             return {}
         if self._begin is None:
             self._begin = t
-        for press in self._felt:
+        for press in {press.stroke: press for press in self._felt}.values():  # one that waits for the breath has several samples
             self._posterior.add(press)
+        if self._asked is not None and not self._felt:
+            self._posterior.vain += 1
         if self._asked is not None and not any(np.linalg.norm(press.xy - self._asked) < ELSEWHERE_M for press in self._felt):
             self._posterior.refuse(self._asked)
         self._felt.clear()
         while (lump := self._posterior.found) is not None:
             self._posterior = self._posterior.accept(lump)
-            self._outline = outline(lump, self._posterior)
+            self._outline += outline(lump, self._posterior)
         self._number += 1
         self._spent_s = (t - self._begin) / NS
         return {"exam/request": self._request(t)}
@@ -95,7 +101,7 @@ class SearchService(Service):
         elif self._outline:
             place, depth = self._outline.pop(0), posterior.task.depth
         else:
-            place, depth = self._policy(posterior, posterior.left(self._spent_s))
+            place, depth = checked(*self._policy(posterior, posterior.left(self._spent_s)), posterior.task)
         self._asked = np.asarray(place, dtype=float)
         return SearchRequest(
             header(t, FRAME),
@@ -117,6 +123,16 @@ class SearchService(Service):
         if left.seconds <= 0:
             return f"{posterior.task.budget.seconds:g} s are over"
         return ""
+
+
+def checked(place: Array, depth: float, task: Task) -> tuple[Array, float]:
+    """A place [m] and a depth [m] that a policy asks for. Raises PolicyError for what the arm must not press."""
+    place = np.asarray(place, dtype=float)
+    if place.shape != (2,) or not np.all((place >= task.low - ROUNDED_M) & (place <= task.high + ROUNDED_M)):  # nor what is NaN
+        raise PolicyError(f"search.policy: it asks for the place {place} m; allowed are {task.low} to {task.high} m")
+    if not 0 < depth <= task.deepest + ROUNDED_M:
+        raise PolicyError(f"search.policy: it asks for a depth of {depth} m; allowed are depths above 0, up to {task.deepest} m")
+    return place, float(depth)
 
 
 def outline(lump: Bump, posterior: Posterior) -> list[Array]:
@@ -142,6 +158,7 @@ def _press(sample: Message) -> Press:
         nanoseconds(sample.header.stamp) / NS,
         limited=sample.force_limited,
         depth_uncertainty=max(sample.depth_uncertainty, LEAST_UNCERTAINTY_M),
+        stroke=int(sample.stroke),
     )
 
 

@@ -13,7 +13,9 @@ from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
 from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_models.scenario import Exam, Scenario, Search, SearchBudget
-from palpate_search.service import FEWEST, create
+from palpate_search.choice import PolicyError
+from palpate_search.presses import Task
+from palpate_search.service import FEWEST, checked, create
 
 
 def played(**exam: Any) -> tuple[ServiceRig, ConformanceReport]:
@@ -70,6 +72,40 @@ def test_a_place_that_the_arm_cannot_take_is_not_asked_for_again() -> None:
         rig.run(0.3, {"exam/state": play.state})
     places = [(m.place.x, m.place.y) for m in (item.message for item in rig.log[REQUEST]) if m.request == SearchRequest.PRESS]
     assert len(set(places)) == len(places) == 12
+
+
+@pytest.mark.parametrize("policy", ["informed", "raster", "random", "latin-hypercube", "expected-improvement"])
+def test_a_press_that_gave_no_sample_is_over_too(policy: str) -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search"), search=Search(policy=policy))
+    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
+    play.phase = ExamState.PHASE_RETRACT
+    for _ in range(4):
+        rig.run(0.3, {"exam/state": play.state})
+        play.over = int(rig.last(REQUEST).number)
+    assert len({(item.message.place.x, item.message.place.y) for item in rig.log[REQUEST]}) == 4
+
+
+TASK = Task((0.0, 0.0), (0.1, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("place", "depth", "named"),
+    [
+        ((0.14, 0.0), 0.010, "place"),
+        ((float("nan"), 0.0), 0.010, "place"),
+        ((0.0, 0.0, 0.0), 0.010, "place"),
+        ((0.0, 0.0), 10.0, "depth"),
+        ((0.0, 0.0), float("nan"), "depth"),
+        ((0.0, 0.0), 0.0, "depth"),
+    ],
+)
+def test_what_the_arm_must_not_press_is_refused(place: tuple[float, ...], depth: float, named: str) -> None:
+    with pytest.raises(PolicyError, match=named):
+        checked(np.array(place), depth, TASK)
+
+
+def test_the_edge_of_the_region_and_the_greatest_depth_may_be_pressed() -> None:
+    assert checked(TASK.high, TASK.deepest, TASK)[1] == TASK.deepest
 
 
 def test_the_report_says_what_it_took() -> None:

@@ -7,14 +7,14 @@ from scipy.stats import qmc
 
 from palpate_models.frames import Array
 from palpate_search.posterior import Posterior
-from palpate_search.presses import Budget
+from palpate_search.presses import PLACES_M, Budget
 
 
 def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     """Line by line, to and fro, over a lattice of as many places as the whole budget has presses."""
-    task, k = posterior.task, len(posterior.presses)
+    task, k = posterior.task, posterior.asked
     width, height = task.high - task.low
-    columns = max(1, round(np.sqrt(task.budget.presses * width / height)))
+    columns = max(1, round(np.sqrt(task.budget.presses * width / max(height, PLACES_M))))
     rows = -(-task.budget.presses // columns)
     column, row = divmod(k % (columns * rows), rows)
     row = row if column % 2 == 0 else rows - 1 - row
@@ -25,7 +25,7 @@ def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
 def random(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     """Anywhere, every place as probable as any other."""
     task = posterior.task
-    rng = np.random.Generator(np.random.PCG64((task.seed, len(posterior.presses))))
+    rng = np.random.Generator(np.random.PCG64((task.seed, posterior.asked)))
     return rng.uniform(task.low, task.high), task.depth
 
 
@@ -33,5 +33,5 @@ def latin_hypercube(posterior: Posterior, budget: Budget) -> tuple[Array, float]
     """McKay, Beckman and Conover 1979: so many strata along x and along y as the budget has presses, each met once."""
     task = posterior.task
     sampler = qmc.LatinHypercube(d=2, rng=np.random.Generator(np.random.PCG64(task.seed)))
-    share = sampler.random(task.budget.presses)[len(posterior.presses) % task.budget.presses]
+    share = sampler.random(task.budget.presses)[posterior.asked % task.budget.presses]
     return task.low + share * (task.high - task.low), task.depth

@@ -18,7 +18,7 @@ from palpate_assessment.calibration import learned
 from palpate_models import press
 from palpate_models.frames import Array
 from palpate_search.posterior import Posterior
-from palpate_search.presses import Budget, Task
+from palpate_search.presses import SHALLOWEST_M, Budget, Task
 
 LENGTH_M: Final = 0.020
 """Length scale of the process: the radius of the lumps sought."""
@@ -45,7 +45,9 @@ def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
     """Mean and standard deviation of the process at the places, and what was felt, in standard deviations of that."""
     exponent = learned().exponent
     xy = np.array([felt.xy for felt in posterior.presses])
-    y = np.array([np.log(max(felt.force, 0.1)) - exponent * np.log(felt.depth / press.DEPTH_M) for felt in posterior.presses])
+    force = np.array([max(felt.force, 0.1) for felt in posterior.presses])
+    depth = np.array([max(felt.depth, SHALLOWEST_M) for felt in posterior.presses])
+    y = np.log(force) - exponent * np.log(depth / press.DEPTH_M)
     y = (y - y.mean()) / max(float(y.std()), 0.05)
     kernel = RBF(LENGTH_M) + WhiteKernel(NOISE**2)
     process = GaussianProcessRegressor(kernel, optimizer=None).fit(xy, y)
@@ -54,8 +56,8 @@ def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
 
 
 def _greatest(posterior: Posterior, budget: Budget, acquisition: Acquisition) -> tuple[Array, float]:
-    if len(posterior.presses) < FIRST:
-        return first(posterior.task, len(posterior.presses)), posterior.task.depth
+    if posterior.asked < FIRST or not posterior.presses:
+        return first(posterior.task, posterior.asked % FIRST), posterior.task.depth
     score = np.where(posterior.open, acquisition(*_fit(posterior)), -np.inf)
     return posterior.task.places[int(np.argmax(score))], posterior.task.depth
 

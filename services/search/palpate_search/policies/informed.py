@@ -41,7 +41,7 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     rates = np.where(posterior.open, rate(np.arange(len(task.places)), task.depth), 0.0)
     best, depth = int(np.argmax(rates)), task.depth
     if rates[best] <= 0:  # nothing tells more than anything else: the level is not known before the first press
-        best = int(np.argmin(np.linalg.norm(task.places - np.array(task.centre), axis=1)))
+        best = int(np.argmin(np.where(posterior.open, np.linalg.norm(task.places - np.array(task.centre), axis=1), np.inf)))
         return task.places[best], task.depth
     greatest = rates[best]
     promising = np.argsort(-rates)[:_PROMISING]
