@@ -50,7 +50,7 @@ def remembered(key: str, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
     A cache folder that cannot be written is no error: the array is then computed each time.
     """
     path = folder() / f"{key}.npy"
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError, EOFError):
         found: NDArray[Any] = np.load(path, mmap_mode="r")
         with contextlib.suppress(OSError):
             os.utime(path)

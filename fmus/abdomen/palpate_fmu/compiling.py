@@ -85,7 +85,7 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, incl
     for path in sorted([*folder.glob("*.[ch]"), *(header for include in includes for header in include.glob("*.h"))]):
         key.update(path.name.encode() + b"\0" + path.read_bytes())
     cached = _cache() / f"{key.hexdigest()}{target.suffix}"
-    if cached.is_file():
+    if cached.is_file() and cached.stat().st_size:
         return cached.read_bytes()
     with tempfile.TemporaryDirectory() as work:
         out = Path(work) / f"library{target.suffix}"

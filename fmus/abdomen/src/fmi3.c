@@ -156,8 +156,7 @@ static fmi3Status set(Component *c, Type type, size_t size, const fmi3ValueRefer
     if (!c || (n && (!vr || !values))) return fmi3Error;
     for (size_t i = 0; i < n; i++) {
         if (!component_find(c, vr[i], type, 0, &slot)) return fmi3Error;
-        if (used + slot.count > given) break;
-        if (!component_check(c, &slot, values + used * size)) return fmi3Error;
+        if (used + slot.count <= given && !component_check(c, &slot, values + used * size)) return fmi3Error;
         used += slot.count;
     }
     if (n && used != given) {

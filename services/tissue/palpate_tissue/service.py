@@ -6,7 +6,7 @@ The physics is behind `TissueBackend`; here messages become arrays in the patien
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from math import hypot, sqrt
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import IndentationTruth, PatientTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message, wrench_message
-from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.frames import Array, apply, inverse, matrix
 from palpate_models.phantom import PhantomModel
@@ -26,6 +26,9 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.surface import SkinSurface
 
 _log = logging.getLogger("palpate.tissue")
+
+MADE_UP = 200
+"""So many steps are made up at once, of those that were missed by the wall clock."""
 
 
 class TissueService(Service):
@@ -57,8 +60,11 @@ class TissueService(Service):
         self._normals_W = self._R_WA @ truth.normals.T
         """At rest, shape (3, n): with the long axis last numpy is several times faster."""
         self._triangles = truth.triangles.astype(np.uint32).ravel()
+        self._period = contract().roles[self.role].period
+        self._t: int | None = None
+        """The tick before [ns]; None before the first tool state."""
         self._p_A: Array = np.zeros(3)
-        """The indenter's centre [m]."""
+        """The indenter's centre then [m]."""
         self._peak_n = self._recent_peak_n = 0.0
         self._contact_steps = 0
         self._onsets = 0
@@ -108,15 +114,30 @@ class TissueService(Service):
         """Steps the tissue to `t` [ns]; force [N] and torque [N m] on the indenter, about its centre, world axes, shape (6,)."""
         if tool is None:
             self.backend.idle(t / NS)
+            self._t = None
             return np.zeros(6)
         p, v, w = tool.pose.position, tool.twist.linear, tool.twist.angular
         motion_W = np.array((p.x, p.y, p.z, 1.0, v.x, v.y, v.z, 0.0, w.x, w.y, w.z, 0.0)).reshape(3, 4)
-        self._p_A, v_A, w_A = motion_W.dot(self._transposed_X_AW)  # `dot` takes a third of the time of `@`
-        F_A = self.backend.step(t / NS, self._p_A, v_A, float(tool.radius), w_A)
+        p_A, v_A, w_A = motion_W.dot(self._transposed_X_AW)  # `dot` takes a third of the time of `@`
+        for at, place in self._way(t, nanoseconds(tool.header.stamp), p_A):
+            F_A = self.backend.step(at / NS, place, v_A, float(tool.radius), w_A)
+            self._t, self._p_A = at, place
         if not self.backend.touching:
             return np.zeros(6)
         F_W: Array = np.array(F_A).dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
         return F_W
+
+    def _way(self, t: int, stamp: int, p_A: Array) -> Sequence[tuple[int, Array]]:
+        """Times [ns] and places [m] of the steps up to `t` [ns], given where the tool was at `stamp`; one if nothing is late.
+
+        By the wall clock a process that was kept from its core hears where the tool is by now. In one step it would be there at
+        once, and the tissue's dashpots would push with what no tool does.
+        """
+        if self._t is None or (t - self._t <= self._period and stamp <= t):
+            return ((t, p_A),)
+        end = self._p_A + (p_A - self._p_A) * ((t - self._t) / max(stamp - self._t, t - self._t))
+        steps = min(max((t - self._t) // self._period, 1), MADE_UP)
+        return [(self._t + (t - self._t) * k // steps, self._p_A + (end - self._p_A) * (k / steps)) for k in range(1, steps + 1)]
 
     def _count(self, F_W: Array) -> None:
         """Counts the step and the force on the indenter."""

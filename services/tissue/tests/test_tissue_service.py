@@ -237,3 +237,24 @@ def test_bench_measures_a_step_in_contact():
     assert result["vertices"] > 2700
     assert result["contacts"] > 5
     assert result["step_us_p50"] > 0
+
+
+def test_a_process_that_stood_still_moves_the_tool_as_fast_as_it_went() -> None:
+    """A millimetre in a tenth of a second, heard of every millisecond, at its end while ticks are caught up, or once and late."""
+    known = scenario()
+    X_WA = matrix(true_pose(known))
+
+    def tool(k: int, stamp: int) -> ToolState:
+        p_A = np.array((0.0, 0.0, 0.015 - 0.006 - 1e-5 * (k - 100)))
+        return tool_state(stamp * MS, (X_WA[:3, :3] @ p_A + X_WA[:3, 3]).tolist())
+
+    peaks = []
+    for ticks, heard_at in ((range(101, 201), int), (range(101, 201), lambda _: 200), ([200], int)):
+        service, inbox = create(known), OneTopic()
+        press(service, X_WA, 0.006, 100)
+        for t in ticks:
+            inbox.message = tool(heard_at(t), heard_at(t))
+            service.step(t * MS, inbox)
+        peaks.append(service.finish()["peak_force_n"])
+    assert peaks[1] == pytest.approx(peaks[0], rel=0.02)
+    assert peaks[2] == pytest.approx(peaks[0], rel=0.02)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from palpate_models.frames import Array
 
@@ -71,8 +71,11 @@ class ContactSolver:
         self._index = np.flatnonzero(active)
         if len(self._index):
             self._columns = self.matrix.take(self._index, axis=1)
-            self._inverse = cho_solve(
-                cho_factor(self._columns.take(self._index, axis=0), lower=True, check_finite=False),
-                np.eye(len(self._index)),
-                check_finite=False,
-            )
+            try:
+                factor = cho_factor(self._columns.take(self._index, axis=0), lower=True, check_finite=False)
+            except LinAlgError as error:
+                raise ContactError(
+                    "the compliance is not positive definite: the mesh has vertices much nearer to each other than its triangles "
+                    "are wide; remesh it evenly, or services.tissue = winkler"
+                ) from error
+            self._inverse = cho_solve(factor, np.eye(len(self._index)), check_finite=False)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from palpate_bus.contract import contract
+from palpate_bus.implementations import ChoiceError
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Service
 from palpate_models.breathing import BreathingCurve
 from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
 from palpate_models.scenario import Scenario
-from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
+from palpate_tissue.backends.elastic.compliance import PITCH_M, SizeError, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.moving.service import carried
 from palpate_tissue.service import TissueService
@@ -18,11 +19,14 @@ from palpate_tissue.service import TissueService
 def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
     """The elastic tissue of a scenario. The first time takes half a minute; the result is kept in the user's cache folder.
 
-    `pitch_m` is that of the finite elements.
+    `pitch_m` is that of the finite elements. Raises ChoiceError for a mesh that this tier cannot take.
     """
     phantom = scenario.phantom
     model = build_phantom(phantom, scenario.seed)
-    body = compliance(model, phantom.lesions, pitch_m=pitch_m)
+    try:
+        body = compliance(model, phantom.lesions, pitch_m=pitch_m)
+    except SizeError as error:
+        raise ChoiceError(str(error)) from error
     tissue = ElasticTissue(
         model,
         body,

@@ -16,9 +16,10 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_fmu.compiling import native
+from palpate_fmu.compiling import CompileError, native
 from palpate_fmu.export import build_scenario_fmu
-from palpate_fmu.instance import FmuInstance
+from palpate_fmu.instance import FmuError, FmuInstance
+from palpate_fmu.phantom_file import ExportError
 from palpate_models.frames import Array, matrix
 from palpate_models.load import true_pose
 from palpate_models.phantom import build_phantom
@@ -50,7 +51,11 @@ class FmuService(Service):
         self._period = rules.roles[table.role].period
         self._time = -self._period
         self._fmu = FmuInstance(fmu_file, self._time / NS, table.parameters)
-        self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
+        try:
+            self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
+        except MapError:
+            self._fmu.close()  # which removes what was unpacked
+            raise
         self._latched = tuple(output for output in self._wiring.outputs if output.topic.latched)
         self._running = tuple(output for output in self._wiring.outputs if not output.topic.latched)
         simulation = self._fmu.description.coSimulation
@@ -77,12 +82,12 @@ class FmuService(Service):
 
     def _advance(self, t: int) -> None:
         behind, rest = divmod(t - self._time, self._period)
-        if behind > MOST_STEPS:
-            raise RuntimeError(f"the FMU would have to catch up {behind} periods, at most {MOST_STEPS} are allowed")
         if behind == 1 or (self._variable_step and t > self._time):
             self._fmu.step(self._time / NS, (t - self._time) / NS)
             self._steps += 1
         else:
+            if behind > MOST_STEPS:
+                raise RuntimeError(f"the FMU would have to catch up {behind} periods, at most {MOST_STEPS} are allowed")
             if rest:
                 raise RuntimeError(f"the FMU takes steps of {self._period / NS} s only, not to {t / NS} s")
             for k in range(behind):
@@ -120,7 +125,8 @@ def packaged_map(name: str) -> FmuMap:
 def create(scenario: Scenario) -> Service:
     """The FMU `tissue.fmu` of a scenario, tied to the tissue's topics by the map `tissue.fmu_map`.
 
-    By default the abdomen of the scenario, built here. Raises MapError for a map of another role: see `hosted`.
+    By default the abdomen of the scenario, built here. Raises MapError for an FMU that cannot be built, loaded or tied, and for a
+    map of another role: see `hosted`.
     """
     chosen = scenario.tissue
     table = load_map(Path(chosen.fmu_map)) if chosen.fmu_map else None
@@ -129,11 +135,14 @@ def create(scenario: Scenario) -> Service:
             f"tissue.fmu_map = {chosen.fmu_map}: its role is {table.role}, not tissue; "
             "for another role use `hosted` in a file of your own (--service ROLE=FILE.py)"
         )
-    if chosen.fmu:
-        service = hosted(Path(chosen.fmu), table, scenario)
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            service = hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
+    try:
+        if chosen.fmu:
+            service = hosted(Path(chosen.fmu), table, scenario)
+        else:
+            with tempfile.TemporaryDirectory() as folder:
+                service = hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
+    except (FmuError, ExportError, CompileError) as error:
+        raise MapError(f"services.tissue = fmu: {error}") from error
     return carried(service, scenario)
 
 
