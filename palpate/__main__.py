@@ -9,11 +9,15 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from types import FrameType
 
 from palpate.environment import FIXED
 
 EXIT_INTERRUPTED = 130
 """What a shell makes of a command that SIGINT ended, and what Typer leaves with then."""
+
+TERMINALS = [number for number in (0, 1, 2) if os.isatty(number)]
+"""Which of standard input, output and error are terminals."""
 
 
 def main() -> None:
@@ -23,7 +27,7 @@ def main() -> None:
         os.execve(sys.executable, [sys.executable, "-m", "palpate", *sys.argv[1:]], {**os.environ, **FIXED})
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # `docker stop`, systemd: what Ctrl-C does
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
-        signal.signal(signal.SIGHUP, signal.default_int_handler)  # the terminal was closed
+        signal.signal(signal.SIGHUP, _hung_up)
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         _run()
@@ -36,6 +40,14 @@ def main() -> None:
         return
     print("palpate: interrupted", file=sys.stderr)
     sys.exit(EXIT_INTERRUPTED)
+
+
+def _hung_up(number: int, frame: FrameType | None) -> None:
+    """The terminal was closed, which is what Ctrl-C is; nothing is to fail because there is nobody to read."""
+    for terminal in TERMINALS:
+        if not os.isatty(terminal):
+            os.dup2(os.open(os.devnull, os.O_RDWR), terminal)
+    signal.default_int_handler(number, frame)
 
 
 def _run() -> None:

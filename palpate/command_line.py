@@ -11,6 +11,16 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+
+class SteadyConsole(Console):
+    """A console whose reader may go away, as `head` does: then it shows no more, and nothing else ends for that."""
+
+    def on_broken_pipe(self) -> None:
+        """Says the rest to nobody."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
 EXIT_BAD_INPUT = 2
 """Nothing was started: what was asked for cannot be."""
 EXIT_FAILED = 3
@@ -19,7 +29,7 @@ EXIT_FAILED = 3
 
 def say(why: object) -> None:
     """Prints what is wrong, word for word."""
-    Console(stderr=True).print(f"[bold red]palpate:[/] {escape(str(why))}", highlight=False, soft_wrap=True)
+    SteadyConsole(stderr=True).print(f"[bold red]palpate:[/] {escape(str(why))}", highlight=False, soft_wrap=True)
 
 
 def refuse(why: object) -> NoReturn:

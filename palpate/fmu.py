@@ -27,11 +27,13 @@ app = typer.Typer(name="fmu", help="The abdomen as an FMU; FMUs of any kind look
 
 def _scenario(name: str, settings: list[str]) -> Scenario:
     """A scenario by name or file, or the default one with a mesh as its phantom."""
-    from palpate_models.load import load_scenario
+    from palpate_models.load import ScenarioError, load_scenario
     from palpate_models.patient import Phantom
     from palpate_models.scenario import Scenario
 
     if Path(name).suffix.lower() in MESHES:
+        if settings:
+            raise ScenarioError(f"{name}: --set is for scenarios: name one that has phantom.kind: mesh and phantom.mesh: {name}")
         return Scenario(name=Path(name).stem, phantom=Phantom(kind="mesh", mesh=name))
     return load_scenario(name, settings)
 

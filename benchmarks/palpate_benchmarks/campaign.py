@@ -11,6 +11,7 @@ import re
 import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final
@@ -302,7 +303,8 @@ def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
             finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
             finding.sign = watch.signs[0] if watch.signs else str(result.failure)
     split = (finding.injected_s or 0.0) * NS
-    forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in collected.indentation]
+    told = [(nanoseconds(m.header.stamp), peak_force(m)) for m in collected.indentation]
+    forces = [(t, force) for t, force in told if isfinite(force)]  # the fault may be that it is told as NaN
     finding.peak_force_before_n = round(max((f for t, f in forces if t < split), default=0.0), 2)
     after = [force for t, force in forces if t >= split]
     finding.peak_force_n = round(max(after), 2) if after else None

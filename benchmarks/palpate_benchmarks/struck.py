@@ -13,9 +13,10 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -81,8 +82,8 @@ class Struck:
 
     @cached_property
     def forces(self) -> list[tuple[int, float]]:
-        """The true normal force [N] at each simulated time [ns]."""
-        return [(stamp, message.normal_force) for stamp, message in self.recorded("truth/indentation")]
+        """The greatest true force [N] until each simulated time [ns] since the one before."""
+        return [(stamp, peak_force(message)) for stamp, message in self.recorded("truth/indentation")]
 
     def recorded(self, topic: str) -> list[tuple[int, Any]]:
         """Messages of a topic out of the recording: (stamp [ns], message)."""
@@ -127,22 +128,37 @@ def strike(
     assert run.stdout is not None
     own, at, struck_s, said = Path(), 0.0, 0.0, {}
     processes: dict[str, psutil.Process] = {}
-    for line in run.stdout:
-        if line.startswith(PROCESSES):
-            places = json.loads(line.removeprefix(PROCESSES))
-            own = Path(places.pop("folder"))
-            processes = {role: psutil.Process(pid) for role, pid in places.items()}
-            processes[CONDUCTOR] = psutil.Process(run.pid)
-        elif line.startswith(AT_DEPTH):
-            struck_s, at = float(line.rsplit(" ", 1)[1]), time.monotonic()
-            blow(processes)
-        elif line.startswith(RESULT):
-            said = json.loads(line.removeprefix(RESULT))
-    try:
-        status: int | None = run.wait(timeout=ENDS_WITHIN_S)
-    except subprocess.TimeoutExpired:
+    hanging = threading.Event()
+    alarm: threading.Timer | None = None
+
+    def end_hanging() -> None:
+        hanging.set()
         run.kill()
-        status = None
+
+    try:
+        for line in run.stdout:
+            if line.startswith(PROCESSES):
+                places = json.loads(line.removeprefix(PROCESSES))
+                own = Path(places.pop("folder"))
+                processes = {role: psutil.Process(pid) for role, pid in places.items()}
+                processes[CONDUCTOR] = psutil.Process(run.pid)
+            elif line.startswith(AT_DEPTH):
+                struck_s, at = float(line.rsplit(" ", 1)[1]), time.monotonic()
+                blow(processes)
+                alarm = threading.Timer(ENDS_WITHIN_S, end_hanging)
+                alarm.start()
+            elif line.startswith(RESULT):
+                said = json.loads(line.removeprefix(RESULT))
+        code = run.wait()
+    finally:
+        if alarm is not None:
+            alarm.cancel()
+        if run.poll() is None:  # whatever interrupted this, the run does not stay
+            for process in processes.values():
+                with suppress(psutil.Error):
+                    process.kill()
+            run.kill()
+    status = None if hanging.is_set() else code
     services = {role: process for role, process in processes.items() if role != CONDUCTOR}
     _, staying = psutil.wait_procs(services.values(), timeout=LEAVES_WITHIN_S)
     left = time.monotonic() - at

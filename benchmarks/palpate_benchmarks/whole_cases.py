@@ -152,10 +152,12 @@ def starve(seconds: float) -> None:
     """Keeps every core busy for some time [s] with processes that want all of it."""
     words = [sys.executable, "-c", "while True: pass"]
     spinning = [subprocess.Popen(words) for _ in range(SPINNING * len(os.sched_getaffinity(0)))]
-    time.sleep(seconds)
-    for process in spinning:
-        process.kill()
-        process.wait()
+    try:
+        time.sleep(seconds)
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
 
 
 def _seconds(case: FaultCase) -> float:

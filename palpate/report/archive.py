@@ -6,16 +6,18 @@ Columns over time are arrays in SI units. The final map, findings and phantom ar
 from __future__ import annotations
 
 import json
+import zlib
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.report.files import drafted
 from palpate.truth.pressed import Pressed
 from palpate.truth.touched import Touched
 from palpate_assessment.messages import SEEN, skin_of
@@ -148,7 +150,8 @@ def write_evidence(
         columns |= {"touched_believed": touched.believed, "touched_true": touched.true}
     if pressed is not None:
         columns |= {f"pressed_{name}": values for name, values in vars(pressed).items()}
-    np.savez_compressed(path, **columns)
+    with drafted(path) as draft, draft.open("wb") as file:
+        np.savez_compressed(file, **columns)
 
 
 def _depth_known(c: Collected) -> tuple[Array, Array]:
@@ -188,9 +191,9 @@ def read_figures(folder: Path) -> dict[str, Any]:
 
 def completed(folder: Path) -> dict[str, Any] | None:
     """report.json of a completed run with its evidence; None where there is none."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, KeyError, TypeError):
         report = read_figures(folder)
-        return report if report["failure"] is None and (folder / FILE).is_file() else None
+        return report if report["failure"] is None and is_zipfile(folder / FILE) else None
     return None
 
 
@@ -204,7 +207,7 @@ def read_evidence(folder: Path) -> Evidence:
         raise EvidenceError(
             f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
         ) from error
-    except (OSError, ValueError, BadZipFile) as error:
+    except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
     try:
         times, sources, words = (held.pop(f"event_{name}").tolist() for name in ("time", "source", "words"))

@@ -13,6 +13,7 @@ from palpate.report.archive import EvidenceError
 from palpate_bus.contract import contract
 from palpate_bus.recordings import RUN_FOLDER, RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.runs.announcement import live
+from palpate_bus.runs.run_name import in_use
 from palpate_conductor.collector import Collected, Collector
 from palpate_models.load import ScenarioError, load_scenario
 from palpate_models.scenario import Scenario
@@ -21,6 +22,10 @@ from palpate_recorder.recover import salvage
 STILL_S: Final = 3.0
 """A recording that has not grown for so long [s] grows no more: its recorder writes every simulated second."""
 MISSING: Final = "a run with --record none keeps nothing that could be recovered"
+
+
+class NothingRecordedError(EvidenceError):
+    """A run that broke off before there was anything of it."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +39,15 @@ class BrokenOff:
 
 
 def broken_off(folder: Path) -> BrokenOff:
-    """Reads the folder of a run. Raises EvidenceError for one that is in use or holds no recording."""
-    if any(Path(run.out).resolve() == folder.resolve() for run in live()):
-        raise EvidenceError(f"{folder}: its run is still on; stop that first")
+    """Reads the folder of a run.
+
+    Raises EvidenceError for one that is in use, NothingRecordedError for one that holds no recording.
+    """
+    try:
+        if in_use(folder) or any(Path(run.out).resolve() == folder.resolve() for run in live()):
+            raise EvidenceError(f"{folder}: its run is still on; stop that first")
+    except OSError as error:
+        raise EvidenceError(f"{folder}: cannot be looked into: {error}") from error
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))
         recording = _recording(folder / RUN_FOLDER)
@@ -46,10 +57,10 @@ def broken_off(folder: Path) -> BrokenOff:
 
 
 def _recording(folder: Path) -> Recording:
-    """The recording, completed if its recorder could not. Raises RecordingError."""
+    """The recording, completed if its recorder could not. Raises RecordingError, or NothingRecordedError where there is none."""
     parts = sorted(folder.glob("*.mcap"))
     if not parts:
-        raise RecordingError(f"{folder}: no recording there; {MISSING}")
+        raise NothingRecordedError(f"{folder}: nothing can be recovered: no recording there; {MISSING}")
     while not (folder / "metadata.yaml").is_file() and time() - parts[-1].stat().st_mtime < STILL_S:
         sleep(0.1)  # the recorder outlives the conductor by some seconds
     if (folder / "metadata.yaml").is_file():
@@ -57,7 +68,7 @@ def _recording(folder: Path) -> Recording:
     try:
         return salvage(folder, [topic.name for role in ("conductor", "assessment") for topic, _ in contract().inputs(role)])
     except (OSError, ValueError) as error:
-        raise RecordingError(str(error)) from error
+        raise NothingRecordedError(f"{folder}: nothing can be recovered: {error}") from error
 
 
 def collect(recording: Recording) -> Collected:

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file; its readers have the old one or the new one, also when this process is killed. Raises OSError."""
+@contextmanager
+def drafted(path: Path) -> Iterator[Path]:
+    """Where to write what takes the place of `path` in the end: readers have the old file or the new one, also after a kill."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        draft.write_text(text, encoding="utf-8")
+        yield draft
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file whole. Raises OSError."""
+    with drafted(path) as draft:
+        draft.write_text(text, encoding="utf-8")

@@ -20,6 +20,7 @@ from palpate.report import page_figures, page_surface, words
 from palpate.report.archive import FILE as EVIDENCE
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
 from palpate.report.evidence import body_of, felt_truth
+from palpate.report.files import write_text
 from palpate.report.results import clean_words, unassessed
 from palpate.report.rows import FindingRow, Report
 from palpate.report.scoring import Truth
@@ -63,7 +64,7 @@ def write_page(folder: Path) -> Path:
     except ScenarioError as error:
         raise EvidenceError(str(error)) from error
     path = folder / FILE
-    path.write_text(render(scenario, report, evidence, sample_places(folder)), encoding="utf-8")
+    write_text(path, render(scenario, report, evidence, sample_places(folder)))
     return path
 
 

@@ -34,6 +34,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
     if completed(folder) is not None:
         raise EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
     run = broken_off(folder)
+    note = ""
     checkpoint, earlier = before(folder.resolve())
     collected, recording = run.collected, run.recording
     if collected.findings is None or not collected.findings.final:
@@ -42,9 +43,11 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
                 _assess(run)
         except RecordingError as error:
             raise EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
+        except Exception as error:  # of the user's own, which may have been what ended the run
+            note = f"; the assessment could not finish: {type(error).__name__}: {error}"
     reached = f"the recording ends at {recording.last / NS:.3f} s"
     why = given_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
-    failure = f"recovered from a run that had no end: {reached}" + (f"; last: {why}" if why else "")
+    failure = f"recovered from a run that had no end: {reached}" + (f"; last: {why}" if why else "") + note
     return run.scenario, RunResult(
         runtime=RUNTIME,
         collected=collected,

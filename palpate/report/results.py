@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -41,6 +42,8 @@ from palpate_models.motion import BodyMotion
 from palpate_models.phantom import quadrant
 from palpate_models.scenario import Scenario
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Known:
@@ -60,7 +63,11 @@ def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] 
     registered = np.array(exam_input(scenario).X_WA)
     runs = [steady_contact(run.exam_states, run.indentation, body.X_WA, motion, registered) for run in (*earlier, c)]
     contact = reduce(ContactRecord.then, runs)
-    pressed = press_patient(scenario)
+    try:
+        pressed = press_patient(scenario)
+    except Exception:  # a tissue of the user's own, which was changed meanwhile or can be made only once
+        log.exception("what there is to be felt is not known: the patient cannot be pressed")
+        pressed = None
     return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
 
 
@@ -124,16 +131,16 @@ def _draws_no_map(c: Collected) -> bool:
 
 
 def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:
-    """Writes report.json, samples.csv, evidence.npz and, when there is a map, map.png into a run's folder; returns the report."""
+    """Writes samples.csv, evidence.npz, report.json and, when there is a map, map.png into a run's folder; returns the report."""
     c = result.collected
     known = truth_of_run(scenario, c, result.earlier)
     run = run_of(folder)
     report = assemble(scenario, result, known).model_copy(update={"run": run})
     samples = samples_of(c.samples)
-    write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     write_samples(folder / "samples.csv", samples, run)
     touched, felt = None if known.contact is None else known.contact.touched, known.felt
     archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed, run)
+    write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     if c.stiffness_map is not None:
         title = f"{scenario.name}, seed {scenario.seed}"
         from palpate.report.figures import draw_map  # noqa: PLC0415 - findings are printed before anything is drawn

@@ -17,7 +17,7 @@ import numpy as np
 
 from palpate.environment import given
 from palpate.report.archive import EvidenceError, completed
-from palpate.report.broken_off import BrokenOff, broken_off
+from palpate.report.broken_off import BrokenOff, NothingRecordedError, broken_off
 from palpate.report.evidence import points
 from palpate_assessment.sampling import columns
 from palpate_assessment.service import AssessmentService
@@ -57,7 +57,7 @@ def resumption(folder: Path) -> Resumption:
 
     Raises EvidenceError for one that was completed, is still on, had felt nothing yet, or left no recording.
     """
-    while (folder / FOLDER / "scenario.yaml").is_file():
+    while _holds_something(folder / FOLDER):
         folder /= FOLDER
     if completed(folder) is not None:
         raise EvidenceError(f"{folder}: its run was completed; there is nothing to go on with")
@@ -68,6 +68,16 @@ def resumption(folder: Path) -> Resumption:
     if not len(reached.left) and not runs[-1].scenario.exam.searched:
         raise EvidenceError(f"{folder}: it had reached every target; palpate report {folder} --recover has its findings")
     return Resumption(folder / FOLDER, runs[-1].scenario, reached, tuple(run.collected for run in runs))
+
+
+def _holds_something(folder: Path) -> bool:
+    """Whether there is a run in a folder that can be gone on with, or that says why not; one killed at its start is none."""
+    if not (folder / "scenario.yaml").is_file():
+        return False
+    try:
+        return completed(folder) is not None or broken_off(folder) is not None
+    except NothingRecordedError:
+        return False
 
 
 def before(folder: Path) -> tuple[Checkpoint | None, tuple[Collected, ...]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from time import perf_counter
 
 from palpate.environment import given
+from palpate.run.interrupts import all_is_measured
 from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
@@ -15,6 +16,7 @@ from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.recording import RawRecorder
 from palpate_bus.service import Service
 from palpate_conductor.collector import Collector
+from palpate_conductor.outcome import in_words
 from palpate_conductor.result import RunProgress, RunResult, Tell, given_up
 from palpate_conductor.timing import SIM_LIMIT
 from palpate_conductor.tree import FrameTree
@@ -61,13 +63,14 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     try:
         with rare_collections():
             last = run.run(end, SIM_LIMIT)
-    except KeyboardInterrupt:
-        interrupted = True
-        failure, last = f"interrupted at {run.t / NS:.3f} s", run.t
     except ServiceFailed as error:
         failure = f"{error.role} lost at {error.t / NS:.3f} s: {error.why}"
         lost = {error.role: error.t}
         last = error.t
+    except (Exception, KeyboardInterrupt, SystemExit) as error:  # whatever it is, what was measured is to be told
+        interrupted = isinstance(error, KeyboardInterrupt)
+        failure, last = in_words(error, run.t), run.t
+    all_is_measured()
     wall = perf_counter() - start
     facts = run.finish()
     for recorder in recorders:

@@ -10,10 +10,11 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
-from palpate.command_line import EXIT_FAILED, fail, say
+from palpate.command_line import EXIT_FAILED, SteadyConsole, say
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
+from palpate.run.interrupts import Ending
 from palpate.run.roles import write_scenario_files
 from palpate.run.space import another_folder, megabytes_of
 from palpate_bus.contract import contract
@@ -22,16 +23,29 @@ from palpate_conductor.result import RunResult
 from palpate_models.scenario import Scenario
 
 
+class Interrupted(typer.Exit):
+    """The command ends as it would have without, but begins nothing else."""
+
+
 def conclude(
-    console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
+    console: Console,
+    folder: Path,
+    scenario: Scenario,
+    result: RunResult,
+    quiet: bool = False,
+    as_json: bool = False,
+    ending: Ending | None = None,
 ) -> None:
-    """Writes the results, prints the findings, and leaves with status 3 when the run failed or its folder took no results."""
+    """Writes the results and prints the findings; `ending` says whether it was asked for.
+
+    Raises typer.Exit with status 3 when the run failed or its folder took no results, Interrupted when it was asked to end.
+    """
     with nullcontext() if quiet else console.status("writing report and maps: about ten seconds"):
         report, page, trouble = _written(folder, scenario, result)
     if as_json:
         print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
     else:
-        print_findings(Console(), report)
+        print_findings(SteadyConsole(), report)
     for sentence in _unfit(result):
         say(f"{sentence}; see docs/topics.md, and palpate check assessment")
     if page is not None and (trouble or not quiet):
@@ -41,9 +55,12 @@ def conclude(
     if trouble:
         say(trouble)
     if result.failure:
-        fail(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
-    if trouble:
-        raise typer.Exit(EXIT_FAILED)
+        say(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+    status = EXIT_FAILED if result.failure or trouble else 0
+    if result.interrupted or (ending is not None and ending.asked):
+        raise Interrupted(status)
+    if status:
+        raise typer.Exit(status)
 
 
 def _unfit(result: RunResult) -> list[str]:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
-from palpate.command_line import refuse
+from palpate.command_line import SteadyConsole, refuse
 from palpate.run.conclusion import conclude
+from palpate.run.interrupts import all_is_measured, results_first
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
 from palpate_bus.settings import BusConfigError
@@ -25,7 +24,7 @@ NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait
 
 def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallclock: bool, quiet: bool) -> None:
     """Conducts services that others start and writes the results into `out`, which has scenario.yaml."""
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     for name in observers:
         if name not in OBSERVERS:
             refuse(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
@@ -37,8 +36,10 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     except (ScenarioError, BusConfigError) as error:
         refuse(error)
     roles = (*workers(chosen), *observers)
-    with RunDisplay(console, quiet, chosen.exam) as display:
-        timing = Timing(wallclock, 1.0 if realtime else None)
-        result = conduct(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
-    close_session(session)
-    conclude(console, out, chosen, result, quiet)
+    with results_first() as ending:
+        with RunDisplay(console, quiet, chosen.exam) as display:
+            timing = Timing(wallclock, 1.0 if realtime else None)
+            result = conduct(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
+        all_is_measured()
+        close_session(session)
+        conclude(console, out, chosen, result, quiet, ending=ending)

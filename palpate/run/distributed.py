@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+from palpate.run.interrupts import all_is_measured
 from palpate.run.placement import Groups, PlacementError, apart
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, override_files, read_processes
@@ -83,6 +84,7 @@ def run_distributed(
             tree = FrameTree(exam_input(scenario))
             with local.as_conductor():
                 result = conduct(session, roles, told, local.ended, timing, patience, begin, tree)
+                all_is_measured()
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
             return result

@@ -11,15 +11,16 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.command_line import EXIT_FAILED, fail, refuse, say
+from palpate.command_line import EXIT_FAILED, SteadyConsole, fail, refuse, say
 from palpate.environment import given
 from palpate.report.archive import EvidenceError
 from palpate.report.resumption import Resumption, going_on, resumption
 from palpate.run.composed import run_composed
-from palpate.run.conclusion import conclude
+from palpate.run.conclusion import Interrupted, conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
 from palpate.run.folder import FolderError, results_folder, unless_begun, usual_folder
+from palpate.run.interrupts import results_first
 from palpate.run.options import Record
 from palpate.run.placement import Groups, PlacementError, placement
 from palpate.run.places import Absent, PlaceError
@@ -84,16 +85,16 @@ def resume(how: How) -> None:
     assert how.resume is not None
     try:
         before = resumption(how.resume)
-    except EvidenceError as error:
+    except (EvidenceError, OSError) as error:
         refuse(f"--resume {error}")
     if not (how.quiet or how.as_json):
         say(before.words)
-    examine(before.scenario, replace(how, out=before.folder), before)
+    examine(before.scenario, replace(how, out=before.folder, overwrite=before.folder.is_dir()), before)
 
 
 def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> None:
     """Runs the examination, or goes on with one, and writes its results; ends the command when it cannot start or has failed."""
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     quiet = how.quiet or how.as_json
     _refuse_contradictions(scenario, how)
     try:
@@ -104,8 +105,7 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
         refuse(error)
     folder = how.out or usual_folder(scenario.name)
     try:
-        with results_folder(folder, overwrite=how.overwrite):
-            check_room(folder, scenario.exam, how.record)
+        with results_first() as ending, results_folder(folder, overwrite=how.overwrite):
             if not quiet:
                 _announce(console, scenario, how, folder)
             with RunDisplay(console, quiet, scenario.exam) as display, given({"PALPATE_RECORD": how.record}):
@@ -114,12 +114,13 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
                     unless_begun(folder, lambda: display.begun),
                     going_on(None if before is None else before.checkpoint),
                 ):
+                    check_room(folder, scenario.exam, how.record)
                     result = _run(scenario, folder.resolve(), tell, how, observers, absent, groups)
                     if result.unbegun:
                         raise KeyboardInterrupt
                 if before is not None:
                     result = replace(result, run_hash=None, earlier=before.earlier)
-            conclude(console, folder, scenario, result, quiet, how.as_json)
+            conclude(console, folder, scenario, result, quiet, how.as_json, ending)
     except (ProcessListError, ChoiceError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
     except RunFailed as error:
@@ -138,19 +139,25 @@ def _announce(console: Console, scenario: Scenario, how: How, folder: Path) -> N
 
 
 def examine_again(scenario: Scenario, how: How, count: int) -> None:
-    """Runs so many examinations one after another, with seeds from the scenario's on; ends the command when one has failed."""
-    folder = how.out or usual_folder(scenario.name)
+    """Runs so many examinations one after another, with seeds from the scenario's on; Ctrl-C in one is the end of all.
 
-    def once(number: int, own: Path) -> bool:
+    Ends the command when one has failed.
+    """
+    failed = 0
+
+    def once(number: int, own: Path) -> None:
+        nonlocal failed
         try:
             examine(scenario.model_copy(update={"seed": scenario.seed + number - 1}), replace(how, out=own))
+        except Interrupted as left:
+            raise Interrupted(EXIT_FAILED if failed else left.exit_code) from None
         except typer.Exit as left:
             if left.exit_code != EXIT_FAILED:
                 raise  # what cannot start once cannot start again
-            return False
-        return True
+            failed += 1
 
-    if failed := repeat(count, folder, once):
+    repeat(count, how.out or usual_folder(scenario.name), once)
+    if failed:
         fail(f"{failed} of {count} examinations did not come to a good end")
 
 
@@ -177,7 +184,13 @@ def _refuse_contradictions(scenario: Scenario, how: How) -> None:
 
 
 def _run(
-    scenario: Scenario, folder: Path, tell: Tell, how: How, observers: tuple[str, ...], absent: Absent, groups: Groups
+    scenario: Scenario,
+    folder: Path,
+    tell: Tell,
+    how: How,
+    observers: tuple[str, ...],
+    absent: Absent,
+    groups: Groups,
 ) -> RunResult:
     if how.composed:
         return run_composed(scenario, folder, tell, observers)

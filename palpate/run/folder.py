@@ -10,13 +10,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-from palpate_bus.implementations import ChoiceError
-from palpate_bus.runs.run_name import FILE as RUN
-
-LOCK = "run.lock"
-"""The file whose lock the run holds; it names the process. The kernel drops the lock when the process ends, however it ends."""
-OURS = frozenset({LOCK, RUN, "scenario.yaml"})
-"""A folder that has none of these is no results folder, and is not removed."""
+from palpate_bus.runs.run_name import LOCK, run_of
 
 
 class FolderError(ValueError):
@@ -41,29 +35,41 @@ def unless_begun(path: Path, begun: Callable[[], bool]) -> Iterator[None]:
 
 @contextmanager
 def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """Makes the folder, and holds its lock until the run is over. `overwrite` removes the results of an earlier run whole.
+    """Makes the folder, and holds its lock until the run is over.
 
-    It is removed when a service cannot be made, so that the same command works once the cause is mended. Raises ChoiceError then,
-    and FolderError for a folder that another run is writing into, that is not empty, or that cannot be made.
+    `overwrite` lays the results of an earlier run aside. They are removed once this run is over, and come back when it leaves no
+    folder, as one does that could not begin. Raises FolderError for a folder that another run is writing into, that is not empty,
+    or that cannot be made.
     """
-    if overwrite and path.is_dir() and any(path.iterdir()):
-        if not any((path / name).exists() for name in OURS):
-            raise FolderError(f"--out {path} --overwrite: it does not hold the results of a run, so it is not removed")
-        with _locked(path):
-            shutil.rmtree(path)
+    earlier = _laid_aside(path) if overwrite and path.is_dir() and any(path.iterdir()) else None
     try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FolderError(f"--out {path}: cannot be made a folder: {error.strerror}") from None
-    with _locked(path):
-        if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
-            what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
-            raise FolderError(f"--out {path}: there is {what} in it; name another folder, or --overwrite to remove it first")
         try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FolderError(f"--out {path}: cannot be made a folder: {error.strerror}") from None
+        with _locked(path):
+            if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
+                what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
+                raise FolderError(f"--out {path}: there is {what} in it; name another folder, or --overwrite to remove it first")
             yield path
-        except ChoiceError:
-            shutil.rmtree(path, ignore_errors=True)
-            raise
+    finally:
+        if earlier is not None and path.exists():
+            shutil.rmtree(earlier, ignore_errors=True)
+        elif earlier is not None:
+            earlier.rename(path)
+            (path / LOCK).unlink(missing_ok=True)
+
+
+def _laid_aside(path: Path) -> Path:
+    """Where the results of an earlier run are now. Raises FolderError for a folder that holds none, or that cannot be moved."""
+    if path.is_symlink() or not (run_of(path) or (path / LOCK).exists()):
+        raise FolderError(f"--out {path} --overwrite: it does not hold the results of a run, so it is not removed")
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    with _locked(path):
+        try:
+            return path.rename(aside)
+        except OSError as error:
+            raise FolderError(f"--out {path} --overwrite: cannot be moved: {error.strerror}") from None
 
 
 @contextmanager

@@ -279,16 +279,24 @@ class LocalProcesses:
         `at_once`: they have nothing to complete, and many are still importing, so that they do not hear the bus.
         """
         steps: tuple[signal.Signals | None, ...] = (None, signal.SIGTERM, signal.SIGKILL)
-        for send in steps[-1:] if at_once else steps:
-            left = [child for child in dict.fromkeys(self.running.values()) if child.poll() is None]
-            deadline = monotonic() + patience_s
-            for child in left:
-                if send is not None:
-                    child.send_signal(send)
-            for child in left:
-                with suppress(subprocess.TimeoutExpired):
-                    child.wait(timeout=max(0.0, deadline - monotonic()))
-        for log in self._logs:
-            log.close()
-        self._announcement.withdraw()
-        self._own.remove()
+        try:
+            for send in steps[-1:] if at_once else steps:
+                left = self._left()
+                deadline = monotonic() + patience_s
+                for child in left:
+                    if send is not None:
+                        child.send_signal(send)
+                for child in left:
+                    with suppress(subprocess.TimeoutExpired):
+                        child.wait(timeout=max(0.0, deadline - monotonic()))
+        finally:  # Ctrl-C, too, leaves nothing behind
+            for child in self._left():
+                child.send_signal(signal.SIGKILL)
+            for log in self._logs:
+                log.close()
+            self._announcement.withdraw()
+            self._own.remove()
+
+    def _left(self) -> list[Child]:
+        """The processes that have not ended."""
+        return [child for child in dict.fromkeys(self.running.values()) if child.poll() is None]

@@ -11,15 +11,20 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Final
 
 import numpy as np
 import psutil
+from pydantic import TypeAdapter
 from scipy import stats
 
+from palpate.command_line import refuse, say
+from palpate.report.files import write_text
+
+FILE: Final = "soak.csv"
 EVERY_S: Final = 1.0
 OURS: Final = "palpate_"
 HERE: Final = "conductor"
@@ -56,62 +61,91 @@ class Growth:
     """The most in the first examination and in the last."""
 
 
+@dataclass
+class Most:
+    """The most of a role in one examination."""
+
+    at_s: float
+    """When the examination began, since the first began."""
+    rss_mb: float
+    descriptors: int
+
+
 class Soak:
-    """Notes the memory of a run's processes while it is on."""
+    """The most memory and open files of each role in each examination; nothing here grows by the second."""
 
     def __init__(self) -> None:
-        self.samples: list[ProcessSample] = []
         self.number = 0
-        self._began = monotonic()
-        self._over = threading.Event()
+        """Which examination is on."""
+        self.most: dict[str, dict[int, Most]] = {}
+        """By role, then by examination."""
+
+    @classmethod
+    def read(cls, folder: Path) -> Soak:
+        """What was noted in a folder of `palpate run --repeat`. Raises OSError, or ValueError where it is none."""
+        soak = cls()
+        with (folder / FILE).open(newline="", encoding="utf-8") as file:
+            for sample in TypeAdapter(list[ProcessSample]).validate_python(list(csv.DictReader(file))):
+                soak.take(sample)
+        return soak
+
+    def take(self, sample: ProcessSample) -> None:
+        """Takes what was noted of one process."""
+        each = self.most.setdefault(sample.role, {})
+        most = each.setdefault(sample.number, Most(sample.at_s, 0.0, 0))
+        most.rss_mb, most.descriptors = max(most.rss_mb, sample.rss_mb), max(most.descriptors, sample.descriptors)
 
     @contextmanager
-    def noted(self) -> Iterator[None]:
-        """Notes once a second."""
-        thread = threading.Thread(target=self._note, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            self._over.set()
-            thread.join()
+    def noted(self, folder: Path) -> Iterator[None]:
+        """Notes all processes once a second, in soak.csv, too. Raises OSError when that cannot be begun."""
+        over, began = threading.Event(), monotonic()
+        with (folder / FILE).open("w", newline="", encoding="utf-8", buffering=1) as file:
+            rows = csv.writer(file, lineterminator="\n")
+            rows.writerow(ProcessSample.__dataclass_fields__)
 
-    def _note(self) -> None:
-        while not self._over.wait(EVERY_S):
-            here = psutil.Process()
-            for process in (here, *here.children(recursive=True)):
-                with suppress(psutil.Error):  # it may end meanwhile
-                    role = HERE if process == here else _role(process.cmdline())
-                    if role:
-                        rss = process.memory_info().rss / 1e6
-                        self.samples.append(ProcessSample(monotonic() - self._began, self.number, role, rss, process.num_fds()))
+            def note() -> None:
+                while not over.wait(EVERY_S):
+                    for sample in _processes(monotonic() - began, self.number):
+                        self.take(sample)
+                        with suppress(OSError):  # the disk may be full, the folder gone: the examinations go on
+                            rows.writerow((f"{sample.at_s:.3f}", *astuple(sample)[1:]))
+
+            thread = threading.Thread(target=note, daemon=True)
+            thread.start()
+            try:
+                yield
+            finally:
+                over.set()
+                thread.join()
 
     def growths(self) -> list[Growth]:
         """By role."""
-        return [self._growth(role) for role in dict.fromkeys(sample.role for sample in self.samples)]
-
-    def _growth(self, role: str) -> Growth:
-        mine = [sample for sample in self.samples if sample.role == role]
-        each = [[sample for sample in mine if sample.number == number] for number in sorted({s.number for s in mine})]
-        hours = np.array([run[0].at_s for run in each]) / 3600
-        highest = np.array([max(sample.rss_mb for sample in run) for run in each])
-        files = [max(sample.descriptors for sample in run) for run in each]
-        slope = low = high = None
-        if len(each) >= FEWEST:
-            fit = stats.linregress(hours, highest)
-            share = 100 / float(highest.mean())
-            half = float(stats.t.ppf(0.975, len(each) - 2) * fit.stderr)
-            slope, low, high = (round(share * value, 2) for value in (fit.slope, fit.slope - half, fit.slope + half))
-        return Growth(role, len(each), round(float(highest.max()), 1), slope, low, high, (files[0], files[-1]))
+        return [_growth(role, list(each.values())) for role, each in self.most.items()]
 
     def write(self, folder: Path) -> None:
-        """Writes soak.csv and soak.json."""
-        with (folder / "soak.csv").open("w", newline="", encoding="utf-8") as file:
-            rows = csv.writer(file, lineterminator="\n")
-            rows.writerow(ProcessSample.__dataclass_fields__)
-            rows.writerows((f"{s.at_s:.1f}", s.number, s.role, f"{s.rss_mb:.1f}", s.descriptors) for s in self.samples)
-        growths = [asdict(growth) for growth in self.growths()]
-        (folder / "soak.json").write_text(json.dumps(growths, indent=1) + "\n", encoding="utf-8")
+        """Writes soak.json. Raises OSError."""
+        write_text(folder / "soak.json", json.dumps([asdict(growth) for growth in self.growths()], indent=1) + "\n")
+
+
+def _growth(role: str, each: list[Most]) -> Growth:
+    hours, highest = (np.array(values) for values in zip(*((most.at_s / 3600, most.rss_mb) for most in each), strict=True))
+    slope = low = high = None
+    if len(each) >= FEWEST:
+        fit = stats.linregress(hours, highest)
+        share = 100 / float(highest.mean())
+        half = float(stats.t.ppf(0.975, len(each) - 2) * fit.stderr)
+        slope, low, high = (round(share * value, 2) for value in (fit.slope, fit.slope - half, fit.slope + half))
+    return Growth(role, len(each), round(float(highest.max()), 1), slope, low, high, (each[0].descriptors, each[-1].descriptors))
+
+
+def _processes(at_s: float, number: int) -> Iterator[ProcessSample]:
+    """The command itself and every service that it has."""
+    here = psutil.Process()
+    for process in (here, *here.children(recursive=True)):
+        with suppress(psutil.Error):  # it may end meanwhile
+            role = HERE if process == here else _role(process.cmdline())
+            if role:
+                yield ProcessSample(at_s, number, role, round(process.memory_info().rss / 1e6, 1), process.num_fds())
 
 
 def _role(command: list[str]) -> str:
@@ -119,14 +153,18 @@ def _role(command: list[str]) -> str:
     return next((word.removeprefix(OURS) for word in command if word.startswith(OURS)), "")
 
 
-def repeat(count: int, folder: Path, once: Callable[[int, Path], bool]) -> int:
-    """Does `once(number, folder of its own)` so many times; returns how many did not come to a good end."""
-    folder.mkdir(parents=True, exist_ok=True)
-    soak, failed = Soak(), 0
-    with soak.noted():
+def repeat(count: int, folder: Path, once: Callable[[int, Path], None]) -> None:
+    """Does `once(number, folder of its own)` so many times, and after each writes what was noted until then."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        refuse(f"--out {folder}: cannot be made a folder: {error.strerror}")
+    soak = Soak()
+    with soak.noted(folder):
         for number in range(1, count + 1):
             soak.number = number
-            failed += not once(number, folder / f"{number:04d}")
-            soak.write(folder)
-    soak.write(folder)
-    return failed
+            once(number, folder / f"{number:04d}")
+            try:
+                soak.write(folder)
+            except OSError as error:
+                say(f"{folder}: what was noted of memory cannot be written: {error.strerror}")

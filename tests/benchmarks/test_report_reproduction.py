@@ -79,11 +79,14 @@ def test_the_moments_are_of_their_phases() -> None:
 
 def test_a_run_that_failed_is_not_finished(tmp_path: Path) -> None:
     assert completed(tmp_path) is None
-    (tmp_path / "evidence.npz").touch()
+    np.savez(tmp_path / "evidence.npz", time=np.zeros(3))
     (tmp_path / "report.json").write_text('{"failure": "robot lost"}', encoding="utf-8")
     assert completed(tmp_path) is None
     (tmp_path / "report.json").write_text('{"failure": null}', encoding="utf-8")
     assert completed(tmp_path) is not None
+    whole = (tmp_path / "evidence.npz").read_bytes()
+    (tmp_path / "evidence.npz").write_bytes(whole[: len(whole) // 2])
+    assert completed(tmp_path) is None, "killed while it was written"
 
 
 @pytest.mark.slow

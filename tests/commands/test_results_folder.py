@@ -12,9 +12,9 @@ from PIL import Image
 from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.page import write_page
 from palpate.report.results import write_results
-from palpate.run.folder import FolderError, results_folder
+from palpate.run.folder import FolderError, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
-from palpate_bus.runs.run_name import run_of
+from palpate_bus.runs.run_name import name_run, run_of
 from palpate_models.load import load_scenario
 
 
@@ -28,10 +28,28 @@ def test_a_folder_with_anything_in_it_is_refused_and_left_alone(tmp_path: Path) 
 def test_overwriting_removes_an_earlier_run_whole(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (out / "logs").mkdir(parents=True)
-    (out / "scenario.yaml").write_text("", encoding="utf-8")
+    name_run(out)
     with results_folder(out, overwrite=True):
         assert [path.name for path in out.iterdir()] == ["run.lock"]
     assert list(out.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_what_was_to_be_overwritten_comes_back_when_the_run_cannot_begin(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    run = name_run(out)
+    with pytest.raises(ValueError, match="no key"), results_folder(out, overwrite=True), unless_begun(out, lambda: False):
+        raise ValueError("no key")
+    assert run_of(out) == run
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_folder_with_a_scenario_of_its_user_is_not_removed(tmp_path: Path) -> None:
+    (tmp_path / "scenario.yaml").write_text("name: mine\n", encoding="utf-8")
+    with pytest.raises(FolderError, match="not removed"), results_folder(tmp_path, overwrite=True):
+        pass
+    assert (tmp_path / "scenario.yaml").exists()
 
 
 def test_overwriting_removes_nothing_that_is_not_of_a_run(tmp_path: Path) -> None:
