@@ -33,9 +33,10 @@ class Sample:
 class Wire:
     """A subscription, and what comes in on it."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, open_to_all: bool = False) -> None:
         session: Any = self
-        self.subscription = Subscription(session, "0/joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_0")
+        key = "0/joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_0"
+        self.subscription = Subscription(session, key, decode=bytes if open_to_all else None)
         monkeypatch.setattr(self.subscription, "close", lambda: None)
 
     def declare_subscriber(self, key: str, handler: Any) -> object:
@@ -73,6 +74,14 @@ def test_a_second_hello_changes_nothing(wire: Wire) -> None:
     wire.bring(OURS, 1)
     assert wire.numbers() == [1]
     assert wire.subscription.foreign == 2
+
+
+def test_where_all_may_speak_nobody_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    wire = Wire(monkeypatch, open_to_all=True)
+    for gid in (OURS, STRANGER, OURS):
+        wire.bring(gid, 1)
+    assert wire.numbers() == [1, 1, 1]
+    assert not wire.subscription.replaced
 
 
 def test_what_is_set_aside_wins_no_time(wire: Wire) -> None:

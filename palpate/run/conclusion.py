@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
@@ -21,6 +22,8 @@ from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import violations
 from palpate_conductor.result import RunResult
 from palpate_models.scenario import Scenario
+
+log = logging.getLogger(__name__)
 
 
 class Interrupted(typer.Exit):
@@ -76,15 +79,14 @@ def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Repor
     Where no folder takes them there is no page, and the report is all the same.
     """
     try:
-        report = write_results(folder, scenario, result)
-        return report, write_page(folder), ""
+        return _kept(folder, scenario, result)
     except OSError as error:
         trouble = f"{folder}: the results cannot be written there ({error.strerror})"
     try:
         other = another_folder()
         write_scenario_files(scenario, other)
-        report = write_results(other, scenario, result)
-        return report, write_page(other), f"{trouble}; they are in {other}"
+        report, page, why = _kept(other, scenario, result)
+        return report, page, f"{trouble}; they are in {other}" + (f"; {why}" if why else "")
     except OSError as error:
         report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
         return (
@@ -92,3 +94,16 @@ def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Repor
             None,
             f"{trouble}, nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here",
         )
+
+
+def _kept(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path, str]:
+    """Writes the results into a folder, without the map where it cannot be drawn, and why. Raises OSError."""
+    try:
+        return write_results(folder, scenario, result), write_page(folder), ""
+    except OSError:
+        raise
+    except Exception as error:  # an assessment of the user's own may tell of triangles that there are not
+        log.exception("the map cannot be used")
+        result.collected.stiffness_map = None
+        why = f"assessment/map cannot be used ({type(error).__name__}: {error}); everything else is kept"
+        return write_results(folder, scenario, result), write_page(folder), why

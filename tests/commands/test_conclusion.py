@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import typer
 from conductor_messages import SETTINGS, collected, result
 from rich.console import Console
 
@@ -23,3 +25,15 @@ def test_findings_that_break_the_contract_are_told(
     gathered.findings.findings[0].confidence = confidence
     conclude(Console(quiet=True), tmp_path, scenario, result(gathered), quiet=True)
     assert ("findings.confidence" in capsys.readouterr().err) is told
+
+
+def test_a_map_that_cannot_be_drawn_costs_the_map_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = load_scenario("clean", SETTINGS, seed=3)
+    write_scenario_files(scenario, tmp_path)
+    gathered = collected()
+    gathered.stiffness_map.triangles = np.full_like(gathered.stiffness_map.triangles, 999_999)
+    with pytest.raises(typer.Exit) as left:
+        conclude(Console(quiet=True), tmp_path, scenario, result(gathered), quiet=True)
+    assert left.value.exit_code == 3
+    assert "assessment/map cannot be used" in " ".join(capsys.readouterr().err.split())
+    assert {path.name for path in tmp_path.iterdir()} >= {"report.json", "evidence.npz", "samples.csv", "report.html"}

@@ -168,7 +168,7 @@ class Subscription:
             if self._decode is None and (gid == self._retired or (self._gid is not None and not greets)):
                 self.foreign += 1
                 return None
-            self.replaced = self._gid is not None
+            self.replaced = self._gid is not None and self._decode is None
             self._gid = gid
         if not payload:
             self.heard = self.heard or sequence == HELLO
