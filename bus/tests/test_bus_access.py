@@ -11,7 +11,7 @@ import zenoh
 
 from palpate_bus.contract import contract
 from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, watched
-from palpate_bus.security.keys import KeysError, certificates, init, members, read
+from palpate_bus.security.keys import HOSTS, KeysError, certificates, init, members, read
 from palpate_bus.wire.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
 from palpate_bus.wire.rmw import message_key, topic_key
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, free_port, open_session, zenoh_config
@@ -219,6 +219,9 @@ def test_keys_are_kept_renewed_and_private(tmp_path: Path) -> None:
     first = init(tmp_path, hosts=("bus.example", "10.0.0.7"))
     assert {c.name for c in first} == set(members())
     assert init(tmp_path) == []
+    (router,) = init(tmp_path, hosts=("lab.example",))
+    assert (router.name, set(router.hosts)) == ("router", {*HOSTS, "bus.example", "10.0.0.7", "lab.example"})
+    assert init(tmp_path, hosts=("10.0.0.7",)) == []
     assert (tmp_path / "robot" / "key.pem").stat().st_mode & 0o077 == 0
     assert (tmp_path / "ca.key").stat().st_mode & 0o077 == 0
     assert not any(c.expired for c in certificates(tmp_path))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from palpate_bus.contract import contract
+from palpate_bus.runs.run_folder import RunFolder
 from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init, read
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, free_port, open_session
@@ -22,8 +21,11 @@ class SecureBus:
 
         Raises BusConfigError when the folder lacks a member or a certificate has expired.
         """
-        self._own = None if keys else Path(tempfile.mkdtemp(prefix="palpate-keys-"))
-        self.keys = (keys or self._own or Path()).resolve()
+        self._own: RunFolder | None = None
+        if keys is None:  # a folder that is removed even where this process is killed, by the next command
+            self._own = RunFolder()
+            keys = self._own.path / "keys"
+        self.keys = keys.resolve()
         self.endpoint = f"tls/127.0.0.1:{free_port()}"
 
     def options(self, role: str) -> BusOptions:
@@ -41,7 +43,7 @@ class SecureBus:
         """Starts the router. Raises BusConfigError."""
         try:
             if self._own is not None:
-                init(self._own, days=2)
+                init(self.keys, days=2)
             options = BusOptions(mode="router", listen=(self.endpoint,), tls=self.keys / ROUTER)
             self._router = open_session(options, access_control(contract()))
         except BaseException:
@@ -56,4 +58,4 @@ class SecureBus:
     def _throw_away(self) -> None:
         """Removes keys that were made for this run alone."""
         if self._own is not None:
-            shutil.rmtree(self._own, ignore_errors=True)
+            self._own.remove()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ipaddress
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -48,6 +49,8 @@ class Certificate:
     until: datetime
     fingerprint: str
     """SHA-256, hexadecimal."""
+    hosts: tuple[str, ...]
+    """Names and addresses under which its owner is known."""
 
     @property
     def expired(self) -> bool:
@@ -63,19 +66,24 @@ def members() -> tuple[str, ...]:
 def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), days: int = DAYS) -> list[Certificate]:
     """Makes what is missing in `folder`: the authority, and a certificate for each of `names` (by default `members()`).
 
-    `hosts` are further names and addresses of the router. Certificates that still hold are kept; those expired are made anew.
-    Returns the new ones. Raises KeysError when the folder holds half an authority.
+    `hosts` are further names and addresses of the router. Certificates that still hold are kept; those expired are made anew, and
+    so is the router's where it lacks one of `hosts`. Returns the new ones. Raises KeysError when the folder holds half an
+    authority.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     authority, signer = _authority(folder)
     made = []
     for name in names or members():
         place = folder / name
-        if (place / CERTIFICATE).exists() and not read(place / CERTIFICATE).expired:
-            continue
+        known = (*HOSTS, *hosts) if name == ROUTER else ()
+        if (place / CERTIFICATE).exists():
+            before = read(place / CERTIFICATE)
+            known = tuple(dict.fromkeys((*before.hosts, *known))) if known else ()
+            if not before.expired and set(known) <= set(before.hosts):
+                continue
         place.mkdir(exist_ok=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
-        subject = _issue(name, key.public_key(), authority, signer, days, (*HOSTS, *hosts) if name == ROUTER else ())
+        subject = _issue(name, key.public_key(), authority, signer, days, known)
         _write_key(place / KEY, key)
         (place / CERTIFICATE).write_bytes(subject.public_bytes(serialization.Encoding.PEM))
         (place / CA).write_bytes(authority.public_bytes(serialization.Encoding.PEM))
@@ -90,7 +98,11 @@ def read(path: Path) -> Certificate:
     except (OSError, ValueError) as error:
         raise KeysError(f"{path}: no certificate: {error}; palpate keys init makes them") from error
     name = str(loaded.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-    return Certificate(name, path, loaded.not_valid_after_utc, loaded.fingerprint(hashes.SHA256()).hex())
+    hosts: tuple[str, ...] = ()
+    with suppress(x509.ExtensionNotFound):
+        named = loaded.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        hosts = tuple(str(host.value) for host in named)
+    return Certificate(name, path, loaded.not_valid_after_utc, loaded.fingerprint(hashes.SHA256()).hex(), hosts)
 
 
 def certificates(folder: Path) -> list[Certificate]:
