@@ -136,8 +136,13 @@ def main(folder: Path, tell: Callable[[int], None] | None = None) -> Path:
     if not files or not scenario.is_file():
         needed = scenario if files else folder / "recording_mcap"
         raise FileNotFoundError(f"{needed}: not there; give the folder of a run that was recorded")
-    replay(files, DashboardService(load_scenario(str(scenario)), folder / FILE, Live(), paced=False), tell)
-    return folder / FILE
+    target = folder / FILE
+    try:
+        replay(files, DashboardService(load_scenario(str(scenario)), target, Live(), paced=False), tell)
+    except BaseException:
+        target.unlink(missing_ok=True)  # half a drawing would be taken for the whole
+        raise
+    return target
 
 
 if __name__ == "__main__":

@@ -90,6 +90,14 @@ def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) 
     assert heard == sorted(heard)
     assert heard[-1] >= 0.9e9
 
+    def interrupted(t: int) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / FILE).unlink()
+    with pytest.raises(KeyboardInterrupt):
+        replay.main(tmp_path, interrupted)
+    assert not (tmp_path / FILE).exists(), "half a drawing would be taken for the whole"
+
 
 def test_the_end_of_a_recording_is_known_once_it_is_complete(tmp_path: Path) -> None:
     path = record(tmp_path, 1.0)
