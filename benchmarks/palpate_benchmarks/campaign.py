@@ -249,7 +249,7 @@ def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> Fault
     if fault is not None:
         processes[target] = replace(processes[target], command=command(target, fault))
     timing = Timing(wallclock=case.wallclock)
-    finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep")
+    finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep", at_s=case.at_s)
     begin = monotonic()
     groups = _placed(case, target)
     local = LocalProcesses(groups, out, files, timing, forks=forks)
