@@ -184,4 +184,4 @@ def test_a_control_message_that_is_replayed_is_not_obeyed(wallclock: Bus) -> Non
     link = wallclock.link()
     wallclock.queues["palpate/control"].replay()
     assert link.poll() is None
-    assert link.repeated == 1
+    assert link.garbage == 1

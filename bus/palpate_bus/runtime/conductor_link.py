@@ -73,8 +73,6 @@ class ConductorLink:
         self._granted = self._beating = False
         self._said = self._beaten = 0
         """Numbers of the newest control message and heartbeat: one that comes again is no word of the conductor."""
-        self.repeated = 0
-        """Control messages that came again."""
         self._silent_s = 0.0
         self._looked = self._sought = self._lost_at = monotonic()
         self._missed = False
@@ -90,7 +88,7 @@ class ConductorLink:
         """The next control message, or None. Raises RunAborted when told so, or when the conductor was lost for the grace."""
         while (sample := self._control.get(timeout)) is not None:
             if sample.sequence <= self._said:
-                self.repeated += 1
+                self._control.garbage += 1
                 continue
             self._said = sample.sequence
             try:
@@ -154,7 +152,7 @@ class ConductorLink:
 
     @property
     def garbage(self) -> int:
-        """Undecodable control messages."""
+        """Control messages that cannot be decoded, or came again."""
         return self._control.garbage + self._beats.garbage
 
 
