@@ -62,6 +62,9 @@ LOCKSTEP_DROP_WAIT_US = 1_000_000
 WALL_CLOCK_DROP_WAIT_US = 1_000
 
 
+_OPEN: set[zenoh.Session] = set()
+"""Sessions that are not closed yet; one that is must not be kept: it has 18 MB of shared memory."""
+
 _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 """Where in its own source zenoh met an error."""
 
@@ -242,7 +245,7 @@ def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | 
         opened = zenoh.open(config)
     except zenoh.ZError as error:
         raise BusConfigError(f"cannot open a zenoh session {_in_words(options)}: {_reason(error)}") from error
-    atexit.register(close_session, opened)
+    _OPEN.add(opened)
     return opened
 
 
@@ -265,9 +268,10 @@ def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
     """Undeclares what is passed, closes the session and returns whether it closed in order; never raises.
 
     A session that is still open when the interpreter ends makes it hang for ten seconds and then print a panic ("close
-    operation timed out"), because its close waits for callbacks that need the interpreter. So `open_session` also registers
-    this function with atexit.
+    operation timed out"), because its close waits for callbacks that need the interpreter. So what `open_session` has opened is
+    closed then.
     """
+    _OPEN.discard(zenoh_session)
     for item in declared:
         with suppress(Exception):
             item.undeclare()
@@ -276,6 +280,12 @@ def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
     except Exception:  # the session is lost either way; zenoh's errors share no base with PyO3's panics
         return False
     return True
+
+
+@atexit.register
+def _close_all() -> None:
+    for opened in tuple(_OPEN):
+        close_session(opened)
 
 
 @contextmanager
