@@ -133,7 +133,7 @@ def run(  # noqa: PLR0913 - the options of a command
     if chosen is None:
         go_on(how)
     elif repeat > 1:
-        examine_again(chosen, how, repeat)
+        examine_again(chosen, out, repeat)
     else:
         examine(chosen, how)
 

@@ -15,7 +15,6 @@ from palpate.command_line import EXIT_FAILED, SteadyConsole, say
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
-from palpate.run.interrupts import Ending
 from palpate.run.roles import write_scenario_files
 from palpate.run.space import another_folder, megabytes_of
 from palpate_bus.contract import contract
@@ -26,10 +25,6 @@ from palpate_models.scenario import Scenario
 log = logging.getLogger(__name__)
 
 
-class Interrupted(typer.Exit):
-    """The command ends as it would have without, but begins nothing else."""
-
-
 def conclude(
     console: Console,
     folder: Path,
@@ -37,12 +32,8 @@ def conclude(
     result: RunResult,
     quiet: bool = False,
     as_json: bool = False,
-    ending: Ending | None = None,
 ) -> None:
-    """Writes the results and prints the findings; `ending` says whether it was asked for.
-
-    Raises typer.Exit with status 3 when the run failed or its folder took no results, Interrupted when it was asked to end.
-    """
+    """Writes the results and prints the findings. Raises typer.Exit with status 3 when the run failed or its folder took none."""
     with nullcontext() if quiet else console.status("writing report and maps: about ten seconds"):
         report, page, trouble = _written(folder, scenario, result)
     if as_json:
@@ -59,11 +50,8 @@ def conclude(
         say(trouble)
     if result.failure:
         say(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
-    status = EXIT_FAILED if result.failure or trouble else 0
-    if result.interrupted or (ending is not None and ending.asked):
-        raise Interrupted(status)
-    if status:
-        raise typer.Exit(status)
+    if result.failure or trouble:
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _unfit(result: RunResult) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,12 +13,12 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.command_line import EXIT_FAILED, SteadyConsole, fail, refuse, say
+from palpate.command_line import EXIT_BAD_INPUT, EXIT_FAILED, SteadyConsole, fail, refuse, say
 from palpate.environment import given
 from palpate.report.archive import EvidenceError
 from palpate.report.resumption import Resumption, going_on, resumption
 from palpate.run.composed import run_composed
-from palpate.run.conclusion import Interrupted, conclude
+from palpate.run.conclusion import conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
 from palpate.run.folder import FolderError, results_folder, unless_begun, usual_folder
@@ -26,7 +28,7 @@ from palpate.run.placement import Groups, PlacementError, placement
 from palpate.run.places import Absent, PlaceError
 from palpate.run.processes import ProcessListError
 from palpate.run.progress import RunDisplay
-from palpate.run.repeat import repeat
+from palpate.run.repeat import repeat, run_to_its_end
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
@@ -105,7 +107,7 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
         refuse(error)
     folder = how.out or usual_folder(scenario.name)
     try:
-        with results_first() as ending, results_folder(folder, overwrite=how.overwrite):
+        with results_first(), results_folder(folder, overwrite=how.overwrite):
             if not quiet:
                 _announce(console, scenario, how, folder)
             with RunDisplay(console, quiet, scenario.exam) as display, given({"PALPATE_RECORD": how.record}):
@@ -120,7 +122,7 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
                         raise KeyboardInterrupt
                 if before is not None:
                     result = replace(result, run_hash=None, earlier=before.earlier)
-            conclude(console, folder, scenario, result, quiet, how.as_json, ending)
+            conclude(console, folder, scenario, result, quiet, how.as_json)
     except (ProcessListError, ChoiceError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
     except RunFailed as error:
@@ -138,8 +140,8 @@ def _announce(console: Console, scenario: Scenario, how: How, folder: Path) -> N
         console.print(f"[dim]{escape(hint)}[/]", highlight=False, soft_wrap=True)
 
 
-def examine_again(scenario: Scenario, how: How, count: int) -> None:
-    """Runs so many examinations one after another, with seeds from the scenario's on; Ctrl-C in one is the end of all.
+def examine_again(scenario: Scenario, out: Path | None, count: int) -> None:
+    """Runs this command so many times, with seeds from the scenario's on; Ctrl-C in one examination is the end of all.
 
     Ends the command when one has failed.
     """
@@ -147,16 +149,17 @@ def examine_again(scenario: Scenario, how: How, count: int) -> None:
 
     def once(number: int, own: Path) -> None:
         nonlocal failed
-        try:
-            examine(scenario.model_copy(update={"seed": scenario.seed + number - 1}), replace(how, out=own))
-        except Interrupted as left:
-            raise Interrupted(EXIT_FAILED if failed else left.exit_code) from None
-        except typer.Exit as left:
-            if left.exit_code != EXIT_FAILED:
-                raise  # what cannot start once cannot start again
-            failed += 1
+        words = (*sys.argv[1:], "--repeat", "1", "--seed", str(scenario.seed + number - 1), "--out", str(own))  # the last counts
+        left = run_to_its_end((sys.executable, "-m", "palpate", *words))
+        if left.status == EXIT_BAD_INPUT:  # what cannot start once cannot start again
+            raise typer.Exit(EXIT_BAD_INPUT)
+        if left.interrupted:
+            raise typer.Exit(EXIT_FAILED if failed else left.status)
+        if left.status < 0:
+            say(f"{own}: the examination was ended by {signal.Signals(-left.status).name}")
+        failed += left.status != 0
 
-    repeat(count, how.out or usual_folder(scenario.name), once)
+    repeat(count, out or usual_folder(scenario.name), once)
     if failed:
         fail(f"{failed} of {count} examinations did not come to a good end")
 

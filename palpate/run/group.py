@@ -27,10 +27,16 @@ class GroupMember(NamedTuple):
     environment: Mapping[str, str]
 
 
-def command(file: Path, members: Mapping[str, GroupMember]) -> tuple[str, ...]:
+def command(file: Path, hosted: Mapping[str, GroupMember]) -> tuple[str, ...]:
     """Writes the file of a group and returns the command that runs it."""
-    file.write_text(json.dumps({role: member._asdict() for role, member in members.items()}), encoding="utf-8")
+    file.write_text(json.dumps({role: member._asdict() for role, member in hosted.items()}), encoding="utf-8")
     return ("python", "-m", "palpate.run.group", str(file))
+
+
+def members(file: Path) -> dict[str, GroupMember]:
+    """The services of a group, from its file. Raises OSError."""
+    rows = json.loads(file.read_text(encoding="utf-8"))
+    return {role: GroupMember(tuple(row["words"]), row["environment"]) for role, row in rows.items()}
 
 
 def _hosted(role: str, member: GroupMember) -> Hosted:
@@ -44,9 +50,8 @@ def _hosted(role: str, member: GroupMember) -> Hosted:
 
 def main(arguments: Sequence[str]) -> None:
     """Runs the group to its end and leaves with status 0, or 3 when the run failed or was aborted."""
-    rows = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
-    members = {role: GroupMember(tuple(row["words"]), row["environment"]) for role, row in rows.items()}
-    host(lambda: [_hosted(role, member) for role, member in members.items()], "+".join(members))
+    hosted = members(Path(arguments[0]))
+    host(lambda: [_hosted(role, member) for role, member in hosted.items()], "+".join(hosted))
 
 
 if __name__ == "__main__":

@@ -1,17 +1,13 @@
-"""Ctrl-C while an examination is ending, and between examinations."""
+"""Ctrl-C while an examination is ending."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from palpate.run import examine as examining
-from palpate.run.conclusion import Interrupted
 from palpate.run.interrupts import all_is_measured, results_first
 
 
@@ -77,20 +73,3 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def test_ctrl_c_in_one_examination_is_the_end_of_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[Path] = []
-
-    def examine(_scenario: Any, how: Any) -> None:
-        done.append(how.out)
-        raise Interrupted(3)
-
-    monkeypatch.setattr(examining, "examine", examine)
-    monkeypatch.setattr(examining, "replace", lambda how, out: SimpleNamespace(out=out))
-    monkeypatch.setattr(examining, "repeat", lambda count, folder, once: [once(n, folder / f"{n:04d}") for n in (1, 2, 3)])
-    scenario = SimpleNamespace(seed=1, model_copy=lambda update: update)
-    with pytest.raises(Interrupted) as left:
-        examining.examine_again(scenario, SimpleNamespace(out=tmp_path / "all"), 3)  # type: ignore[arg-type]
-    assert left.value.exit_code == 3
-    assert [folder.name for folder in done] == ["0001"]
