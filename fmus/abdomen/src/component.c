@@ -364,6 +364,7 @@ size_t component_snapshot_size(const Component *c) { return sizeof(Snapshot) + f
 
 void component_save(const Component *c, Snapshot *s) {
     memset(s, 0, sizeof *s);
+    memcpy(s->token, c->phantom->token, sizeof c->phantom->token);
     s->parameters = c->parameters;
     s->inputs = c->inputs;
     s->state = c->tissue->state;
@@ -378,6 +379,10 @@ int component_load(Component *c, const Snapshot *s, size_t size) {
     if (size != component_snapshot_size(c) || s->phase < PHASE_INSTANTIATED || s->phase > PHASE_TERMINATED ||
         s->parameters.lesion_count < 0 || s->parameters.lesion_count > LESIONS) {
         component_say(c, "this is not a state of this FMU");
+        return 0;
+    }
+    if (memcmp(s->token, c->phantom->token, sizeof c->phantom->token) != 0) {
+        component_say(c, "this is the state of an FMU of another phantom");
         return 0;
     }
     if (s->exchange != c->exchange) {

@@ -103,6 +103,7 @@ typedef struct {
 
 /* A copy of all that a step changes, and of the parameters. */
 typedef struct {
+    char token[72]; /* of the phantom; the rest is zero */
     Parameters parameters;
     Inputs inputs;
     State state;

@@ -212,6 +212,22 @@ def test_a_state_can_be_saved_and_loaded_even_by_another_instance(fmu: Path) -> 
         np.testing.assert_array_equal(press(other, 200, 300), ahead)
 
 
+def test_the_state_of_another_phantom_is_refused(fmu: Path, phantom: Phantom, tmp_path: Path) -> None:
+    """It has the same size, and its wall the same vertices."""
+    stiffer = phantom.model_copy(update={"stiffness": phantom.stiffness.model_copy(update={"k_w_n_per_m3": 1.8e5})})
+    with FmuInstance(fmu) as one:
+        different = build_fmu(stiffer, 1, tmp_path / "stiffer.fmu", one.version, [native()])
+        with FmuInstance(different) as other:
+            press(other)
+            saved = save(other)
+            press(one)
+            with pytest.raises(Exception, match="etFMU"):
+                restore(one, saved)
+            with FmuInstance(fmu) as same:
+                press(same)
+                np.testing.assert_array_equal(press(one, 50, 300), press(same, 50, 300))
+
+
 def test_a_long_step_is_cut_and_agrees_with_short_ones(fmu3: Path) -> None:
     with FmuInstance(fmu3) as coarse, FmuInstance(fmu3) as fine:
         for fmu, n in ((coarse, 1), (fine, 10)):
