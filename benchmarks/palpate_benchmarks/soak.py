@@ -6,17 +6,15 @@ python -m palpate_benchmarks.soak FOLDER [FOLDER ...] --out soak.png
 
 from __future__ import annotations
 
-from itertools import cycle
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from palpate.command_line import refuse
-from palpate.run.repeat import Growth, Most, Soak
+from palpate.run.repeat import Growth, ProcessSample, Soak, read_growths, read_samples
 
 HOUR_S = 3600.0
 
@@ -36,22 +34,35 @@ def growth_table(growths: list[Growth]) -> str:
     return "\n".join(rows)
 
 
-def draw(soaks: dict[str, Soak], path: Path) -> None:
-    """Writes a PNG: for each soak, by its name, the memory and the open files of every role, the most in each examination."""
-    figure = Figure(figsize=(8.0, 3.0 * len(soaks)), layout="constrained")
-    for (name, soak), (memory, files) in zip(soaks.items(), figure.subplots(len(soaks), 2, squeeze=False), strict=True):
-        for (role, each), colour in zip(soak.most.items(), cycle(colormaps["tab10"].colors), strict=False):  # type: ignore[attr-defined]
-            _draw_role(memory, files, list(each.values()), role, colour)
-        memory.set(title=f"{name}: memory [MB]", ylim=(0, None), xlabel="time [h]")
-        files.set(title="open files", ylim=(0, None), xlabel="time [h]")
+def draw(soaks: dict[str, list[ProcessSample]], path: Path) -> None:
+    """Writes a PNG: for each soak, by its name, the most memory and open files of every role in each examination, and its memory
+    in the course of the examination in the middle.
+    """
+    figure = Figure(figsize=(11.0, 3.2 * len(soaks)), layout="constrained")
+    for (name, samples), panels in zip(soaks.items(), figure.subplots(len(soaks), 3, squeeze=False), strict=True):
+        memory, within, files = panels
+        middle = 1 + max(sample.number for sample in samples) // 2
+        for (role, each), colour in zip(Soak.of(samples).most.items(), colormaps["tab20"].colors, strict=False):  # type: ignore[attr-defined]
+            hours = [most.at_s / HOUR_S for most in each.values()]
+            memory.plot(hours, [most.rss_mb for most in each.values()], ".-", color=colour, lw=0.8, ms=3)
+            files.plot(hours, [most.descriptors for most in each.values()], ".-", color=colour, lw=0.8, ms=3, label=role)
+            course = [(sample.at_s, sample.rss_mb) for sample in samples if (sample.role, sample.number) == (role, middle)]
+            if course:
+                at_s, rss_mb = zip(*course, strict=True)
+                within.plot([second - at_s[0] for second in at_s], rss_mb, color=colour, lw=1.0)
+        memory.set(title=f"{name}: memory [MB]", xlabel="time [h]")
+        within.set(title=f"in examination {middle}: memory [MB]", xlabel="time [s]")
+        files.set(title="open files", xlabel="time [h]")
         files.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        for panel in panels:
+            panel.set_ylim(0, None)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
-def _draw_role(memory: Axes, files: Axes, each: list[Most], role: str, colour: tuple[float, ...]) -> None:
-    hours = [most.at_s / HOUR_S for most in each]
-    memory.plot(hours, [most.rss_mb for most in each], ".-", color=colour, lw=0.8, ms=3)
-    files.plot(hours, [most.descriptors for most in each], ".-", color=colour, lw=0.8, ms=3, label=role)
+def _ended(samples: list[ProcessSample], growths: list[Growth]) -> list[ProcessSample]:
+    """Those of the examinations that came to their end."""
+    last = max(growth.examinations for growth in growths)
+    return [sample for sample in samples if sample.number <= last]
 
 
 def main(
@@ -60,12 +71,13 @@ def main(
 ) -> None:
     """Prints how the memory of each role grows from examination to examination, and draws it."""
     try:
-        soaks = {folder.name: Soak.read(folder) for folder in folders}
+        growths = {folder.name: read_growths(folder) for folder in folders}
+        soaks = {folder.name: _ended(read_samples(folder), growths[folder.name]) for folder in folders}
         draw(soaks, out)
     except (OSError, ValueError) as error:
         refuse(error)
-    for name, soak in soaks.items():
-        print(f"{name}\n\n{growth_table(soak.growths())}\n")
+    for folder in folders:
+        print(f"{folder.name}\n\n{growth_table(growths[folder.name])}\n")
     print(out)
 
 

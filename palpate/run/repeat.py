@@ -12,7 +12,7 @@ import json
 import signal
 import subprocess
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
@@ -31,6 +31,7 @@ from palpate.run.group import members
 from palpate.run.interrupts import SIGNALS
 
 FILE: Final = "soak.csv"
+SUMMARY: Final = "soak.json"
 EVERY_S: Final = 1.0
 OURS: Final = "palpate_"
 HERE: Final = "repeat"
@@ -49,6 +50,12 @@ class ProcessSample:
     role: str
     rss_mb: float
     descriptors: int
+
+
+def read_samples(folder: Path) -> list[ProcessSample]:
+    """What was noted in a folder of `palpate run --repeat`, oldest first. Raises OSError, or ValueError where it is none."""
+    with (folder / FILE).open(newline="", encoding="utf-8") as file:
+        return TypeAdapter(list[ProcessSample]).validate_python(list(csv.DictReader(file)))
 
 
 @dataclass(frozen=True)
@@ -87,12 +94,11 @@ class Soak:
         """By role, then by examination."""
 
     @classmethod
-    def read(cls, folder: Path) -> Soak:
-        """What was noted in a folder of `palpate run --repeat`. Raises OSError, or ValueError where it is none."""
+    def of(cls, samples: Iterable[ProcessSample]) -> Soak:
+        """The most of these."""
         soak = cls()
-        with (folder / FILE).open(newline="", encoding="utf-8") as file:
-            for sample in TypeAdapter(list[ProcessSample]).validate_python(list(csv.DictReader(file))):
-                soak.take(sample)
+        for sample in samples:
+            soak.take(sample)
         return soak
 
     def take(self, sample: ProcessSample) -> None:
@@ -130,7 +136,12 @@ class Soak:
 
     def write(self, folder: Path) -> None:
         """Writes soak.json. Raises OSError."""
-        write_text(folder / "soak.json", json.dumps([asdict(growth) for growth in self.growths()], indent=1) + "\n")
+        write_text(folder / SUMMARY, json.dumps([asdict(growth) for growth in self.growths()], indent=1) + "\n")
+
+
+def read_growths(folder: Path) -> list[Growth]:
+    """What soak.json of a folder says, of the examinations that came to their end. Raises OSError, or ValueError."""
+    return TypeAdapter(list[Growth]).validate_json((folder / SUMMARY).read_bytes())
 
 
 def _growth(role: str, each: list[Most]) -> Growth:

@@ -16,7 +16,7 @@ import typer
 
 from palpate.run import examine as examining
 from palpate.run import repeat as soaking
-from palpate.run.repeat import Left, ProcessSample, Soak, repeat
+from palpate.run.repeat import Left, ProcessSample, Soak, read_samples, repeat
 
 
 def test_each_has_a_folder_and_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -37,7 +37,7 @@ def test_each_has_a_folder_and_is_noted(tmp_path: Path, monkeypatch: pytest.Monk
     assert growth["highest_mb"] > 10
     assert growth["percent_an_hour"] is not None
     assert noted.read_text().startswith("at_s,number,role,rss_mb,descriptors\n")
-    assert Soak.read(tmp_path / "soak").growths()[0].examinations == 3
+    assert Soak.of(read_samples(tmp_path / "soak")).growths()[0].examinations == 3
 
 
 def test_the_slope_is_of_the_highest_of_each_examination() -> None:

@@ -45,7 +45,7 @@ LOOK_PATIENCE = 12 * SECOND
 """Time that perception may take beyond the burst [ns]: it watches about two breaths."""
 EXAM_PLANNING_TIME = 2 * SECOND
 """Simulated time that planning the examination takes [ns]."""
-ASSESS_PATIENCE = 30 * SECOND
+ASSESS_PATIENCE = 120 * SECOND
 """Time that the assessment may take for its final findings [ns]."""
 
 
