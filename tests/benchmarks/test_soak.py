@@ -29,4 +29,4 @@ def test_what_was_noted_is_drawn_and_told(tmp_path: Path, capsys: pytest.Capture
 def test_a_folder_of_something_else_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(Exception, match="2"):
         soaking.main([tmp_path], tmp_path / "soak.png")
-    assert "soak.csv" in capsys.readouterr().err
+    assert "soak.json" in capsys.readouterr().err
