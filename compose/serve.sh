@@ -1,7 +1,7 @@
 #!/bin/sh
 # Entry point of the dashboard's image: the run while it is on, then its recording, at the same address, until it is stopped.
 # (A viewer that was open during the run keeps what it has; one that is opened or reloaded later gets the whole recording.)
-export PALPATE_VIEWER=serve:9876 # here and not in the compose file: a run without containers would take the port from another one
+export PALPATE_VIEWER=serve:0.0.0.0:9876 # here and not in the compose file: a run without containers would take the port from another one
 "$@" &
 service=$!
 trap 'kill $service; exit 0' TERM INT

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate_bus.runs.announcement import Announcement, Run
+from palpate_bus.runs.announcement import Announcement, Run, live
 from palpate_bus.runs.joining import NoBus, find, find_all
 from palpate_bus.wire.zenoh_config import TLS_FILES
 
@@ -37,6 +37,17 @@ def test_nothing_to_join() -> None:
         find()
     with pytest.raises(NoBus, match="no run 'healthy' is on; on are: none"):
         find(chosen="healthy")
+
+
+def test_a_folder_that_has_other_files_keeps_them(tmp_path: Path) -> None:
+    """PALPATE_RUNS may name any folder of the user."""
+    (tmp_path / "package.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "17-4711.json").write_text("{}", encoding="utf-8")
+    announced = Announcement(Run("healthy", ENDPOINTS))
+    assert [run.name for run in live()] == ["healthy"]
+    assert {path.name for path in tmp_path.iterdir()} == {"package.json", announced.path.name}
+    assert announced.path.stat().st_mode & 0o777 == 0o600
+    announced.withdraw()
 
 
 def test_the_one_run() -> None:

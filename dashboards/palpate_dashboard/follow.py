@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from time import monotonic, sleep
+
+import zenoh
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import RunControl, codec
@@ -17,6 +20,7 @@ from palpate_bus.runs.operator_keys import OperatorKeys
 from palpate_bus.runs.operator_requests import order
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import IDLE_S, ObservedService
+from palpate_bus.security.access import OPERATOR
 from palpate_bus.wire.zenoh_config import session
 from palpate_dashboard.replay import draw, messages, recording_of
 from palpate_dashboard.service import DashboardService
@@ -26,10 +30,15 @@ CHECK_S = 1.0
 Say = Callable[[str], None]
 
 
+def _operator(run: Run, bus: zenoh.Session) -> AbstractContextManager[zenoh.Session]:
+    """How an operator's keys reach the run: a secure one does not take them from a viewer."""
+    return nullcontext(bus) if run.keys is None else session(run.options(OPERATOR))
+
+
 def follow(run: Run, service: DashboardService, say: Say, keys: OperatorKeys) -> str:
     """Draws `run` until it ends, and finishes `service`; passes on what an operator's `keys` say. Returns how it ended."""
     rules = contract()
-    with session(run.options()) as bus:
+    with session(run.options()) as bus, _operator(run, bus) as operator:
         member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)
         control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
         decode = codec.decoder("palpation_msgs/msg/RunControl")
@@ -45,7 +54,7 @@ def follow(run: Run, service: DashboardService, say: Say, keys: OperatorKeys) ->
             if not observed.drain_and_step():
                 sleep(IDLE_S)
             for word in keys.pressed():
-                say(order(bus, run.domain, word, "a key of palpate dashboard"))
+                say(order(operator, run.domain, word, "a key of palpate dashboard"))
             while (sample := control.get(0)) is not None:
                 message = decode(sample.payload)
                 if message.command == RunControl.END:

@@ -22,11 +22,13 @@ MEMORY_LIMIT = "512MiB"
 class Live:
     """How to show a run while it runs.
 
-    `serve:PORT` hosts the recording for viewers that connect, in the browser at PORT + 1; `connect:URL` sends it to a
-    viewer that listens, by default one on this machine.
+    `serve:PORT` hosts the recording for viewers of this machine, in the browser at PORT + 1; with `serve:0.0.0.0:PORT` every
+    machine that reaches the port sees the run. `connect:URL` sends it to a viewer that listens, by default one on this machine.
     """
 
     serve_port: int | None = None
+    serve_at: str = "127.0.0.1"
+    """The address of the interface on which it is served."""
     connect_url: str | None = None
 
     @staticmethod
@@ -36,9 +38,10 @@ class Live:
         if not text:
             return Live()
         if kind == "serve":
-            if rest and not (rest.isdigit() and 1024 <= int(rest) <= 65534):
-                raise ValueError(f"PALPATE_VIEWER={text}: want serve:PORT with PORT in 1024..65534")
-            return Live(serve_port=int(rest or 9876))
+            at, _, port = rest.rpartition(":")
+            if port and not (port.isdigit() and 1024 <= int(port) <= 65534):
+                raise ValueError(f"PALPATE_VIEWER={text}: want serve:PORT or serve:ADDRESS:PORT with PORT in 1024..65534")
+            return Live(serve_port=int(port or 9876), serve_at=at or Live.serve_at)
         if kind == "connect":
             return Live(connect_url=rest or "rerun+http://127.0.0.1:9876/proxy")
         raise ValueError(f"PALPATE_VIEWER={text}: want serve, serve:PORT, connect or connect:URL")
@@ -52,10 +55,13 @@ def address(port: int) -> str:
     return f"http://localhost:{port + 1}/?url={quote(f'rerun+http://localhost:{port}/proxy', safe='')}&theme=dark"
 
 
-def _serve(port: int) -> Any:
-    """A sink that hosts the recording at `port`, and the web viewer at `port` + 1. Raises OSError if one is taken."""
+def _serve(at: str, port: int) -> Any:
+    """A sink that hosts the recording at `port` of the interface `at`, and the web viewer at `port` + 1 of all of them.
+
+    That is a page without data. Raises OSError if one is taken.
+    """
     try:
-        server = rr.GrpcServerSink(port=port, server_memory_limit=MEMORY_LIMIT)
+        server = rr.GrpcServerSink(bind_ip=at, port=port, server_memory_limit=MEMORY_LIMIT)
         rr.serve_web_viewer(web_port=port + 1, open_browser=False)
     except RuntimeError as error:
         raise OSError(f"PALPATE_VIEWER=serve:{port}: ports {port} and {port + 1} must be free: {error}") from error
@@ -76,7 +82,7 @@ def open_recording(path: Path | None, live: Live, blueprint: Any, name: str, run
         path.parent.mkdir(parents=True, exist_ok=True)
         sinks.append(rr.FileSink(path))
     if live.serve_port is not None:
-        sinks.append(_serve(live.serve_port))
+        sinks.append(_serve(live.serve_at, live.serve_port))
     if live.connect_url is not None:
         sinks.append(rr.GrpcSink(live.connect_url))
     recording.set_sinks(*sinks, default_blueprint=blueprint)

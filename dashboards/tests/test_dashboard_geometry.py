@@ -66,10 +66,11 @@ def test_a_cloud_with_padding_and_invalid_points() -> None:
 def test_viewer_setting() -> None:
     assert Live.parse("") == Live()
     assert Live.parse("serve") == Live(serve_port=9876)
-    assert Live.parse("serve:9000") == Live(serve_port=9000)
+    assert Live.parse("serve:9000") == Live(serve_port=9000, serve_at="127.0.0.1")
+    assert Live.parse("serve:0.0.0.0:9000") == Live(serve_port=9000, serve_at="0.0.0.0")
     assert Live.parse("connect").connect_url == "rerun+http://127.0.0.1:9876/proxy"
     assert Live.parse("connect:rerun+http://screen:9876/proxy").connect_url == "rerun+http://screen:9876/proxy"
-    for wrong in ("window", "serve:x", "serve:80"):
+    for wrong in ("window", "serve:x", "serve:80", "serve:0.0.0.0:80"):
         with pytest.raises(ValueError, match="PALPATE_VIEWER"):
             Live.parse(wrong)
 

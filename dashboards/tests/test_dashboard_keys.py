@@ -12,11 +12,15 @@ import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from test_dashboard_browser import free_ports, start
 
+from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
+from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
+from palpate_dashboard import follow as following
 
 KEYS_PROGRAM = """
 import sys, time
@@ -122,3 +126,17 @@ def test_keys_stop_and_release_a_live_run(
             running.wait(60)
         if end >= 0:
             os.close(end)
+
+
+def test_keys_go_to_a_secure_run_with_the_operators_certificate(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its router lets no viewer ask for anything."""
+    for name in TLS_FILES:
+        (tmp_path / "operator" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "operator" / name).touch()
+    opened: list[BusOptions] = []
+    monkeypatch.setattr(following, "session", opened.append)
+    bus: Any = object()
+    with following._operator(Run("healthy", {}), bus) as operator:
+        assert operator is bus
+    following._operator(Run("healthy", {"router": "tls/127.0.0.1:17998"}, keys=str(tmp_path)), bus)
+    assert [options.tls for options in opened] == [tmp_path / "operator"]

@@ -92,7 +92,7 @@ def diagnose(bus: Joined, rules: Contract, live: LiveMonitor) -> Diagnosis:
     """What is known by now."""
     found = list(live.graph.alive.values())
     findings = [
-        *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(rules, live), *_processes(live),
+        *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(bus, rules, live), *_processes(live),
         *_waiting(live),
     ]  # fmt: skip
     differing = mismatches(found)
@@ -162,8 +162,8 @@ def _clock(live: LiveMonitor) -> list[Remark]:
     return findings
 
 
-def _who(rules: Contract, live: LiveMonitor) -> list[Remark]:
-    absent = graph.missing(rules, live.graph.alive.values())
+def _who(bus: Joined, rules: Contract, live: LiveMonitor) -> list[Remark]:
+    absent = graph.missing(rules, live.graph.alive.values(), bus.target.run)
     workers = [role for role in absent if not rules.roles[role].observer]
     others = [role for role in absent if rules.roles[role].observer]
     strangers = sorted(live.graph.roles() - rules.roles.keys())

@@ -8,6 +8,7 @@ from time import monotonic
 
 from palpate.live.connection import Joined
 from palpate_bus.contract import Contract
+from palpate_bus.runs.announcement import Run
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 
 
@@ -95,8 +96,15 @@ def processes(found: Iterable[Entity]) -> list[tuple[str, ...]]:
     return sorted(tuple(sorted(names)) for names in by_session.values())
 
 
-def missing(rules: Contract, found: Iterable[Entity]) -> list[str]:
-    """Roles of the contract that are not on the bus, the critical ones first."""
+def missing(rules: Contract, found: Iterable[Entity], run: Run | None) -> list[str]:
+    """Roles that are not on the bus, the critical ones first.
+
+    They are those that `run` has, or where it is not known, those that every run has; and all observers.
+    """
     there = {entity.node for entity in found}
-    absent = [role for role in rules.roles.values() if role.name not in there]
+    absent = [
+        role
+        for role in rules.roles.values()
+        if role.name not in there and (role.observer or (role.name in run.endpoints if run is not None else not role.optional))
+    ]
     return [role.name for role in sorted(absent, key=lambda role: (role.observer, not role.critical))]

@@ -25,7 +25,7 @@ def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = 
     with command(), joined(ChosenBus(connect, run, domain)) as bus:
         found = graph.present(bus)
         nodes, rules = graph.nodes(found), contract()
-        absent = graph.missing(rules, found)
+        absent = graph.missing(rules, found, bus.target.run)
         if as_json:
             rows = [
                 {"node": n.name, "role": n.name in rules.roles, "sessions": sorted(n.zids), "publishes": sorted(n.publishes),

@@ -76,7 +76,8 @@ class SmallRobot:
 def small_bus(folder: Path, domain: int = 0) -> Iterator[SmallRobot]:
     """The robot on a bus of its own, announced."""
     options = mesh(["robot"], folder)["robot"]
-    run = Run(name="small", endpoints={"robot": options.listen[0]}, domain=domain)
+    missed = {role: options.listen[0].replace("robot", role) for role in ("control", "tissue")}
+    run = Run(name="small", endpoints={"robot": options.listen[0], **missed}, domain=domain)
     with session(options) as bus:
         announcement = Announcement(run)
         robot = SmallRobot(bus, domain)

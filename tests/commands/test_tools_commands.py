@@ -19,6 +19,7 @@ from small_bus import RULES, SmallRobot, small_bus
 from typer.testing import CliRunner, Result
 
 from palpate.live.doctor_command import doctor
+from palpate.live.graph import missing
 from palpate.live.node_command import app as node
 from palpate.live.topic_command import app as topic
 from palpate_bus.runs.announcement import Announcement, Run, live
@@ -100,8 +101,8 @@ def test_bw_counts_bytes(robot: SmallRobot) -> None:
 def test_nodes_and_who_is_missing(robot: SmallRobot) -> None:
     found = output_of("node", "list")
     assert [row["node"] for row in found["nodes"]] == ["robot"]
-    assert found["missing"][0] == "tissue"
-    assert "control" in found["missing"]
+    assert found["missing"][:2] == ["tissue", "control"]
+    assert "search" not in found["missing"], "the run does without it"
 
 
 def test_doctor_finds_what_is_wrong(robot: SmallRobot) -> None:
@@ -120,13 +121,13 @@ def test_doctor_finds_what_is_wrong(robot: SmallRobot) -> None:
         tokens.undeclare()
     assert not found["healthy"]
     about = {(finding["about"], finding["level"]) for finding in found["findings"]}
-    assert {("versions", "ok"), ("endpoints", "ok"), ("roles", "trouble"), ("types", "trouble")} <= about
+    assert {("versions", "ok"), ("endpoints", "warning"), ("roles", "trouble"), ("types", "trouble")} <= about
     kinds = {(v["topic"], v["sender"], v["kind"]) for v in found["violations"]}
     assert ("joint_states", "robot", "not finite") in kinds
     assert ("joint_states", "rviz", "type hash") in kinds
     texts = " ".join(finding["text"] for finding in found["findings"])
     assert "control is missing" in texts
-    assert "1 of 1 endpoints answer" in texts
+    assert "1 of 3 endpoints answer" in texts
     assert "robot, rviz share one" in texts, "they have a session in common"
 
 
@@ -180,3 +181,12 @@ def test_a_killed_run_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     child.wait()
     assert live() == []
     assert list(tmp_path.glob("*.json")) == []
+
+
+def test_only_roles_that_the_run_has_are_missed() -> None:
+    observers = [role.name for role in RULES.roles.values() if role.observer]
+    unknown = missing(RULES, [], None)
+    assert "tissue" in unknown
+    assert "search" not in unknown, "it is optional"
+    run = Run("hardware", {"robot": "tcp/127.0.0.1:1", "search": "tcp/127.0.0.1:2"})
+    assert set(missing(RULES, [], run)) == {"robot", "search", *observers}

@@ -9,11 +9,13 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -71,7 +73,7 @@ class Announcement:
         """Writes the file of `run`. Raises OSError when the folder cannot be made or is another user's."""
         self.path = folder() / f"{run.pid}-{time.time_ns()}.json"
         draft = self.path.with_suffix(".new")
-        self._file = draft.open("w", encoding="utf-8")
+        self._file = open(draft, "w", encoding="utf-8", opener=partial(os.open, mode=0o600))  # noqa: SIM115 - it is locked while the run is on
         fcntl.flock(self._file, fcntl.LOCK_EX)
         json.dump(asdict(run), self._file, indent=2)
         self._file.flush()
@@ -104,11 +106,16 @@ def matching(chosen: str | None) -> list[Run]:
     return [run for run in live() if chosen is None or chosen == str(run.pid) or chosen in run.name]
 
 
+def _is_ours(path: Path) -> bool:
+    """Whether it is named as an announcement is: PALPATE_RUNS may name a folder in which something else lies, too."""
+    return re.fullmatch(r"\d+-\d+\.json", path.name) is not None
+
+
 def live() -> list[Run]:
     """The runs of this user on this machine that are on, oldest first. What killed runs left is removed."""
     remove_leftovers()
     runs = []
-    for path in folder().glob("*.json"):
+    for path in filter(_is_ours, folder().iterdir()):
         with suppress(OSError, ValueError, TypeError), path.open(encoding="utf-8") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
