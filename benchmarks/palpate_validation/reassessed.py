@@ -28,7 +28,8 @@ from palpate.report.results import Known, truth_of_run
 from palpate.report.scoring import Scores, score
 from palpate.run.composed import load_services
 from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_bus.recordings import RUN_FOLDER, open_recording
+from palpate_bus.recordings import open_recording
+from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected
 from palpate_models.load import load_scenario
 from palpate_models.phantom.field import gaussian_field
@@ -65,7 +66,7 @@ BENT_M: Final = 0.0005
 def read(folder: Path) -> tuple[Scenario, Collected, Known]:
     """The recorded run in a folder, and the truth of it. Raises RecordingError, ScenarioError."""
     scenario = load_scenario(str(folder / "scenario.yaml"))
-    collected = collect(open_recording(folder / RUN_FOLDER))
+    collected = collect(open_recording(folder / RECORDING))
     return scenario, collected, truth_of_run(scenario, collected)
 
 

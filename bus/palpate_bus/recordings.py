@@ -18,9 +18,8 @@ from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
 from palpate_bus.contract import Contract
+from palpate_bus.settings import RECORDING
 
-RUN_FOLDER = "recording_mcap"
-"""Name of the recording within a run's folder."""
 KEPT_EVERY = "kept_every_ms"
 """In the metadata of a channel: the time in which one message was kept."""
 SCENARIO = "scenario.yaml"
@@ -106,7 +105,7 @@ _RECOVER = "if its recorder was killed, first: python -m palpate_recorder.recove
 def _files(path: Path) -> tuple[Path, ...]:
     if path.is_file():
         return (path,)
-    folder = path / RUN_FOLDER if (path / RUN_FOLDER).is_dir() else path
+    folder = path / RECORDING if (path / RECORDING).is_dir() else path
     metadata = folder / "metadata.yaml"
     if metadata.is_file():
         info = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]

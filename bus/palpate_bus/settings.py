@@ -41,6 +41,8 @@ COMPOSE_VARIABLES = {
     "PALPATE_RECORDING": ("", "Folder with a recording, for compose/camera-replay.yml."),
 }
 """What only docker-compose.yml reads: default and meaning."""
+RECORDING = "recording_mcap"
+"""The recording within a results folder: a rosbag2 folder."""
 
 
 class BusConfigError(ValueError):

@@ -224,6 +224,22 @@ def test_a_topic_that_lags_behind_the_others_is_too_old() -> None:
     assert bus.named["control/joint_torque age"][1].expected == "at most 20 ms"
 
 
+def test_the_next_run_on_the_same_bus_is_judged_by_itself() -> None:
+    """A router stays, and so does a monitor; what the first run sent is older than all that the second sends."""
+    bus = Bus()
+    bus.run(3000)
+    for generation in (1, 2):
+        bus.entities = [entity(RULES.topics[name].producer, name, 10 * generation + i) for i, name in enumerate(MAKE)]
+        bus.sequences = dict.fromkeys(MAKE, 0)
+        start = bus.tick
+        bus.run(1500, lambda name, t, _, start=start: MAKE[name](t - start * MS))
+        assert bus.named == {}
+        assert bus.monitor.time.progress == pytest.approx(0.5, abs=0.05)
+    assert [row.senders for row in bus.monitor.health() if row.topic.name == "joint_states"] == [("robot",)]
+    bus.run(1000, lambda name, t, _: None if name == "joint_states" else MAKE[name](t - start * MS))
+    assert [kind for kind in bus.named if "silent" in kind] == ["joint_states silent"]
+
+
 def test_diagnostics_say_it_to_ros_tools() -> None:
     bus = Bus()
     bus.run(1000)

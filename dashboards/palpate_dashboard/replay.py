@@ -19,6 +19,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.recordings import BROKEN, complete_records
+from palpate_bus.settings import RECORDING
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.load import load_scenario
@@ -64,7 +65,7 @@ class RecordedInbox:
 
 def recording_of(folder: Path) -> tuple[Path, ...]:
     """The MCAP files of the run in `folder`, in order; empty when there are none. A long recording has several."""
-    files = (folder / "recording_mcap").glob("recording_mcap_*.mcap")
+    files = (folder / RECORDING).glob(f"{RECORDING}_*.mcap")
     return tuple(sorted(files, key=lambda path: int(path.stem.rpartition("_")[2])))
 
 
@@ -134,7 +135,7 @@ def main(folder: Path, tell: Callable[[int], None] | None = None) -> Path:
     """Draws the run in `folder` again; returns the file. Raises FileNotFoundError naming what is missing."""
     files, scenario = recording_of(folder), folder / "scenario.yaml"
     if not files or not scenario.is_file():
-        needed = scenario if files else folder / "recording_mcap"
+        needed = scenario if files else folder / RECORDING
         raise FileNotFoundError(f"{needed}: not there; give the folder of a run that was recorded")
     target = folder / FILE
     try:

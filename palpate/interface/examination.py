@@ -26,6 +26,7 @@ from palpate.report.results import clean_words, in_words
 from palpate.report.rows import Report
 from palpate.run.folder import usual_folder
 from palpate.run.options import DEFAULT_SCENARIO
+from palpate_bus.settings import RECORDING
 from palpate_models.load import dump_scenario
 from palpate_models.scenario import Scenario
 
@@ -85,7 +86,7 @@ class Examination:
     @property
     def mcap(self) -> Path | None:
         """Every message of the run, a rosbag2 folder; None where nothing was recorded."""
-        return self._file("recording_mcap")
+        return self._file(RECORDING)
 
     @property
     def page(self) -> Path:

@@ -46,8 +46,20 @@ def replay(  # noqa: PLR0913 - the options of a command
 
       palpate replay tissue.mcap --service tissue --update-refs tissue.mcap      renews it
     """
+    from palpate.command_line import refuse
     from palpate.replay.perform import Passage, Playing, play, run_again, write_reference
 
+    on_the_bus: dict[str, object] = {"--rate": rate != 1.0, "--topic": topics, "--listen": listen, "--hold": hold, "--drive": drive}
+    part_alone: dict[str, object] = {"--from": begin, "--for": length}
+    compared: dict[str, object] = {"--tolerance": tolerance, "--json": as_json}
+    again = {"--update-refs": update_refs, "--scenario": scenario, **compared}
+    unused, why = on_the_bus | part_alone, "is for a recording that is played on the bus; --service compares the whole of it"
+    if service is None:
+        unused, why = again, "goes with --service ROLE"
+    elif update_refs is not None:
+        unused, why = on_the_bus | compared, "does not go with --update-refs, which only writes"
+    for option in (name for name, value in unused.items() if value):
+        refuse(f"{option} {why}")
     part = Passage(begin, length)
     if service is None:
         play(file, part, Playing(rate, topics, listen, hold, drive))

@@ -11,9 +11,10 @@ from typing import Final
 from palpate.replay.rerun import rerun
 from palpate.report.archive import EvidenceError
 from palpate_bus.contract import contract
-from palpate_bus.recordings import RUN_FOLDER, RecordedMessage, Recording, RecordingError, open_recording
+from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.runs.announcement import live
 from palpate_bus.runs.run_name import in_use
+from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected, Collector
 from palpate_models.load import ScenarioError, load_scenario
 from palpate_models.scenario import Scenario
@@ -50,7 +51,7 @@ def broken_off(folder: Path) -> BrokenOff:
         raise EvidenceError(f"{folder}: cannot be looked into: {error}") from error
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))
-        recording = _recording(folder / RUN_FOLDER)
+        recording = _recording(folder / RECORDING)
         return BrokenOff(folder, scenario, recording, collect(recording))
     except (RecordingError, ScenarioError) as error:
         raise EvidenceError(f"{folder}: nothing can be recovered: {error}") from error

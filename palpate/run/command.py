@@ -146,12 +146,23 @@ def prepare(
 ) -> None:
     """Write the scenario files of a run in containers, its first step.
 
-    scenario.yaml is for tissue, observers and scoring, plant.yaml for robot and camera, exam.yaml for all others.
+    scenario.yaml is for tissue, observers and scoring, plant.yaml for robot and camera, exam.yaml for all others. Results of an
+    earlier run are kept, in a folder within this one.
     """
+    from palpate.command_line import refuse, say
+    from palpate.run.folder import FolderError, apart
     from palpate.run.inputs import usable
     from palpate.run.roles import write_scenario_files
 
-    write_scenario_files(usable(scenario, settings, seed, elsewhere=True), out)
+    chosen = usable(scenario, settings, seed, elsewhere=True)
+    try:
+        if (earlier := apart(out)) is not None:
+            say(f"the results of the run before are in {earlier} now")
+        write_scenario_files(chosen, out)
+    except FolderError as error:
+        refuse(error)
+    except OSError as error:
+        refuse(f"--out {out}: cannot be written into: {error.strerror}")
 
 
 def conduct(

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
+from typing import Final
 
-from palpate_bus.runs.run_name import LOCK, run_of
+from palpate_bus.runs.run_name import FILE, LOCK, in_use, run_of
+from palpate_bus.settings import RECORDING
+
+OF_A_RUN: Final = (
+    *("run.json", "scenario.yaml", "plant.yaml", "exam.yaml", "bus.json", "logs", RECORDING, "recording.rrd"),
+    *("evidence.npz", "samples.csv", "report.json", "report.html", "map.png"),
+)
+"""What a run leaves in its folder."""
 
 
 class FolderError(ValueError):
@@ -31,6 +41,24 @@ def unless_begun(path: Path, begun: Callable[[], bool]) -> Iterator[None]:
         if not begun():
             shutil.rmtree(path, ignore_errors=True)
         raise
+
+
+def apart(path: Path) -> Path | None:
+    """Moves the results of an earlier run, if the folder holds any, into a folder within it, and returns that.
+
+    It is named by when that run began, and by its name. Raises FolderError for a folder that a run is writing into.
+    """
+    if in_use(path):
+        raise FolderError(f"--out {path}: a run is writing into it; name another folder")
+    if not (run := run_of(path)):
+        return None
+    began = str(json.loads((path / FILE).read_text(encoding="utf-8")).get("began", ""))
+    earlier = path / "-".join((re.sub(r"\D", "", began.partition("+")[0]), run))
+    earlier.mkdir()
+    for name in OF_A_RUN:
+        with suppress(FileNotFoundError):
+            (path / name).rename(earlier / name)
+    return earlier
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from time import monotonic
@@ -109,9 +109,9 @@ class Soak:
 
     @contextmanager
     def noted(self, folder: Path) -> Iterator[None]:
-        """Notes all processes once a second, in soak.csv, too. Raises OSError when that cannot be begun."""
+        """Notes all processes once a second, in a new soak.csv, too. Raises OSError when that cannot be begun."""
         over, began = threading.Event(), monotonic()
-        with (folder / FILE).open("w", newline="", encoding="utf-8", buffering=1) as file:
+        with (folder / FILE).open("x", newline="", encoding="utf-8", buffering=1) as file:
             rows = csv.writer(file, lineterminator="\n")
             rows.writerow(ProcessSample.__dataclass_fields__)
 
@@ -206,12 +206,15 @@ def run_to_its_end(command: Sequence[str]) -> Left:
 
 def repeat(count: int, folder: Path, once: Callable[[int, Path], None]) -> None:
     """Does `once(number, folder of its own)` so many times, and after each writes what was noted until then."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        refuse(f"--out {folder}: cannot be made a folder: {error.strerror}")
     soak = Soak()
-    with soak.noted(folder):
+    with ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(soak.noted(folder))
+        except FileExistsError:
+            refuse(f"--out {folder}: there is {FILE} of an earlier --repeat in it; name another folder")
+        except OSError as error:
+            refuse(f"--out {folder}: cannot be written into: {error.strerror}")
         for number in range(1, count + 1):
             soak.number = number
             once(number, folder / f"{number:04d}")

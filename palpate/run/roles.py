@@ -24,8 +24,6 @@ WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or r
 OBSERVERS = tuple(name for name, role in _ROLES.items() if role.observer)
 NONE = "none"
 """`services.tissue: none`: nothing plays the tissue, since what is examined is real."""
-RESULTS = ("report.json", "report.html", "map.png", "samples.csv", "evidence.npz", "bus.json", "recording.rrd")
-"""What the end of a run leaves in its folder, and the viewer's drawing; the recorder removes its own files."""
 
 
 def workers(scenario: Scenario) -> tuple[str, ...]:
@@ -112,8 +110,6 @@ def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
     Only scenario.yaml names the run: what the examination is given shall be the same whenever the examination is.
     """
     (out / "logs").mkdir(parents=True, exist_ok=True)
-    for name in RESULTS:  # of an earlier run in the same folder, which could be taken for results of this one
-        (out / name).unlink(missing_ok=True)
     named = f"# run {name_run(out)}\n"
     for view in HIDDEN:
         text = dump_scenario(scenario, view)

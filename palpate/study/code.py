@@ -23,14 +23,14 @@ PACKAGES: Final = (
     *(f"palpate_{role}" for role in WORKERS),
 )
 """Packages whose code decides results."""
-SUFFIXES: Final = (".py", ".yaml", ".csv")
+SUFFIXES: Final = (".py", ".yaml", ".csv", ".npz", ".c", ".h")
 
 
 @cache
 def code_digest() -> str:
     """SHA-256 over the files that decide results, by their place in the package: the same for every way to install them."""
     digest = hashlib.sha256()
-    for name, path in _files():
+    for name, path in sorted(_files()):
         digest.update(f"{name}\0{hashlib.sha256(path.read_bytes()).hexdigest()}\0".encode())
     return digest.hexdigest()
 
@@ -39,6 +39,9 @@ def _files() -> Iterator[tuple[str, Path]]:
     for package in PACKAGES:
         spec = find_spec(package)
         for root in map(Path, (spec.submodule_search_locations if spec else None) or ()):
-            for path in sorted(root.rglob("*")):
+            for path in root.rglob("*"):
                 if path.suffix in SUFFIXES:
                     yield f"{package}/{path.relative_to(root).as_posix()}", path
+            if package == "palpate_fmu":  # in a checkout its sources lie beside it
+                for path in (root.parent / "src").glob("*.[ch]"):
+                    yield f"{package}/src/{path.name}", path

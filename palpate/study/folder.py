@@ -19,6 +19,7 @@ from palpate.study.tables import write_tables
 
 MANIFEST: Final = "manifest.json"
 SESSIONS: Final = "sessions.jsonl"
+FAILURES: Final = "failures"
 
 
 def usual_folder(study: str, split: str) -> Path:
@@ -89,6 +90,15 @@ def sessions(folder: Path) -> list[Session]:
     path = folder / SESSIONS
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     return [Session.model_validate_json(line) for line in lines]
+
+
+def put_together(parts: Sequence[Path], folder: Path) -> None:
+    """Takes over how long each go at a part took, each once however often this is done, and why attempts at cases failed."""
+    every = dict.fromkeys(session for part in (folder, *parts) for session in sessions(part))
+    write_text(folder / SESSIONS, "".join(f"{session.model_dump_json()}\n" for session in every))
+    (folder / FAILURES).mkdir(exist_ok=True)
+    for path in (path for part in parts for path in (part / FAILURES).glob("*.json")):
+        write_text(folder / FAILURES / path.name, path.read_text(encoding="utf-8"))
 
 
 def outcomes_of(folder: Path, manifest: Manifest) -> list[Outcome]:

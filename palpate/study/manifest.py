@@ -19,7 +19,7 @@ from palpate_bus.implementations import ChoiceError, is_file
 from palpate_models.errors import Errors
 from palpate_models.load import ScenarioError, as_settings, load_scenario
 from palpate_models.phantom import MeshError, build_phantom
-from palpate_models.scenario import Scenario, Services
+from palpate_models.scenario import Scenario
 from palpate_models.section import Section
 
 ID_DIGITS: Final = 16
@@ -122,7 +122,7 @@ def _check_secret(study: Study, request: Request) -> None:
 def _cases(study: Study, request: Request) -> Iterator[Case]:
     salt = study.salt if request.secret is None else request.secret
     errors = study.error_levels()
-    services: dict[str, Services] = {}
+    usable: dict[str, Scenario] = {}
     for name, population in study.populations.items():
         count = getattr(population.number, request.split)
         if count and request.number is not None:
@@ -132,9 +132,9 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
                 for key, method in study.methods.items():
                     where = f"{study.name}: populations.{name} by methods.{key}"
                     scenario = _scenario(where, (population, method, wrong), (number, seed), request.settings)
-                    if where not in services:  # looking for what is installed takes a tenth of a second
-                        services[where] = _usable(where, scenario).services
-                    scenario = scenario.model_copy(update={"services": services[where]})
+                    if where not in usable:  # looking for what is installed takes a tenth of a second
+                        usable[where] = _usable(where, scenario)
+                    scenario = scenario.model_copy(update={"services": usable[where].services, "search": usable[where].search})
                     files = _files(scenario)
                     yield Case(
                         case_id=_case_id(scenario, files, study.tier, method),
@@ -184,7 +184,8 @@ def _usable(where: str, scenario: Scenario) -> Scenario:
 def _files(scenario: Scenario) -> dict[str, str]:
     """SHA-256 of the files that decide a result, by path."""
     named = [scenario.phantom.mesh, scenario.tissue.fmu, scenario.tissue.fmu_map]
-    named += [word for word in scenario.services.model_dump().values() if is_file(word)]
+    functions = (*scenario.services.model_dump().values(), scenario.exam.pattern, scenario.search.policy)
+    named += [word for word in functions if is_file(word)]
     return {path: file_hash(path) for path in named if path is not None}
 
 

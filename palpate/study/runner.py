@@ -24,7 +24,7 @@ from palpate.report.files import write_text
 from palpate.study.case import Attempt
 from palpate.study.child import run_batch
 from palpate.study.code import code_digest
-from palpate.study.folder import Manifest, manifest_of, open_folder
+from palpate.study.folder import FAILURES, Manifest, manifest_of, open_folder
 from palpate.study.manifest import Case
 from palpate.study.outcome import ATTEMPTS, Outcome, case_file, read_outcome, write_outcome
 from palpate.study.spec import StudyError
@@ -75,7 +75,7 @@ def run_cases(folder: Path, cases: Sequence[Case], workers: Workers, tell: Tell,
     `runs`: the results of whole examinations stay in the folder `runs`, each in a folder of its own.
     """
     (folder / "cases").mkdir(parents=True, exist_ok=True)
-    (folder / "failures").mkdir(exist_ok=True)
+    (folder / FAILURES).mkdir(exist_ok=True)
     todo, kept = missing(folder, cases), str((folder / "runs").resolve()) if runs else None
     running: dict[Future[list[str]], list[Case]] = {}
 
@@ -139,4 +139,4 @@ def failures(folder: Path, case: Case) -> list[str]:
 
 
 def _failures_file(folder: Path, case: Case) -> Path:
-    return folder / "failures" / f"{case.case_id}.json"
+    return folder / FAILURES / f"{case.case_id}.json"

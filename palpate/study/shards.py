@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from palpate.study.folder import Manifest, add_session, open_folder, outcomes_of, read_manifest, sessions
+from palpate.study.folder import Manifest, open_folder, outcomes_of, put_together, read_manifest
 from palpate.study.manifest import Case
 from palpate.study.outcome import write_outcome
 from palpate.study.spec import StudyError
@@ -51,8 +51,7 @@ def merge(parts: Sequence[Path], folder: Path) -> Manifest:
     for part in parts:
         for outcome in outcomes_of(part, manifest):
             write_outcome(folder, outcome)
-        for session in sessions(part) if part.resolve() != folder.resolve() else ():
-            add_session(folder, session)
+    put_together(parts, folder)
     there = {outcome.case.case_id for outcome in outcomes_of(folder, manifest)}
     if absent := [row.case_id for row in manifest.cases if row.case_id not in there]:
         raise StudyError(

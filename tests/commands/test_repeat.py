@@ -40,6 +40,15 @@ def test_each_has_a_folder_and_is_noted(tmp_path: Path, monkeypatch: pytest.Monk
     assert Soak.of(read_samples(tmp_path / "soak")).growths()[0].examinations == 3
 
 
+def test_what_was_noted_of_earlier_examinations_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "soak.csv").write_text("a night's work", encoding="utf-8")
+    with pytest.raises(typer.Exit) as left:
+        repeat(2, tmp_path, lambda number, own: None)
+    assert left.value.exit_code == 2
+    assert "soak.csv" in capsys.readouterr().err
+    assert (tmp_path / "soak.csv").read_text(encoding="utf-8") == "a night's work"
+
+
 def test_the_slope_is_of_the_highest_of_each_examination() -> None:
     soak = Soak()
     for number in range(1, 5):

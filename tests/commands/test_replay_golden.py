@@ -86,6 +86,9 @@ def test_renewing_a_reference_makes_the_changed_service_agree(tmp_path: Path) ->
         (("--service", "control", "--tolerance", "x"), "--tolerance x"),
         (("--service", "control", "--tolerance", "nothing:torque=1"), "no topic 'nothing'"),
         (("--topic", "nothing"), "nothing"),
+        (("--update-refs", "new.mcap"), "--update-refs goes with --service"),
+        (("--service", "control", "--for", "5"), "--for is for a recording that is played"),
+        (("--service", "control", "--update-refs", "new.mcap", "--json"), "--json does not go with --update-refs"),
     ],
 )
 def test_bad_input_ends_with_status_2_and_says_what_is_wrong(words: tuple[str, ...], said: str) -> None:

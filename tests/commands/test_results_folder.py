@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,7 @@ from PIL import Image
 from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.page import write_page
 from palpate.report.results import write_results
-from palpate.run.folder import FolderError, results_folder, unless_begun
+from palpate.run.folder import FolderError, _locked, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_name import name_run, run_of
 from palpate_models.load import load_scenario
@@ -23,6 +25,24 @@ def test_a_folder_with_anything_in_it_is_refused_and_left_alone(tmp_path: Path) 
     with pytest.raises(FolderError, match=r"there is thesis\.tex in it"), results_folder(tmp_path):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_preparing_containers_keeps_the_results_of_the_run_before(tmp_path: Path) -> None:
+    write_scenario_files(load_scenario("clean"), tmp_path)
+    (tmp_path / "report.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    run = run_of(tmp_path)
+    words = [sys.executable, "-m", "palpate", "prepare", "healthy", "--out", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    (earlier,) = tmp_path.glob(f"*-{run}")
+    assert str(earlier) in done.stderr
+    assert {path.name for path in earlier.iterdir()} >= {"report.json", "run.json", "scenario.yaml", "logs"}
+    assert run_of(tmp_path) not in ("", run)
+    assert {"notes.txt", "scenario.yaml"} <= {path.name for path in tmp_path.iterdir()}
+    assert not (tmp_path / "report.json").exists()
+    with _locked(tmp_path):
+        assert subprocess.run(words, capture_output=True, check=False).returncode == 2
+    assert len(list(tmp_path.glob("2*"))) == 1
 
 
 def test_overwriting_removes_an_earlier_run_whole(tmp_path: Path) -> None:

@@ -33,13 +33,15 @@ def test_ids_depend_on_everything_that_decides_a_result(changes: dict[str, objec
     assert ids.isdisjoint(case.case_id for case in cases_of(study(**{"tier": "whole", **changes})))
 
 
-def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path) -> None:
+@pytest.mark.parametrize("field", ["services.assessment", "exam.pattern", "search.policy"])
+def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path, field: str) -> None:
     found = []
     for folder, text in (("a", "1"), ("b", "1"), ("c", "2")):
         path = tmp_path / folder / "mine.py"
         path.parent.mkdir()
-        path.write_text(f"def create(scenario): return {text}\n")
-        found.append(cases_of(study(methods={"m": {"services": {"assessment": str(path)}}}))[0].case_id)
+        path.write_text(f"def create(scenario): return {text}\nscan = next_press = create\n")
+        settings = {"exam.pattern": "search"} if field == "search.policy" else {}
+        found.append(cases_of(study(methods={"m": {"settings": {**settings, field: str(path)}}}))[0].case_id)
     assert found[0] == found[1] != found[2]
 
 

@@ -24,8 +24,8 @@ from toy_study import TOY, study
 
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import FindingScore
-from palpate.study.digest import digest
-from palpate.study.folder import manifest_of, open_folder, outcomes_of
+from palpate.study.digest import Session, digest
+from palpate.study.folder import FAILURES, add_session, manifest_of, open_folder, outcomes_of, sessions
 from palpate.study.manifest import Case, cases_of
 from palpate.study.outcome import ATTEMPTS, case_file, read_outcome
 from palpate.study.runner import StudyStopped, failures, missing, of_other_code, run_cases
@@ -105,7 +105,13 @@ def test_the_digest_is_that_of_its_parts_put_together(folder: Path, tmp_path: Pa
             open_folder(part, manifest_of("toy", CASES))
             case_file(part, case.case_id).parent.mkdir(exist_ok=True)
             case_file(part, case.case_id).write_bytes(case_file(folder, case.case_id).read_bytes())
-    assert merge(parts, tmp_path / "whole") == manifest_of("toy", CASES)
+        add_session(part, Session(workers=index, cases=len(own), elapsed_s=60.0))
+    (parts[0] / FAILURES).mkdir()
+    (parts[0] / FAILURES / f"{CASES[0].case_id}.json").write_text('["killed"]', encoding="utf-8")
+    for _again in range(2):
+        assert merge(parts, tmp_path / "whole") == manifest_of("toy", CASES)
+        assert [session.workers for session in sessions(tmp_path / "whole")] == [1, 2]
+    assert failures(tmp_path / "whole", CASES[0]) == ["killed"]
     assert digest_of(tmp_path / "whole") == digest_of(folder)
     with pytest.raises(StudyError, match="1 of 3 cases are in no part"):
         merge(parts[:1], tmp_path / "half")

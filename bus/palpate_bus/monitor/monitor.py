@@ -36,6 +36,8 @@ class Monitor:
         self._checkers = {name: Checker(topic) for name, topic in rules.topics.items()}
         self._decoders = {name: codec.decoder(topic.type) for name, topic in rules.topics.items()}
         self._nodes: dict[bytes, str] = {}
+        self._left: set[bytes] = set()
+        """Senders that were on the bus and are no more."""
         self._publishers: dict[str, set[str]] = {}
         self._since: dict[tuple[str, str], float] = {}
         self._news: list[Violation] = []
@@ -55,7 +57,13 @@ class Monitor:
     def see(self, entities: Iterable[Entity], now: float) -> None:
         """Takes the entities on the bus (`GraphWatch.alive.values()`): they give senders their names, types and hashes."""
         present = list(entities)
+        before = self._nodes.keys()
         self._nodes = {entity.gid: entity.node for entity in present}
+        self._left |= before - self._nodes.keys()
+        for streams in self._streams.values():
+            if not streams.keys().isdisjoint(self._nodes):  # another run's: what an earlier one sent is past
+                for gid in self._left & streams.keys():
+                    del streams[gid]
         self._publishers = {}
         for entity in present:
             if entity.endpoint is None or entity.endpoint.topic not in self.rules.topics:
@@ -113,7 +121,8 @@ class Monitor:
                 stream.ages.append((wall - stream.sent) / MS)
         rows = self.rules.topics
         periodic = [(rows[name], streams) for name, streams in self._streams.items() if rows[name].periodic]
-        self.time = timing.bus_time((stream for _, streams in periodic for stream in streams.values()), self.wallclock)
+        there = (stream for _, streams in periodic for gid, stream in streams.items() if gid not in self._left)
+        self.time = timing.bus_time(there, self.wallclock)
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:

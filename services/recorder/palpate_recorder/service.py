@@ -17,14 +17,12 @@ from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.runs.run_name import run_of
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.settings import Settings
+from palpate_bus.settings import RECORDING, Settings
 from palpate_models.scenario import Scenario
 from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
 
 log = logging.getLogger(__name__)
 
-FOLDER = "recording_mcap"
-"""Name of the rosbag2 folder within the folder of the run."""
 SPARE_BYTES = 10_000_000
 """With less than this left on the disk the recording ends: report, page and map need it."""
 LOOK_NS = 200_000_000
@@ -136,6 +134,6 @@ def create(scenario: Scenario) -> RecorderService:
     """
     del scenario
     settings = Settings.read()
-    out = settings.required("out", f"the recorder writes to $PALPATE_OUT/{FOLDER}, so give it the run's folder")
+    out = settings.required("out", f"the recorder writes to $PALPATE_OUT/{RECORDING}, so give it the run's folder")
     size = settings.record_file_mb
-    return RecorderService(out / FOLDER, FILE_BYTES if size is None else size * 1_000_000, full=settings.record == "full")
+    return RecorderService(out / RECORDING, FILE_BYTES if size is None else size * 1_000_000, full=settings.record == "full")

@@ -21,9 +21,10 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, SurfaceMesh, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.recordings import RecordingError, open_recording
+from palpate_bus.settings import RECORDING
 from palpate_models.scenario import Scenario
 from palpate_recorder.recover import recover, salvage
-from palpate_recorder.service import FOLDER, RecorderService, create
+from palpate_recorder.service import RecorderService, create
 
 MS = 1_000_000
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]
@@ -51,12 +52,12 @@ def record(service: RecorderService, milliseconds: int) -> None:
 
 
 def test_rosbags_reads_back_every_byte(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 2500)
     facts = service.finish()
     assert facts["messages"] == 2550
     assert facts["missing"] == {}
-    with Reader(tmp_path / FOLDER) as reader:
+    with Reader(tmp_path / RECORDING) as reader:
         assert reader.message_count == 2550
         assert {connection.topic for connection in reader.connections} == {
             f"/{topic.name}" for topic, _ in contract().inputs("recorder")
@@ -69,20 +70,20 @@ def test_rosbags_reads_back_every_byte(tmp_path: Path) -> None:
 
 
 def test_a_reader_without_our_definitions_decodes_our_types(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 60)
     service.finish()
-    with AnyReader([tmp_path / FOLDER]) as reader:
+    with AnyReader([tmp_path / RECORDING]) as reader:
         connection = next(c for c in reader.connections if c.topic == "/sim/surface")
         _, _, data = list(reader.messages([connection]))[-1]
         assert reader.deserialize(data, connection.msgtype).vertices[0] == pytest.approx(0.05)
 
 
 def test_the_mcap_library_decodes_all_with_the_schemas_in_the_file(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 120)
     service.finish()
-    with (tmp_path / FOLDER / f"{FOLDER}_0.mcap").open("rb") as stream:
+    with (tmp_path / RECORDING / f"{RECORDING}_0.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
         decoded = list(reader.iter_decoded_messages())
@@ -114,9 +115,9 @@ def kill(service_folder: Path, to: Path, share: float = 1.0) -> Path:
 
 
 def test_a_crash_loses_at_most_the_last_simulated_second(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 3900)
-    recovered = recover(kill(tmp_path / FOLDER, tmp_path / "crashed"))
+    recovered = recover(kill(tmp_path / RECORDING, tmp_path / "crashed"))
     with Reader(recovered) as reader:
         stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
     assert stamps == [i * MS for i in range(len(stamps))]
@@ -124,12 +125,12 @@ def test_a_crash_loses_at_most_the_last_simulated_second(tmp_path: Path) -> None
 
 
 def test_a_file_cut_anywhere_is_recovered_up_to_there(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 3900)
     service.finish()
     counts = []
     for share in (0.3, 0.6, 0.9, 1.0):
-        recovered = recover(kill(tmp_path / FOLDER, tmp_path / f"cut_{share}", share))
+        recovered = recover(kill(tmp_path / RECORDING, tmp_path / f"cut_{share}", share))
         with Reader(recovered) as reader:
             counts.append(len([None for _ in reader.messages()]))
             assert counts[-1] == reader.message_count
@@ -137,9 +138,9 @@ def test_a_file_cut_anywhere_is_recovered_up_to_there(tmp_path: Path) -> None:
 
 
 def test_what_is_salvaged_is_what_is_recovered_and_nothing_is_written(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 3900)
-    crashed = kill(tmp_path / FOLDER, tmp_path / "crashed", 0.7)
+    crashed = kill(tmp_path / RECORDING, tmp_path / "crashed", 0.7)
     before = sorted(tmp_path.rglob("*"))
     salvaged = salvage(crashed, ["joint_states", "sim/surface"])
     assert sorted(tmp_path.rglob("*")) == before
@@ -155,14 +156,14 @@ def test_what_is_salvaged_is_what_is_recovered_and_nothing_is_written(tmp_path: 
 def test_recover_says_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no recording there"):
         recover(tmp_path)
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     with pytest.raises(ValueError, match="nothing to recover"):
-        recover(kill(tmp_path / FOLDER, tmp_path / "empty"))
+        recover(kill(tmp_path / RECORDING, tmp_path / "empty"))
     service.finish()
 
 
 def test_gaps_in_the_sequence_are_reported(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     for sequence in (0, 1, 5, 6):
         service.record(TOPICS["joint_states"], joint_states(0), sequence * MS, sequence)
     assert service.finish()["missing"] == {"/joint_states": 3}
@@ -170,7 +171,7 @@ def test_gaps_in_the_sequence_are_reported(tmp_path: Path) -> None:
 
 def test_memory_stays_bounded_by_the_chunk(tmp_path: Path) -> None:
     """Large messages go to disk by size, long before a simulated second is over."""
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     payload = codec.encode(
         SurfaceMesh(
             header(0),
@@ -183,7 +184,7 @@ def test_memory_stays_bounded_by_the_chunk(tmp_path: Path) -> None:
     )
     for i in range(3):
         service.record(TOPICS["sim/surface"], payload, i, i)
-    assert (tmp_path / FOLDER / f"{FOLDER}_0.mcap").stat().st_size > 2 * len(payload)
+    assert (tmp_path / RECORDING / f"{RECORDING}_0.mcap").stat().st_size > 2 * len(payload)
     service.finish()
 
 
@@ -195,25 +196,25 @@ def rotated(folder: Path) -> RecorderService:
 
 
 def test_a_long_recording_is_split_and_reads_as_one(tmp_path: Path) -> None:
-    facts = rotated(tmp_path / FOLDER).finish()
+    facts = rotated(tmp_path / RECORDING).finish()
     assert facts["files"] >= 3
-    metadata = yaml.safe_load((tmp_path / FOLDER / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    metadata = yaml.safe_load((tmp_path / RECORDING / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert len(metadata["relative_file_paths"]) == facts["files"]
     assert sum(file["message_count"] for file in metadata["files"]) == metadata["message_count"] == facts["messages"]
-    with Reader(tmp_path / FOLDER) as reader:
+    with Reader(tmp_path / RECORDING) as reader:
         stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
     assert stamps == [i * MS for i in range(3900)]
-    for path in sorted((tmp_path / FOLDER).glob("*.mcap")):
+    for path in sorted((tmp_path / RECORDING).glob("*.mcap")):
         with path.open("rb") as stream:  # each file is complete in itself
             decoded = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
             assert sum(1 for _ in decoded) > 0, path
 
 
 def test_a_crash_of_a_split_recording_loses_at_most_the_last_second(tmp_path: Path) -> None:
-    rotated(tmp_path / FOLDER)  # its process dies here
+    rotated(tmp_path / RECORDING)  # its process dies here
     crashed = tmp_path / "crashed"
     crashed.mkdir()
-    for number, path in enumerate(sorted((tmp_path / FOLDER).glob("*.mcap"))):
+    for number, path in enumerate(sorted((tmp_path / RECORDING).glob("*.mcap"))):
         (crashed / f"crashed_{number}.mcap").write_bytes(path.read_bytes())
     with Reader(recover(crashed)) as reader:
         stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
@@ -222,16 +223,16 @@ def test_a_crash_of_a_split_recording_loses_at_most_the_last_second(tmp_path: Pa
 
 
 def test_a_shorter_run_in_the_same_folder_leaves_no_file_of_the_longer_one(tmp_path: Path) -> None:
-    rotated(tmp_path / FOLDER).finish()
-    service = RecorderService(tmp_path / FOLDER)
+    rotated(tmp_path / RECORDING).finish()
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 5)
     service.finish()
-    assert [path.name for path in (tmp_path / FOLDER).glob("*.mcap")] == [f"{FOLDER}_0.mcap"]
+    assert [path.name for path in (tmp_path / RECORDING).glob("*.mcap")] == [f"{RECORDING}_0.mcap"]
 
 
 def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_most(tmp_path: Path) -> None:
     every = TOPICS["joint_states"].record_ms
-    service = RecorderService(tmp_path / FOLDER, full=False)
+    service = RecorderService(tmp_path / RECORDING, full=False)
     for k in range(101):
         service.record(TOPICS["joint_states"], joint_states(k * MS), k * MS, k + 1)
         service.record(TOPICS["robot/status"], b"", k * MS, k + 1)
@@ -239,7 +240,7 @@ def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_mos
     assert facts["topics"]["/joint_states"] == 100 // every + 1
     assert facts["topics"]["/robot/status"] == 101
     assert facts["missing"] == {}
-    recording = open_recording(tmp_path / FOLDER)
+    recording = open_recording(tmp_path / RECORDING)
     assert recording.thinned.keys() == {name for name, topic in TOPICS.items() if topic.record_ms}
     recording.check(contract(), ["robot/status"])
     recording.check(contract(), ["joint_states"], whole=False)
@@ -249,38 +250,45 @@ def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_mos
 
 def test_rerun_opens_the_recording(tmp_path: Path) -> None:
     """Its own reader decodes joint states and meshes alike; nothing of ours takes part."""
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 200)
     service.finish()
     out = tmp_path / "opened.rrd"
-    command = [Path(sys.executable).with_name("rerun"), "mcap", "convert", tmp_path / FOLDER / f"{FOLDER}_0.mcap", "-o", out]
+    command = [
+        Path(sys.executable).with_name("rerun"),
+        "mcap",
+        "convert",
+        tmp_path / RECORDING / f"{RECORDING}_0.mcap",
+        "-o",
+        out,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert out.stat().st_size > 10_000
 
 
 def test_an_empty_recording_is_a_valid_bag(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     assert service.finish()["messages"] == 0
-    with Reader(tmp_path / FOLDER) as reader:
+    with Reader(tmp_path / RECORDING) as reader:
         assert list(reader.messages()) == []
 
 
 def test_finish_twice_and_a_new_run_in_the_same_folder(tmp_path: Path) -> None:
-    first = RecorderService(tmp_path / FOLDER)
+    first = RecorderService(tmp_path / RECORDING)
     record(first, 10)
     first.finish()
     first.finish()
-    second = RecorderService(tmp_path / FOLDER)
+    second = RecorderService(tmp_path / RECORDING)
     record(second, 5)
     second.finish()
-    metadata = yaml.safe_load((tmp_path / FOLDER / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    metadata = yaml.safe_load((tmp_path / RECORDING / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert metadata["message_count"] == 6
     assert metadata["duration"]["nanoseconds"] == 4 * MS
 
 
 def test_an_unknown_topic_is_counted_not_written(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     stranger = TOPICS["joint_states"].model_copy(update={"name": "not/ours"})
     service.record(stranger, b"\0\1\0\0", 0, 0)
     facts = service.finish()
@@ -291,7 +299,7 @@ def test_an_unknown_topic_is_counted_not_written(tmp_path: Path) -> None:
 def test_create_reads_the_run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_OUT", str(tmp_path / "run"))
     create(Scenario()).finish()
-    assert (tmp_path / "run" / FOLDER / "metadata.yaml").is_file()
+    assert (tmp_path / "run" / RECORDING / "metadata.yaml").is_file()
     monkeypatch.delenv("PALPATE_OUT")
     with pytest.raises(ValueError, match="PALPATE_OUT"):
         create(Scenario())
@@ -305,7 +313,7 @@ Usage = namedtuple("Usage", "total used free")
 
 
 def test_a_disk_that_fills_up_ends_the_recording_whole_and_not_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 9_000_000))
     service.record(TOPICS["joint_states"], joint_states(1000 * MS), 1000 * MS, 1000)
@@ -313,14 +321,14 @@ def test_a_disk_that_fills_up_ends_the_recording_whole_and_not_the_run(tmp_path:
     facts = service.finish()
     assert facts["trouble"] == "recorder: the recording ends at 1.000 s: 9 MB are left on its disk, which the report needs"
     assert facts["unwritten"] == 2
-    with Reader(tmp_path / FOLDER) as reader:
+    with Reader(tmp_path / RECORDING) as reader:
         assert reader.message_count == 1020
 
 
 def test_a_folder_that_is_lost_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / FOLDER)
+    service = RecorderService(tmp_path / RECORDING)
     record(service, 100)
-    shutil.rmtree(tmp_path / FOLDER)
+    shutil.rmtree(tmp_path / RECORDING)
     service.record(TOPICS["joint_states"], joint_states(300 * MS), 300 * MS, 300)
     facts = service.finish()
     assert facts["trouble"] == "recorder: the recording ends at 0.300 s: its folder is lost: No such file or directory"
@@ -338,13 +346,13 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_on_a_small_disk_room_is_left_for_the_report(small_disk: Path) -> None:
-    service = RecorderService(small_disk / FOLDER)
+    service = RecorderService(small_disk / RECORDING)
     record(service, 60_000)
     facts = service.finish()
     assert "are left on its disk" in facts["trouble"]
     assert facts["unwritten"] > 0
     assert shutil.disk_usage(small_disk).free > 5_000_000
-    with Reader(small_disk / FOLDER) as reader:
+    with Reader(small_disk / RECORDING) as reader:
         assert reader.message_count == facts["messages"]
 
 
@@ -353,7 +361,7 @@ def test_what_the_disk_does_not_take_ends_the_recording_and_not_the_run(
 ) -> None:
     """As above, but it fills up faster than anybody looks."""
     monkeypatch.setattr("palpate_recorder.service.SPARE_BYTES", 0)
-    service = RecorderService(small_disk / FOLDER)
+    service = RecorderService(small_disk / RECORDING)
     record(service, 10_000)
     (small_disk / "ballast").write_bytes(bytes(shutil.disk_usage(small_disk).free - 100_000))
     record(service, 60_000)
