@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
+from scipy.spatial import cKDTree
 
 from palpate_models.frames import Array
 from palpate_models.lbr import POSITION_LIMIT, TORQUE_LIMIT
@@ -127,8 +128,8 @@ def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
     q = batch.from_one(best)
     missing, reached = batch.reached(q)
     if reached.any() and not reached.all():
-        distance = np.linalg.norm(batch.positions[:, None] - batch.positions[reached], axis=2)
-        trial = batch.search(q[np.flatnonzero(reached)[distance.argmin(axis=1)]])
+        _, nearest = cKDTree(batch.positions[reached]).query(batch.positions)
+        trial = batch.search(q[np.flatnonzero(reached)[nearest]])
         residual, good = batch.reached(trial)
         better = ~reached & (good | (residual < missing))
         q = np.where(better[:, None], trial, q)

@@ -49,7 +49,13 @@ def replay(  # noqa: PLR0913 - the options of a command
     from palpate.command_line import refuse
     from palpate.replay.perform import Passage, Playing, play, run_again, write_reference
 
-    on_the_bus: dict[str, object] = {"--rate": rate != 1.0, "--topic": topics, "--listen": listen, "--hold": hold, "--drive": drive}
+    on_the_bus: dict[str, object] = {
+        "--rate": rate != 1.0,
+        "--topic": topics,
+        "--listen": listen,
+        "--hold": hold,
+        "--drive": drive,
+    }
     part_alone: dict[str, object] = {"--from": begin, "--for": length}
     compared: dict[str, object] = {"--tolerance": tolerance, "--json": as_json}
     again = {"--update-refs": update_refs, "--scenario": scenario, **compared}

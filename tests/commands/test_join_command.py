@@ -66,7 +66,7 @@ def test_a_place_is_entered_by_what_was_there_or_by_what_is_named() -> None:
 
 
 def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> None:
-    with pytest.raises(PlaceError, match="robot: only assessment, camera, perception can change hands"):
+    with pytest.raises(PlaceError, match="robot: only assessment, camera can change hands"):
         place_to_take("robot", run(tmp_path, "wallclock"))
     with pytest.raises(PlaceError, match="in wall-clock runs only"):
         place_to_take("camera", run(tmp_path))

@@ -162,7 +162,7 @@ def _ordinary(length: float) -> Anatomy:
     """The default anatomy of a body of this length [m]."""
     usual, scale = Skeleton(), length / 0.46
     across, along = usual.iliac_crest_m
-    skeleton = Skeleton(
+    skeleton = Skeleton.model_construct(  # a body that is no person's may be beyond a person's limits
         costal_arch_m=scale * usual.costal_arch_m,
         iliac_crest_m=(scale * across, scale * along),
         iliac_radius_m=scale * usual.iliac_radius_m,

@@ -1,5 +1,6 @@
 """A camera that shows a recording: it conforms, shows the recorded pixels at new stamps, and names what a recording lacks."""
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,19 @@ def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, s
     for heard, then in zip(shown[SMALL_IMAGE], seen[SMALL_IMAGE], strict=False):
         np.testing.assert_array_equal(heard.message.data, then.message.data)
         assert nanoseconds(heard.message.header.stamp) == heard.t
+
+
+def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(seen: dict[str, list[HeardMessage]], tmp_path: Path) -> None:
+    """It has the time of reception, which is another one for each message, and a tf_static of each sender."""
+    (pose,) = seen[POSE]
+    stranger = copy.deepcopy(pose.message)
+    stranger.transforms[0].child_frame_id = "gripper"
+    late = [heard._replace(t=heard.t + 120_000) for heard in seen[INFO]]
+    poses = [pose._replace(message=stranger), pose._replace(t=pose.t + 1, sequence=pose.sequence + 1)]
+    folder = record(tmp_path / "recording_mcap", {**seen, INFO: late, POSE: poses})
+    camera = ReplayedCamera(open_recording(folder))
+    assert [item.child_frame_id for item in camera.start()[POSE].transforms] == ["gripper", "camera_depth_optical_frame"]
+    assert camera.finish()["frames_recorded"] == FRAMES
 
 
 def test_a_recording_without_small_images_has_those_of_its_whole_ones(

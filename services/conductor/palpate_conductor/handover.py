@@ -1,6 +1,7 @@
 """Places that are kept: in a wall-clock run a service may be stopped and another process may take its place.
 
-Only roles without which nothing dangerous happens: what moves the arm, feels the tissue or watches over both ends the run.
+Only roles without which nothing dangerous happens, and whose work another process can go on with: what moves the arm, feels the
+tissue or watches over both ends the run, and a perception that has not seen the first look does not know the wall.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Final
 
-ROLES: Final = frozenset({"camera", "perception", "assessment"})
+ROLES: Final = frozenset({"camera", "assessment"})
 
 
 @dataclass

@@ -125,7 +125,8 @@ class Extrapolator:
         """Coordinates of the reference at `t`, shape (39,), with the gap as it has faded until `faded` [ns]."""
         since, longest = t - setpoint.stamp, self._max_age
         age = min(max(since, -longest), longest) * 1e-9
-        x: Array = np.array((1.0, age, age * age, exp((self._since - faded) * 1e-9 / SMOOTHING_S))).dot(self._terms)
+        fading = min(self._since - faded, 0) * 1e-9  # a clock that is set back makes no gap wider
+        x: Array = np.array((1.0, age, age * age, exp(fading / SMOOTHING_S))).dot(self._terms)
         if since > longest:  # the sender has fallen silent: brake smoothly
             x[_VELOCITIES] *= exp((longest - since) * 1e-9 / SMOOTHING_S)
             x[QDD] = 0.0

@@ -87,6 +87,17 @@ def test_steps_of_pose_and_wrench_fade_in() -> None:
         assert series[-1] == pytest.approx(end, rel=2e-3)
 
 
+def test_a_clock_that_is_set_back_makes_no_gap_wider() -> None:
+    """It would wind the springs up: 100 ms back made 60 N m of a gap of 2 um."""
+    guide = Extrapolator(10 * MS)
+    guide.accept(at(490 * MS), 500 * MS)
+    guide.at(500 * MS)
+    guide.accept(at(500 * MS, 2e-6), 501 * MS)
+    assert 0.0 <= guide.at(501 * MS).motion.p_WD[0] <= 2e-6
+    for back in (40, 100, 200):
+        assert 0.0 <= guide.at((502 - back) * MS).motion.p_WD[0] <= 2e-6
+
+
 def test_silent_sender_is_braked_smoothly() -> None:
     """Set-points stop: the motion goes on for the bridging time, brakes within 25 ms and stands."""
     guide = Extrapolator(10 * MS)

@@ -21,6 +21,8 @@ from palpate_models.frames import Array
 
 RATES_PER_MIN: Final = (4.0, 40.0)
 """Breaths a minute that are looked for."""
+LEAST_S: Final = 5.0
+"""What is remembered tells rate and amplitude when it is of so long at least."""
 MEMORY_S: Final = 30.0
 """So much of the past tells rate and amplitude."""
 RENEWAL_S: Final = 1.0
@@ -74,7 +76,8 @@ class BreathFilter:
             while self._times[0] < self._t_s - MEMORY_S:
                 del self._times[0], self._seen[0]
             self._renewed_s = self._t_s
-            self._learn()
+            if self._times[-1] - self._times[0] >= LEAST_S:  # else the wall was hidden for long: it breathes as it did before
+                self._learn()
 
     def forget(self, d: float) -> None:
         """Begins anew at a displacement [m]: what it was going to do is not known."""

@@ -123,6 +123,12 @@ class Pipeline:
             message = f"{100 * coverage:.0f} % of the region of interest seen, {100 * MIN_COVERAGE:.0f} % needed: {why}"
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
 
+        if (away := float(np.abs(shift).max())) > MARGIN_M:  # beyond what is cropped, fitted and judged for what is missing
+            message = (
+                f"the patient lies {1e3 * away:.0f} mm from where the first look saw him, at most {1e3 * MARGIN_M:.0f} mm can be"
+            )
+            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
+
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
         nodes = scan.targets + shift  # 5

@@ -144,9 +144,15 @@ class PerceptionService(Service):
         if burst.fusion is not None:
             for image in burst.waiting[: burst.wanted - burst.fusion.frames]:
                 burst.wrong = burst.wrong or _disagreement(image, burst.camera)
-                if not burst.wrong:
-                    burst.fusion.add(depth_in_metres(IMAGE, image))
-                    burst.stamps_s.append(nanoseconds(image.header.stamp) / NS)
+                if burst.wrong:
+                    continue
+                try:
+                    depth = depth_in_metres(IMAGE, image)
+                except ValueError as error:  # of another encoding, or too few bytes
+                    burst.wrong = str(error)
+                    continue
+                burst.fusion.add(depth)
+                burst.stamps_s.append(nanoseconds(image.header.stamp) / NS)
             burst.waiting.clear()
 
 

@@ -24,6 +24,23 @@ def followed(*settings: str, scenario: str = "healthy", seed: int = 3, seconds: 
     return run(load_scenario(scenario, ("exam.region_m=[0.1, 0.1]", *settings), seed), seconds)
 
 
+def test_after_a_long_gap_the_wall_breathes_as_before() -> None:
+    """A camera that was gone for longer than is remembered: one image tells neither rate nor amplitude."""
+    t = 0.1 * np.arange(400)
+    t[100:] += 40.0
+    d = 0.004 * (1 - np.cos(2 * np.pi * t / 4))
+    breath = BreathFilter(t[:100], d[:100])
+    told = []
+    for k in range(100, 160):
+        expected, sigma = breath.forward(t[k])
+        told.append((expected - d[k], sigma))
+        breath.update(d[k], 0.0003)
+        breath.remember(d[k])
+        assert breath.depth == pytest.approx(0.008, rel=0.1)
+    errors, sigmas = np.array(told[10:]).T
+    assert np.sqrt(np.mean((errors / sigmas) ** 2)) < 1.5
+
+
 def test_a_sine_is_forecast() -> None:
     t = 0.1 * np.arange(400)
     d = 0.004 * (1 - np.cos(2 * np.pi * t / 4))

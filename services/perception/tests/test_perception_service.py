@@ -51,10 +51,16 @@ def default_look() -> dict[str, Any]:
     return look(scenario())
 
 
-def look(case: Scenario, frames: int | None = None, links: Any = None, rises: tuple[float, ...] = (0.0,)) -> dict[str, Any]:
+def look(
+    case: Scenario,
+    frames: int | None = None,
+    links: Any = None,
+    rises: tuple[float, ...] = (0.0,),
+    perception: PerceptionService | None = None,
+) -> dict[str, Any]:
     """What perception publishes after a burst by the camera: topics to messages."""
     exam = plant_input(case)
-    camera, perception = CameraService(exam), PerceptionService(exam)
+    camera, perception = CameraService(exam), perception or PerceptionService(exam)
     wanted = frames or case.camera.frames
     seen = HandInbox().receive({"sim/link_poses": links} if links else {})
     heard = HandInbox().receive(camera.start())
@@ -297,6 +303,16 @@ def test_without_a_trigger_nothing_is_published() -> None:
     assert [perception.step(k * TICK, inbox.receive(frame)) for k in range(3)] == [{}, {}, {}]
 
 
+@pytest.mark.parametrize(("away", "targets"), [(0.025, True), (0.05, False)])
+def test_a_patient_who_moved_beyond_what_is_fitted_is_not_measured(away: float, targets: bool) -> None:
+    case = scenario()
+    perception = PerceptionService(plant_input(case))
+    perception._follower.shift = np.array((0.0, -away))
+    sent = look(case, perception=perception)["perception/targets"]
+    assert (len(sent.positions) > 0) == targets
+    assert ("the patient lies 50 mm from where the first look saw him" in sent.message) != targets
+
+
 def test_a_burst_without_frames_is_answered_in_words() -> None:
     perception, inbox = PerceptionService(exam_input(scenario())), HandInbox()
     inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 5)})
@@ -314,6 +330,19 @@ def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
     inbox.gone.add("camera")
     targets = perception.step(2 * TICK, inbox.receive({}))["perception/targets"]
     assert targets.message == "nothing seen: the camera's service is gone"
+
+
+def test_frames_that_cannot_be_read_are_answered_in_words() -> None:
+    case = scenario()
+    camera, perception = CameraService(plant_input(case)), create(case)
+    wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 1)}
+    inbox = HandInbox().receive(camera.start())
+    frame = whole(camera.step(TICK, HandInbox().receive(wake)))
+    frame["camera/depth/image_raw"].encoding = "mono8"
+    sent = [perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
+    sent += [perception.step(k * TICK, inbox.receive(frame if k == 2 else {})) for k in range(2, 15)]
+    (answer,) = [outbox for outbox in sent if outbox]
+    assert "mono8" in answer["perception/targets"].message
 
 
 def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message, decode
 from palpate_bus.messages.images import depth_in_metres
-from palpate_bus.messages.stamps import time_message
+from palpate_bus.messages.stamps import nanoseconds, time_message
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
@@ -34,16 +34,23 @@ class ReplayedCamera(Service):
     def __init__(self, recording: Recording) -> None:
         """Reads the frames, about 1 MB each. Raises RecordingError when the recording has no frame or no pose."""
         rules = contract()
-        by_topic: dict[str, dict[int, RecordedMessage]] = {topic: {} for topic in (IMAGE, INFO, POSE, SMALL_IMAGE, SMALL_INFO)}
-        recording.check(rules, by_topic)
-        for message in recording.messages(by_topic):
-            by_topic[message.topic][message.stamp] = message
+        by_topic: dict[str, dict[int, RecordedMessage]] = {topic: {} for topic in (IMAGE, INFO, SMALL_IMAGE, SMALL_INFO)}
+        poses: list[RecordedMessage] = []
+        self._types = {topic: rules.topics[topic].type for topic in (*by_topic, POSE)}
+        recording.check(rules, self._types)
+        for message in recording.messages(self._types):
+            if message.topic == POSE:
+                poses.append(message)
+            else:  # by the header: a recording of ROS has the time at which each was received
+                by_topic[message.topic][nanoseconds(self._message(message).header.stamp)] = message
+        recorded = {**by_topic, POSE: poses}
         for topic in (IMAGE, INFO, POSE):
-            if not by_topic[topic]:
+            if not recorded[topic]:
                 raise RecordingError(f"{recording.path}: has no message of {topic}; a camera can be replayed only from all of "
                                      f"{IMAGE}, {INFO}, {POSE}")  # fmt: skip
-        self._types = {topic: rules.topics[topic].type for topic in by_topic}
-        self._pose = self._message(next(iter(by_topic[POSE].values())))
+        self._pose = self._message(poses[0])
+        for message in poses[1:]:  # each sender of a system tells its own
+            self._pose.transforms.extend(self._message(message).transforms)
         self._frames = _pairs(by_topic[IMAGE], by_topic[INFO])
         if not self._frames:
             raise RecordingError(f"{recording.path}: no image has a camera_info of its stamp")
