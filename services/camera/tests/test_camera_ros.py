@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import MS, contract
 from palpate_bus.contract.conformance import violations
 from palpate_bus.messages import (
     CameraInfo,
@@ -22,7 +22,7 @@ from palpate_bus.messages import (
     TransformStamped,
     Vector3,
 )
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
@@ -101,6 +101,18 @@ def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
     assert set(service.step(300_000_000, inbox)) == small
     assert service.step(400_000_000, inbox) == {}, "no new image"
     assert service.finish() == {"bursts": 1, "frames": 2, "frames_rejected": 0, "frames_repeated": 0, "problem": ""}
+
+
+@pytest.mark.parametrize(("age_ms", "told_ms"), [(80, 920), (0, 1000), (5000, 1000), (-40, 1000)])
+def test_an_image_has_the_time_of_its_exposure_unless_its_clock_is_another(age_ms: int, told_ms: int) -> None:
+    """A camera's image is some 50 to 120 ms old when it comes, in which a wall that breathes moves by half a millimetre."""
+    port = Port()
+    image = ros_image()
+    now = nanoseconds(image.header.stamp) + age_ms * MS
+    service = RosCameraService(port, now=lambda: now)
+    port.waiting = [image]
+    (depth, info) = service.step(1000 * MS, HandInbox()).values()
+    assert nanoseconds(depth.header.stamp) == nanoseconds(info.header.stamp) == told_ms * MS
 
 
 def test_an_image_that_is_repeated_is_not_passed_on_as_new() -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from time import monotonic, sleep
+from collections.abc import Callable, Mapping
+from time import monotonic, sleep, time_ns
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,6 +26,8 @@ from palpate_models.scenario import RosCamera, Scenario
 
 POSE_WAIT_S = 20.0
 """How long the camera's pose is waited for before the run."""
+OLDEST_NS = 300_000_000
+"""An image that seems older than this has a stamp of another clock."""
 
 
 class CameraPort(ABC):
@@ -79,11 +81,21 @@ class RosCameraService(Service):
 
     role: ClassVar[str] = "camera"
 
-    def __init__(self, port: CameraPort, frame: str = FRAME, world: str = "world", wait_s: float = POSE_WAIT_S) -> None:
-        """Waits for the camera's pose. Raises CameraError naming the frames that are known when it does not come."""
-        self._port, self._frame = port, frame
+    def __init__(
+        self,
+        port: CameraPort,
+        frame: str = FRAME,
+        world: str = "world",
+        wait_s: float = POSE_WAIT_S,
+        now: Callable[[], int] = time_ns,
+    ) -> None:
+        """Waits for the camera's pose; `now` is ROS's clock [ns].
+
+        Raises CameraError naming the frames that are known when the pose does not come.
+        """
+        self._port, self._frame, self._now = port, frame, now
         self._X_WC = _await_pose(port, frame, world, wait_s)
-        self._wanted = 0
+        self._wanted = self._asked = 0
         self._stamp = 0
         """When the newest image was taken, by the driver's clock [ns]; 0: none, or the driver does not say."""
         self._facts = {"bursts": 0, "frames": 0, "frames_rejected": 0, "frames_repeated": 0}
@@ -100,7 +112,7 @@ class RosCameraService(Service):
         images, info = self._port.images(), self._port.info()
         triggers = list(inbox.new("planning/camera_trigger"))
         if triggers:
-            self._wanted = int(triggers[-1].frames)
+            self._wanted, self._asked = int(triggers[-1].frames), nanoseconds(triggers[-1].header.stamp)
             self._facts["bursts"] += len(triggers)
         if not images or info is None:
             return {}
@@ -117,12 +129,18 @@ class RosCameraService(Service):
             self._facts["frames_rejected"] += 1
             self._problem = str(error)
             return {}
-        outbox = messages.every_few(t, depth, pinhole)
-        if self._wanted and not triggers:
+        exposed = self._exposed(t, stamp)
+        outbox = messages.every_few(exposed, depth, pinhole)
+        if self._wanted and not triggers and exposed >= self._asked:
             self._wanted -= 1
             self._facts["frames"] += 1
-            outbox |= messages.whole(t, depth, pinhole)
+            outbox |= messages.whole(exposed, depth, pinhole)
         return outbox
+
+    def _exposed(self, t: int, stamp: int) -> int:
+        """When an image of ROS time `stamp` was exposed, in the time of the run, now `t` [ns]; `t` where that cannot be told."""
+        age = self._now() - stamp
+        return max(t - age, 0) if 0 <= age <= OLDEST_NS else t
 
     def finish(self) -> Mapping[str, Any]:
         """How much was passed on or repeated, and why something was not passed on."""
