@@ -193,15 +193,15 @@ def test_a_closed_session_keeps_no_shared_memory(tmp_path: Path) -> None:
     def mapped() -> int:
         return Path("/proc/self/maps").read_text(encoding="utf-8").count("/dev/shm/")
 
-    options = mesh(["a", "b"], tmp_path)
+    options, before = mesh(["a", "b"], tmp_path), mapped()
     with session(options["a"]) as a, session(options["b"]) as b:
         assert heard(a, b, bytes(200_000)) is not None
-        during = mapped()
+        assert mapped() > before
     del a, b
     end = time.monotonic() + 10
-    while mapped() >= during and time.monotonic() < end:
+    while mapped() > before and time.monotonic() < end:
         time.sleep(0.05)
-    assert mapped() < during
+    assert mapped() <= before, "what earlier tests left may be gone, too"
 
 
 POOLS_PROGRAM = """
