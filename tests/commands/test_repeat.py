@@ -102,7 +102,8 @@ def test_each_is_a_command_and_an_interrupted_one_is_the_end_of_all(
 
 WAITS = """
 import signal, sys, time
-signal.signal(signal.SIGTERM, signal.default_int_handler)
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, signal.default_int_handler)
 try:
     print("begun", flush=True)
     time.sleep(60)
@@ -112,7 +113,8 @@ except KeyboardInterrupt:
 ASKED = """
 import signal, sys
 from palpate.run.repeat import run_to_its_end
-signal.signal(signal.SIGTERM, signal.default_int_handler)
+for number in (signal.SIGINT, signal.SIGTERM):  # a shell ignores SIGINT for what runs in its background
+    signal.signal(number, signal.default_int_handler)
 left = run_to_its_end((sys.executable, "-c", sys.argv[1]))
 print(left.status, left.interrupted)
 """
