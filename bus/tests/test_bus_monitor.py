@@ -240,6 +240,16 @@ def test_the_next_run_on_the_same_bus_is_judged_by_itself() -> None:
     assert [kind for kind in bus.named if "silent" in kind] == ["joint_states silent"]
 
 
+def test_a_sender_that_comes_back_is_judged_again() -> None:
+    """A link that was lost for a moment takes all tokens with it."""
+    bus = Bus()
+    there = bus.entities
+    for bus.entities in (there, [], there):
+        bus.run(1500)
+    assert bus.named == {}
+    assert bus.monitor.time.progress == pytest.approx(0.5, abs=0.05)
+
+
 def test_diagnostics_say_it_to_ros_tools() -> None:
     bus = Bus()
     bus.run(1000)

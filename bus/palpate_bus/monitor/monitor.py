@@ -59,7 +59,7 @@ class Monitor:
         present = list(entities)
         before = self._nodes.keys()
         self._nodes = {entity.gid: entity.node for entity in present}
-        self._left |= before - self._nodes.keys()
+        self._left = (self._left | before) - self._nodes.keys()
         for streams in self._streams.values():
             if not streams.keys().isdisjoint(self._nodes):  # another run's: what an earlier one sent is past
                 for gid in self._left & streams.keys():

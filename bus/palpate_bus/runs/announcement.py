@@ -15,7 +15,6 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -73,7 +72,8 @@ class Announcement:
         """Writes the file of `run`. Raises OSError when the folder cannot be made or is another user's."""
         self.path = folder() / f"{run.pid}-{time.time_ns()}.json"
         draft = self.path.with_suffix(".new")
-        self._file = open(draft, "w", encoding="utf-8", opener=partial(os.open, mode=0o600))  # noqa: SIM115 - it is locked while the run is on
+        draft.touch(mode=0o600)
+        self._file = draft.open("w", encoding="utf-8")
         fcntl.flock(self._file, fcntl.LOCK_EX)
         json.dump(asdict(run), self._file, indent=2)
         self._file.flush()

@@ -124,9 +124,7 @@ class Pipeline:
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
 
         if (away := float(np.abs(shift).max())) > MARGIN_M:  # beyond what is cropped, fitted and judged for what is missing
-            message = (
-                f"the patient lies {1e3 * away:.0f} mm from where the first look saw him, at most {1e3 * MARGIN_M:.0f} mm can be"
-            )
+            message = f"the patient has moved by {1e3 * away:.0f} mm since the first look; at most {1e3 * MARGIN_M:.0f} mm can be"
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])

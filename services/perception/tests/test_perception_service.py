@@ -310,7 +310,7 @@ def test_a_patient_who_moved_beyond_what_is_fitted_is_not_measured(away: float, 
     perception._follower.shift = np.array((0.0, -away))
     sent = look(case, perception=perception)["perception/targets"]
     assert (len(sent.positions) > 0) == targets
-    assert ("the patient lies 50 mm from where the first look saw him" in sent.message) != targets
+    assert ("the patient has moved by 50 mm since the first look" in sent.message) != targets
 
 
 def test_a_burst_without_frames_is_answered_in_words() -> None:
