@@ -99,6 +99,18 @@ def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) 
     assert not (tmp_path / FILE).exists(), "half a drawing would be taken for the whole"
 
 
+def test_the_drawing_of_a_lone_file_goes_when_it_was_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, shown = record(tmp_path, 0.5), []
+
+    def look(drawing: Path, *_: object) -> None:
+        assert drawing.stat().st_size > 10_000
+        shown.append(drawing)
+
+    monkeypatch.setattr("palpate.live.viewing.view", look)
+    assert CliRunner().invoke(app, [str(path)]).exit_code == 0
+    assert not shown[0].parent.exists()
+
+
 def test_the_end_of_a_recording_is_known_once_it_is_complete(tmp_path: Path) -> None:
     path = record(tmp_path, 1.0)
     last = max(time for time, _, _ in replay.messages((path,)))

@@ -25,7 +25,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
     motion: Annotated[bool, typer.Option("--motion", help="It may move; most checks of the robot need this.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
     slack: Annotated[float, typer.Option(min=0, help="Seconds that transport and scheduler may add to a reaction.")] = 0.15,
-    wait: Annotated[float, typer.Option(help="Seconds to wait for it to join.")] = 60.0,
+    wait: Annotated[float, typer.Option(min=1, help="Seconds to wait for it to join.")] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     failures: Annotated[bool, typer.Option("--failures", help="Print only what failed.")] = False,
 ) -> None:

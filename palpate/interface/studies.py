@@ -13,7 +13,7 @@ import pandas as pd
 from palpate.interface.scenarios import paths
 from palpate.study.digest import RunRecord, Session
 from palpate.study.folder import add_session, conclude, usual_folder
-from palpate.study.manifest import Request, cases_of
+from palpate.study.manifest import Request, cases_of, command_of
 from palpate.study.runner import missing, opened, run_cases
 from palpate.study.spec import Split, StudyError, load_study, with_methods
 from palpate.study.summary import PAGE
@@ -106,9 +106,10 @@ def study(
     if split not in get_args(Split):
         raise StudyError(f"split = {split!r}: want one of {', '.join(get_args(Split))}")
     chosen = with_methods(load_study(str(source)), methods)
-    cases = cases_of(chosen, Request(split, number, as_settings(dict(paths(settings)))))
+    request = Request(split, number, as_settings(dict(paths(settings))))
+    cases = cases_of(chosen, request)
     folder = usual_folder(chosen.name, split) if out is None else Path(out)
-    manifest = opened(folder, chosen.name, cases)
+    manifest = opened(folder, chosen.name, cases, command_of(str(source), request, methods or ()))
     todo, begin, count = len(missing(folder, cases)), monotonic(), workers or cores()
     with threads(count) as hands:
         run_cases(folder, cases, hands, lambda _: None)

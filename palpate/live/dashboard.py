@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -62,7 +63,8 @@ def dashboard(  # noqa: PLR0913 - the options of a command
             run = named_runs(chosen, "or give a results folder, a .rrd or a .mcap file")[-1]
             watch(run, port, native, show, leave, console)
         else:
-            view(recording(Path(source), console), port, native, show, console)
+            with tempfile.TemporaryDirectory(prefix="palpate-dashboard-") as place:
+                view(recording(Path(source), Path(place), console), port, native, show, console)
     except (NoBus, NothingToShow, NoPicture, BusConfigError, ScenarioError, OSError, ValueError) as error:
         refuse(error)
     except KeyboardInterrupt:

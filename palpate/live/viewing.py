@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import tempfile
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -53,8 +52,8 @@ def watch(run: Run, port: int, native: bool, show: bool, leave: bool, console: C
             viewer.terminate()
 
 
-def recording(source: Path, console: Console) -> Path:
-    """The .rrd of a source; drawn from the MCAP recording when there is none. Raises NothingToShow."""
+def recording(source: Path, place: Path, console: Console) -> Path:
+    """The .rrd of a source; drawn from the MCAP recording when there is none, a lone file's in `place`. Raises NothingToShow."""
     if source.suffix == ".rrd" and source.is_file():
         return source
     if (source / FILE).is_file():
@@ -63,7 +62,7 @@ def recording(source: Path, console: Console) -> Path:
         scenario = source.parent.parent / "scenario.yaml"
         if not scenario.is_file():
             raise NothingToShow(f"{scenario} is not there: a recording is drawn with its run's scenario.yaml, two folders up")
-        target = Path(tempfile.mkdtemp(prefix="palpate-dashboard-")) / FILE
+        target = place / FILE
         drawn = DashboardService(load_scenario(str(scenario)), target, Live(), paced=False)
         with _drawing(console, (source,)) as tell:
             replay.replay((source,), drawn, tell)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter, process_time
@@ -101,11 +101,11 @@ def assess(service: Service, gathered: Collected) -> dict[str, Any]:
     """
     states = gathered.exam_states
     first, last = (nanoseconds(state.header.stamp) for state in (states[0], states[-1]))
-    inputs: tuple[tuple[int, dict[str, list[Message]]], ...] = (
+    inputs: tuple[tuple[int, dict[str, Sequence[Message]]], ...] = (
         (first, {"perception/surface": [gathered.surface]}),
         (last, {"exam/state": states}),
     )
-    latest: dict[str, list[Message]] = {}
+    latest: dict[str, Sequence[Message]] = {}
     service.start()
     for t, new in inputs:
         latest |= new
@@ -120,7 +120,7 @@ def assess(service: Service, gathered: Collected) -> dict[str, Any]:
 class _Given:
     """An inbox of messages by topic: those that are new, and those that came so far."""
 
-    def __init__(self, new: dict[str, list[Message]], latest: dict[str, list[Message]]) -> None:
+    def __init__(self, new: dict[str, Sequence[Message]], latest: dict[str, Sequence[Message]]) -> None:
         self._new, self._latest = new, latest
 
     def latest(self, topic: str) -> Message | None:

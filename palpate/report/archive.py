@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import json
 import zlib
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile, is_zipfile
@@ -17,6 +19,7 @@ from zipfile import BadZipFile, is_zipfile
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.report.evidence import columns_of, xyz
 from palpate.report.files import drafted
 from palpate.truth.pressed import Pressed
 from palpate.truth.touched import Touched
@@ -121,23 +124,18 @@ def write_evidence(
     path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None, run: str = ""
 ) -> None:
     """Writes what was collected of the run called `run`, complete or not, and what is known of its truth."""
-    states, contacts = c.exam_states, c.indentation
+    states = _columns(c.exam_states)
+    contacts = columns_of(((nanoseconds(m.header.stamp) / NS, m.depth, m.normal_force) for m in c.indentation), _CONTACT)
     events = _events(c)
-    known, uncertainty = _depth_known(c)
+    known, uncertainty = _depth_known(c, states)
     columns: dict[str, Any] = {
         "run": np.array(run),
-        "time": np.array([nanoseconds(s.header.stamp) / NS for s in states]),
-        "phase": np.array([s.phase for s in states], dtype=np.uint8),
-        **{name: np.array([getattr(s, field) for s in states], dtype=np.float32) for name, field in _FLOATS.items()},
-        **{name: np.array([getattr(s, name) for s in states], dtype=bool) for name in _FLAGS},
+        **{name: states[name] for name in ("time", "phase", *_FLAGS, "visited", "skipped")},
+        **{name: states[name].astype(np.float32) for name in ("depth", "setpoint", "force")},
         "depth_known": known.astype(np.float32),
         "uncertainty": uncertainty.astype(np.float32),
-        "visited": np.array([s.target_index for s in states], dtype=np.uint32),
-        "skipped": np.array([s.targets_skipped for s in states], dtype=np.uint32),
-        "target_count": np.array(max((s.target_count for s in states), default=0)),
-        "true_time": np.array([nanoseconds(m.header.stamp) / NS for m in contacts]),
-        "true_depth": np.array([m.depth for m in contacts], dtype=np.float32),
-        "true_force": np.array([m.normal_force for m in contacts], dtype=np.float32),
+        "target_count": states["target_count"].max(initial=0),
+        **contacts,
         "event_time": np.array([event.time_s for event in events]),
         "event_source": np.array([event.source for event in events], dtype=np.str_),
         "event_words": np.array([event.words for event in events], dtype=np.str_),
@@ -154,33 +152,50 @@ def write_evidence(
         np.savez_compressed(file, **columns)
 
 
-def _depth_known(c: Collected) -> tuple[Array, Array]:
+_FLAGS: Final = ("in_contact", "steady", "force_limited")
+_FIELDS: Final = {
+    "phase": ("phase", "u1"),
+    "depth": ("depth", "f8"),
+    "uncertainty": ("depth_uncertainty", "f8"),
+    "followed": ("wall_displacement", "f8"),
+    "setpoint": ("depth_setpoint", "f8"),
+    "force": ("normal_force", "f8"),
+    **{flag: (flag, "?") for flag in _FLAGS},
+    "visited": ("target_index", "u4"),
+    "skipped": ("targets_skipped", "u4"),
+    "target_count": ("target_count", "u4"),
+}
+"""Columns made of the exam states: field and type."""
+_told: Final = attrgetter(*(field for field, _ in _FIELDS.values()))
+_CONTACT: Final = np.dtype([("true_time", "f8"), ("true_depth", "f4"), ("true_force", "f4")])
+
+
+def _columns(exam_states: Iterable[Any]) -> dict[str, Array]:
+    """The columns `_FIELDS`, and beside them time [s], place and normal of the skin under the indenter in world, shape (n, 3)."""
+    kinds = [("time", "f8"), *((name, kind) for name, (_, kind) in _FIELDS.items()), ("place", "f8", 3), ("normal", "f8", 3)]
+    rows = ((nanoseconds(s.header.stamp) / NS, *_told(s), xyz(s.surface_point), xyz(s.surface_normal)) for s in exam_states)
+    return columns_of(rows, np.dtype(kinds))
+
+
+def _depth_known(c: Collected, states: dict[str, Array]) -> tuple[Array, Array]:
     """Depths of the exam states as they are known in the end, and their standard deviations [m], shape (n,) each."""
-    depth, told = _depth_seen(c), np.array([s.depth_uncertainty for s in c.exam_states])
+    depth, told = _depth_seen(c, states), states["uncertainty"]
     skin = None if c.surface is None or c.correction is None else skin_of(c.surface, c.correction, np.eye(4))
     if skin is None:
         return depth, told
-    time = np.array([nanoseconds(s.header.stamp) / NS for s in c.exam_states])
-    points, normals = ([getattr(s, name) for s in c.exam_states] for name in ("surface_point", "surface_normal"))
-    deeper, sigma = skin.deeper(time, *(np.array([(v.x, v.y, v.z) for v in vectors]) for vectors in (points, normals)))
+    deeper, sigma = skin.deeper(states["time"], states["place"], states["normal"])
     return depth + np.nan_to_num(deeper), np.where(np.isnan(sigma), told, sigma)
 
 
-def _depth_seen(c: Collected) -> Array:
+def _depth_seen(c: Collected, states: dict[str, Array]) -> Array:
     """Depths of the exam states by the breath that was seen [m], shape (n,)."""
-    told = np.array([(nanoseconds(s.header.stamp) / NS, s.depth, s.wall_displacement) for s in c.exam_states]).reshape(-1, 3)
-    time, depth, followed = told.T
+    time, depth, followed, places = (states[name] for name in ("time", "depth", "followed", "place"))
     motions = [m for m in c.motions if m.state in SEEN]
     if c.surface is None or not motions:
-        return np.asarray(depth)
+        return depth
     shares = BreathingShares(np.asarray(c.surface.vertices, dtype=float).reshape(-1, 3), np.asarray(c.surface.breathing))
-    places = np.array([(s.surface_point.x, s.surface_point.y, s.surface_point.z) for s in c.exam_states])
     exposed, displacement = np.array([(nanoseconds(m.header.stamp) / NS, m.displacement) for m in motions]).T
     return depth_seen(time, depth, followed, shares(places), (exposed, displacement))
-
-
-_FLOATS: Final = {"depth": "depth", "setpoint": "depth_setpoint", "force": "normal_force"}
-_FLAGS: Final = ("in_contact", "steady", "force_limited")
 
 
 def read_figures(folder: Path) -> dict[str, Any]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import hypot
-from typing import Any
+from operator import attrgetter
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from palpate_models.motion import BodyMotion
 from palpate_models.scenario import Scenario
 
 Mask = NDArray[np.bool_]
+xyz: Final = attrgetter("x", "y", "z")
+"""Of a point or vector of a message."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,12 @@ class ContactRecord:
         }
         places = (np.concatenate((getattr(self.touched, k), getattr(later.touched, k))) for k in ("believed", "true"))
         return ContactRecord(**both, touched=Touched(*places))
+
+
+def columns_of(rows: Iterable[tuple[Any, ...]], kinds: np.dtype[Any]) -> dict[str, NDArray[Any]]:
+    """An array for each field of `kinds`. The rows are never in memory all at once."""
+    table = np.fromiter(rows, kinds)
+    return {name: np.ascontiguousarray(table[name]) for name in kinds.names or ()}
 
 
 def points(message: Any, field: str = "vertices") -> Array:
@@ -152,26 +161,30 @@ def peak_force(message: Any) -> float:
 
 
 def steady_contact(
-    exam_states: list[Any], indentation: list[Any], X_WA: Array, motion: BodyMotion, registered_X_WA: Array
+    exam_states: Iterable[Any], indentation: Iterable[Any], X_WA: Array, motion: BodyMotion, registered_X_WA: Array
 ) -> ContactRecord:
     """Exam states that count, with the true contact at the same stamp.
 
     Poses of A in world: the true one at first, how the body moves from there, and the registered one.
     """
-    true = {nanoseconds(m.header.stamp): m for m in indentation}
-    pairs = [(s, true[t]) for s in exam_states if s.steady and (t := nanoseconds(s.header.stamp)) in true]
 
-    def places(messages: list[Any], pose: Array) -> Array:
-        p = np.array([(m.surface_point.x, m.surface_point.y, m.surface_point.z) for m in messages]).reshape(-1, 3)
-        return apply(inverse(pose), p)
+    def shared(m: Any) -> tuple[Any, ...]:
+        return nanoseconds(m.header.stamp), m.depth, xyz(m.surface_point)
 
-    truly = [m for _, m in pairs]
-    times = np.array([nanoseconds(m.header.stamp) / NS for m in truly])
+    told = columns_of(((*shared(s), s.depth_setpoint, s.normal_force, s.force_limited) for s in exam_states if s.steady), _STEADY)
+    true = columns_of(map(shared, indentation), _SHARED)
+    stamps, at, truly = np.intersect1d(told["stamp"], true["stamp"], return_indices=True)
+    believed = apply(inverse(registered_X_WA), told["place"][at])
+    touched = motion.on_body(stamps / NS, apply(inverse(X_WA), true["place"][truly]))
     return ContactRecord(
-        measured=np.array([s.depth for s, _ in pairs]),
-        true=np.array([m.depth for _, m in pairs]),
-        wanted=np.array([s.depth_setpoint for s, _ in pairs]),
-        force=np.array([s.normal_force for s, _ in pairs]),
-        touched=Touched(places([s for s, _ in pairs], registered_X_WA), motion.on_body(times, places(truly, X_WA))),
-        limited=np.array([s.force_limited for s, _ in pairs], dtype=bool),
+        measured=told["depth"][at],
+        true=true["depth"][truly],
+        wanted=told["wanted"][at],
+        force=told["force"][at],
+        touched=Touched(believed, touched),
+        limited=told["limited"][at],
     )
+
+
+_SHARED: Final = np.dtype([("stamp", "i8"), ("depth", "f8"), ("place", "f8", 3)])
+_STEADY: Final = np.dtype([*_SHARED.descr, ("wanted", "f8"), ("force", "f8"), ("limited", "?")])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,6 +140,6 @@ def _after(run: BrokenOff, earlier: Checkpoint | None) -> Checkpoint:
     return Checkpoint(columns(assessment.samples, run.recording.last / NS), left, surface, strokes)
 
 
-def _latest(exam_states: list[Any]) -> int:
+def _latest(exam_states: Iterable[Any]) -> int:
     """The latest target that was reached and felt; it is felt once more, since its stroke goes on from there."""
     return max((int(state.target_index) for state in exam_states if state.steady), default=0)

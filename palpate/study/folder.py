@@ -43,18 +43,20 @@ class ManifestRow(BaseModel):
 class Manifest(BaseModel):
     """manifest.json: all cases of a study, in its order."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     study: str
     split: str
     tier: str
     cases: list[ManifestRow]
+    command: str = ""
+    """That runs the study again; empty where there is none."""
 
 
-def manifest_of(study: str, cases: Sequence[Case]) -> Manifest:
+def manifest_of(study: str, cases: Sequence[Case], command: str = "") -> Manifest:
     """The manifest of these cases."""
     rows = [ManifestRow.model_validate(case.model_dump()) for case in cases]
-    return Manifest(study=study, split=cases[0].split, tier=cases[0].tier, cases=rows)
+    return Manifest(study=study, split=cases[0].split, tier=cases[0].tier, cases=rows, command=command)
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -103,15 +105,8 @@ def put_together(parts: Sequence[Path], folder: Path) -> None:
 
 def outcomes_of(folder: Path, manifest: Manifest) -> list[Outcome]:
     """The outcomes that there are, in the order of the manifest. Raises StudyError for a file that is none."""
-    found = []
-    for row in manifest.cases:
-        try:
-            outcome = read_outcome(folder, row.case_id)
-        except ValueError as error:
-            raise StudyError(f"{folder}: cases/{row.case_id}.json is no outcome of this version ({error}): remove it") from error
-        if outcome is not None:
-            found.append(outcome)
-    return found
+    found = (read_outcome(folder, row.case_id) for row in manifest.cases)
+    return [outcome for outcome in found if outcome is not None]
 
 
 def conclude(folder: Path, manifest: Manifest) -> tuple[RunRecord, list[Outcome]]:
@@ -123,5 +118,5 @@ def conclude(folder: Path, manifest: Manifest) -> tuple[RunRecord, list[Outcome]
     found = record(manifest.study, outcomes, sessions(folder))
     write_record(folder, found)
     write_real_time(folder, outcomes)
-    summarise(folder)
+    summarise(folder, manifest.command)
     return found, outcomes

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -66,6 +67,20 @@ class Request(NamedTuple):
     """Overrides `a.b=c` of every scenario, after all others."""
     secret: str | None = None
     """What the file of secret seeds holds: it takes the place of the study's salt in the split `test`."""
+
+
+def command_of(name: str, request: Request, methods: Sequence[str] = (), services: Sequence[str] = ()) -> str:
+    """The command that runs a study again, by its name or file. FILE stands for the file of secret seeds."""
+    options: dict[str, Sequence[str]] = {
+        "--split": [request.split],
+        "--number": [] if request.number is None else [str(request.number)],
+        "--method": methods,
+        "--service": services,
+        "--set": request.settings,
+        "--seeds-file": [] if request.secret is None else ["FILE"],
+    }
+    words = [word for option, values in options.items() for value in values for word in (option, value)]
+    return shlex.join(["palpate", "study", name, *words])
 
 
 def patient_seeds(study: str, population: str, split: Split, count: int, salt: str) -> list[int]:

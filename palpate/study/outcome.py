@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from palpate.report.files import write_text
 from palpate.report.rows import Report
 from palpate.study.manifest import Case
+from palpate.study.spec import StudyError
 
 ATTEMPTS: Final = 3
 """A case that fails so often is reported as failed."""
@@ -59,9 +60,11 @@ def write_outcome(folder: Path, outcome: Outcome) -> None:
 
 
 def read_outcome(folder: Path, case_id: str) -> Outcome | None:
-    """The outcome of a case; None when it has none yet. Raises ValueError for a file that is none."""
+    """The outcome of a case; None when it has none yet. Raises StudyError for a file that is none."""
+    path = case_file(folder, case_id)
     try:
-        text = case_file(folder, case_id).read_text(encoding="utf-8")
+        return Outcome.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
-    return Outcome.model_validate_json(text)
+    except (OSError, ValueError) as error:
+        raise StudyError(f"{path} is no outcome of this version ({error}): remove it, and its case is run again") from error

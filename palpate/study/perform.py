@@ -18,7 +18,7 @@ from palpate.command_line import EXIT_FAILED, fail, refuse
 from palpate.run.roles import settings_of
 from palpate.study.digest import RunRecord, Session
 from palpate.study.folder import Manifest, add_session, conclude, usual_folder
-from palpate.study.manifest import Case, Request, cases_of, secret_of
+from palpate.study.manifest import Case, Request, cases_of, command_of, secret_of
 from palpate.study.outcome import Outcome
 from palpate.study.runner import StudyStopped, failures, missing, opened, run_cases
 from palpate.study.shards import Shard, merge
@@ -73,7 +73,8 @@ def run_study(order: StudyOrder) -> None:
         part = Shard.parse(order.shard) if order.shard else None
         cases = cases_of(study, request)
         folder = order.out or usual_folder(study.name, order.split)
-        manifest = opened(folder, study.name, cases, order.keep)
+        command = command_of(order.name, request, order.methods or (), order.services or ())
+        manifest = opened(folder, study.name, cases, command, order.keep)
     except (StudyError, ChoiceError, OSError) as error:
         refuse(error)
     own = part.part(cases) if part else cases

@@ -55,12 +55,12 @@ def of_other_code(folder: Path, cases: Iterable[Case]) -> list[Case]:
     return [case for case, outcome in found if outcome is not None and outcome.code not in ("", code_digest())]
 
 
-def opened(folder: Path, study: str, cases: Sequence[Case], keep: bool = False) -> Manifest:
-    """Makes the folder of a study of these cases, or goes on in it. Returns its manifest.
+def opened(folder: Path, study: str, cases: Sequence[Case], command: str, keep: bool = False) -> Manifest:
+    """Makes the folder of a study of these cases, which `command` runs again, or goes on in it. Returns its manifest.
 
     `keep`: cases that other code has made count. Raises StudyError for them otherwise, and for a folder of another study.
     """
-    manifest = manifest_of(study, cases)
+    manifest = manifest_of(study, cases, command)
     open_folder(folder, manifest)
     if not keep and (old := of_other_code(folder, cases)):
         raise StudyError(

@@ -39,13 +39,11 @@ def merge(parts: Sequence[Path], folder: Path) -> Manifest:
 
     Raises StudyError when they are not of one study, or a case has no outcome in any of them.
     """
-    manifests = {part: read_manifest(part) for part in parts}
-    if empty := [part for part, manifest in manifests.items() if manifest is None]:
-        raise StudyError(f"{empty[0]} is no folder of a study: it has no manifest.json")
-    manifest = manifests[parts[0]]
-    assert manifest is not None
-    if other := [part for part in parts if manifests[part] != manifest]:
-        raise StudyError(f"{other[0]} holds another study, split or number of patients than {parts[0]}")
+    manifests = [_manifest(part) for part in parts]
+    manifest = manifests[0]
+    for part, other in zip(parts, manifests, strict=True):
+        if (other.study, other.cases) != (manifest.study, manifest.cases):
+            raise StudyError(f"{part} holds another study, split or number of patients than {parts[0]}")
     open_folder(folder, manifest)
     (folder / "cases").mkdir(exist_ok=True)
     for part in parts:
@@ -57,4 +55,11 @@ def merge(parts: Sequence[Path], folder: Path) -> Manifest:
         raise StudyError(
             f"{len(absent)} of {len(manifest.cases)} cases are in no part, {absent[0]} the first: run what is missing"
         )
+    return manifest
+
+
+def _manifest(part: Path) -> Manifest:
+    manifest = read_manifest(part)
+    if manifest is None:
+        raise StudyError(f"{part} is no folder of a study: it has no manifest.json")
     return manifest

@@ -1,8 +1,7 @@
-"""study.json and study.html of a study, from its three tables alone."""
+"""study.json and study.html of a study, from its three tables and the command that made them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +13,6 @@ from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.report.files import write_text
 from palpate.study import human_line
 from palpate.study.page import render
-from palpate.study.spec import load_study, study_names
 from palpate.study.statistics.analysis import Analysis, analyse
 from palpate.study.statistics.calibration import CalibrationRow
 from palpate.study.statistics.comparison import Comparison, compare
@@ -108,12 +106,12 @@ class Analysed:
     analyses: tuple[Analysis, ...]
 
 
-def summarise(folder: Path, folds: int = FOLDS) -> None:
+def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
     """Reads cases.parquet, findings.parquet and lumps.parquet of `folder`; writes study.json and study.html beside them.
 
-    Intervals are of `folds` resamplings. Raises TablesError.
+    `command` runs the study again. Intervals are of `folds` resamplings. Raises TablesError.
     """
-    analysed = analysed_tables(read_tables(folder, folds))
+    analysed = analysed_tables(read_tables(folder, folds), command)
     write_text(folder / JSON, analysed.summary.model_dump_json(indent=1) + "\n")
     write_text(folder / PAGE, render(analysed.summary.model_dump(), analysed.analyses, analysed.summary.comparisons))
 
@@ -129,7 +127,7 @@ def read_summary(path: Path) -> StudySummary:
         raise TablesError(f"{path} is no study.json of this version: {'; '.join(wrong)}") from error
 
 
-def analysed_tables(tables: Tables) -> Analysed:
+def analysed_tables(tables: Tables, command: str) -> Analysed:
     """All statistics of a study."""
     analyses = tuple(analyse(variant, tables.bootstrap) for variant in tables.variants)
     reference, *others = tables.variants
@@ -137,7 +135,7 @@ def analysed_tables(tables: Tables) -> Analysed:
         study=tables.study,
         splits=tables.splits,
         version=version("palpate"),
-        command=command_of(tables.study, tables.splits, _patients(tables)),
+        command=command,
         patients=_patients(tables),
         reference=reference.name,
         methods={analysis.name: _method(analysis) for analysis in analyses},
@@ -153,17 +151,6 @@ def analysed_tables(tables: Tables) -> Analysed:
 def _patients(tables: Tables) -> dict[str, int]:
     """How many patients there are, by population."""
     return {str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()}
-
-
-def command_of(study: str, splits: Sequence[str], patients: Mapping[str, int]) -> str:
-    """The words that run the study again, with the number of patients where it is not the study's own."""
-    words = ["palpate study", study, *(f"--split {split}" for split in splits)]
-    counts = set(patients.values())
-    if study in study_names() and len(splits) == 1 and len(counts) == 1:
-        own = {name: getattr(row.number, splits[0]) for name, row in load_study(study).populations.items()}
-        if own != patients:
-            words.append(f"--number {counts.pop()}")
-    return " ".join(words)
 
 
 def _method(a: Analysis) -> MethodRow:

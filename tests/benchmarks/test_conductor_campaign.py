@@ -23,7 +23,7 @@ def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
 def in_phase(phase: int, message: str = "") -> RunProgress:
     messages = collected()
     last = messages.exam_states[-1]
-    messages.exam_states.append(ExamState(**{**vars(last), "phase": phase, "message": message}))
+    messages.exam_states = [*messages.exam_states, ExamState(**{**vars(last), "phase": phase, "message": message})]
     return RunProgress(0, 1.0, messages)
 
 

@@ -96,7 +96,7 @@ def test_the_override_for_hardware_starts_no_simulation() -> None:
     roles = workers(scenario)
     assert set(WORKERS) - set(roles) == {"tissue"}
     assert document["services"]["tissue"]["profiles"] == ["simulated"]
-    processes = read_processes(compose_file(), (*roles, *OBSERVERS), (file,))
+    processes = read_processes(compose_file(), (*roles, "search", *OBSERVERS), (file,))
     assert (scenario.services.robot, scenario.services.camera) == ("lbr", "ros")
     assert {process.command for process in processes.values()} == {("python", "-m", f"palpate_{role}") for role in processes}
     assert {process.environment["PALPATE_RUNTIME"] for process in processes.values()} == {"wallclock"}

@@ -8,7 +8,7 @@ import pytest
 from toy_study import TOY, study
 
 from palpate.study.folder import manifest_of, open_folder
-from palpate.study.manifest import Request, cases_of, patient_seeds, secret_of
+from palpate.study.manifest import Request, cases_of, command_of, patient_seeds, secret_of
 from palpate.study.spec import StudyError
 
 
@@ -43,6 +43,15 @@ def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path, 
         settings = {"exam.pattern": "search"} if field == "search.policy" else {}
         found.append(cases_of(study(methods={"m": {"settings": {**settings, field: str(path)}}}))[0].case_id)
     assert found[0] == found[1] != found[2]
+
+
+def test_the_command_says_all_that_was_asked_for() -> None:
+    request = Request("tune", 8, ("search.policy=my own.py", "errors=poor"), "secret")
+    words = "--set 'search.policy=my own.py' --set errors=poor --seeds-file FILE"
+    assert command_of("mine.yaml", request, ["a"], ["assessment=b.py"]) == (
+        f"palpate study mine.yaml --split tune --number 8 --method a --service assessment=b.py {words}"
+    )
+    assert command_of("release", Request()) == "palpate study release --split test"
 
 
 def test_patients_are_the_same_for_all_methods_and_errors() -> None:

@@ -102,14 +102,14 @@ def test_the_digest_is_that_of_its_parts_put_together(folder: Path, tmp_path: Pa
     for index, part in enumerate(parts, 1):
         own = Shard(index, 2).part(CASES)
         for case in own:  # what another machine has done
-            open_folder(part, manifest_of("toy", CASES))
+            open_folder(part, manifest_of("toy", CASES, f"palpate study {part}/toy.yaml"))
             case_file(part, case.case_id).parent.mkdir(exist_ok=True)
             case_file(part, case.case_id).write_bytes(case_file(folder, case.case_id).read_bytes())
         add_session(part, Session(workers=index, cases=len(own), elapsed_s=60.0))
     (parts[0] / FAILURES).mkdir()
     (parts[0] / FAILURES / f"{CASES[0].case_id}.json").write_text('["killed"]', encoding="utf-8")
     for _again in range(2):
-        assert merge(parts, tmp_path / "whole") == manifest_of("toy", CASES)
+        assert merge(parts, tmp_path / "whole") == manifest_of("toy", CASES, f"palpate study {parts[0]}/toy.yaml")
         assert [session.workers for session in sessions(tmp_path / "whole")] == [1, 2]
     assert failures(tmp_path / "whole", CASES[0]) == ["killed"]
     assert digest_of(tmp_path / "whole") == digest_of(folder)
@@ -165,7 +165,7 @@ def test_a_study_goes_on_after_its_command_was_killed(folder: Path, tmp_path: Pa
     subprocess.run(words, check=True)
     assert done.items() <= {path.name: path.stat().st_mtime_ns for path in (out / "cases").glob("*.json")}.items()
     assert digest_of(out) == digest_of(folder) == json.loads((out / "run.json").read_text())["digest"]
-    assert (out / "study.html").is_file()
+    assert f"palpate study {tmp_path / 'toy.yaml'} --split test" in (out / "study.html").read_text()
 
 
 def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path) -> None:
@@ -251,6 +251,9 @@ def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
     assert of_other_code(folder, CASES) == []
     path.write_text(outcome.model_copy(update={"code": "0" * 64}).model_dump_json())
     assert of_other_code(tmp_path, CASES) == [CASES[0]]
+    path.write_text("{}")
+    with pytest.raises(StudyError, match=f"{path} is no outcome of this version"):
+        of_other_code(tmp_path, CASES)
 
 
 def _case_process() -> psutil.Process | None:

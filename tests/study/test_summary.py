@@ -12,11 +12,11 @@ import synthetic
 
 from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.study.leaderboard import write_leaderboard
-from palpate.study.spec import load_study
 from palpate.study.statistics.reading import TablesError
-from palpate.study.summary import command_of, read_summary, summarise
+from palpate.study.summary import read_summary, summarise
 
 FOLDS = 100
+COMMAND = "palpate study toy --split test"
 
 
 class Outside(HTMLParser):
@@ -70,7 +70,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cases[-1] |= {"status": "failed", "completed": False, "score": np.nan}
     for name, frame in zip(("cases", "findings", "lumps"), synthetic.frames(cases, findings, lumps), strict=True):
         frame.to_parquet(folder / f"{name}.parquet")
-    summarise(folder, FOLDS)
+    summarise(folder, COMMAND, FOLDS)
     return folder
 
 
@@ -113,7 +113,7 @@ def test_the_human_line_is_in_every_plot_of_detection(study: Path) -> None:
 
 def test_the_same_tables_give_the_same_bytes(study: Path) -> None:
     before = [(study / name).read_bytes() for name in ("study.json", "study.html")]
-    summarise(study, FOLDS)
+    summarise(study, COMMAND, FOLDS)
     assert [(study / name).read_bytes() for name in ("study.json", "study.html")] == before
 
 
@@ -127,14 +127,14 @@ def test_the_leaderboard_has_a_row_a_method(study: Path, tmp_path: Path) -> None
     assert auc is not None
     row = next(row for row in rows if row[0] == "| palpate")
     assert row[2].startswith(f"{auc.value:.3f} ({auc.low:.3f} to {auc.high:.3f}; n = {auc.n}")
-    assert summary.command in page.read_text(encoding="utf-8")
+    assert COMMAND in page.read_text(encoding="utf-8")
 
 
 def test_a_study_of_healthy_people_alone_has_a_page(tmp_path: Path) -> None:
     frames = synthetic.frames([synthetic.case(i, "healthy") for i in range(3)], [], [])
     for name, frame in zip(("cases", "findings", "lumps"), frames, strict=True):
         frame.to_parquet(tmp_path / f"{name}.parquet")
-    summarise(tmp_path)
+    summarise(tmp_path, COMMAND)
     row = read_summary(tmp_path / "study.json").methods["palpate"]
     assert row.auc is None
     assert row.rates.specificity.value == 1.0
@@ -147,7 +147,7 @@ def test_what_comes_of_an_assumed_loop_says_so_and_is_not_on_the_leaderboard(tmp
     )
     for name, frame in zip(("cases", "findings", "lumps"), frames, strict=True):
         frame.to_parquet(tmp_path / f"{name}.parquet")
-    summarise(tmp_path)
+    summarise(tmp_path, COMMAND)
     assert ("Not to be quoted" in (tmp_path / "study.html").read_text(encoding="utf-8")) == (behind < LEAST_EXAMINATIONS)
     if behind >= LEAST_EXAMINATIONS:
         write_leaderboard([tmp_path / "study.json"], tmp_path / "leaderboard.md")
@@ -161,10 +161,3 @@ def test_a_json_of_another_kind_is_refused(tmp_path: Path) -> None:
     path.write_text("{}", encoding="utf-8")
     with pytest.raises(TablesError, match=r"study\.json.*methods"):
         write_leaderboard([path], tmp_path / "leaderboard.md")
-
-
-@pytest.mark.parametrize(("each", "words"), [(None, ""), (8, " --number 8")])
-def test_the_command_says_how_many_patients_where_they_are_not_the_studys_own(each: int | None, words: str) -> None:
-    own = {name: population.number.test for name, population in load_study("release").populations.items()}
-    patients = own if each is None else dict.fromkeys(own, each)
-    assert command_of("release", ("test",), patients) == f"palpate study release --split test{words}"

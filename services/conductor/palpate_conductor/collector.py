@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from palpate_bus.contract import MS
-from palpate_bus.messages import Clock, DiagnosticArray
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import Clock, DiagnosticArray, codec
 from palpate_bus.messages.stamps import NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_conductor.tree import FrameTree
@@ -18,13 +18,41 @@ TREE_PERIOD = 50 * MS
 """Simulated time between two messages on `tf`."""
 
 
+class KeptMessages(Sequence[Any]):
+    """All messages of a topic, as bytes: decoded, a state of the examination takes ten times as much memory."""
+
+    def __init__(self, topic: str) -> None:
+        kind = contract().topics[topic].type
+        self._encode, self._decode = codec.encoder(kind), codec.decoder(kind)
+        self._kept: list[bytes] = []
+        self._newest: Any | None = None
+
+    def extend(self, messages: Iterable[Any]) -> None:
+        """Keeps further messages."""
+        for message in messages:
+            self._kept.append(self._encode(message))
+            self._newest = message
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[Any]:
+        return map(self._decode, self._kept)
+
+    def __getitem__(self, at: Any) -> Any:
+        if at == -1 and self._kept:  # asked for at every tick
+            return self._newest
+        kept = self._kept[at]
+        return self._decode(kept) if isinstance(kept, bytes) else [*map(self._decode, kept)]
+
+
 @dataclass
 class Collected:
     """Messages of a run, oldest first, or the newest where only that counts."""
 
-    exam_states: list[Any] = field(default_factory=list)
-    indentation: list[Any] = field(default_factory=list)
-    motions: list[Any] = field(default_factory=list)
+    exam_states: Sequence[Any] = ()
+    indentation: Sequence[Any] = ()
+    motions: Sequence[Any] = ()
     """How perception saw the wall move."""
     exam_time: int = -1
     """Simulated time [ns] of the newest exam state, -1 before the first: by its number: no clock can spoil that."""
@@ -59,7 +87,10 @@ class Collector(Service):
 
     def __init__(self, diagnose: Callable[[], Sequence[Any]] | None = None, tree: FrameTree | None = None) -> None:
         """`diagnose` gives the statuses for `diagnostics`; `tree` makes `tf` of the measured joints."""
-        self.collected = Collected()
+        self._exam_states, self._indentation, self._motions = map(
+            KeptMessages, ("exam/state", "truth/indentation", "perception/motion")
+        )
+        self.collected = Collected(self._exam_states, self._indentation, self._motions)
         self.diagnose = diagnose
         self._tree = tree
         self._felt = False
@@ -70,11 +101,11 @@ class Collector(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Takes everything new and publishes the clock."""
         c = self.collected
-        c.exam_states.extend(inbox.new("exam/state"))
+        self._exam_states.extend(inbox.new("exam/state"))
         seen = inbox.stamp("exam/state")
         c.exam_time = -1 if seen is None else seen
-        c.indentation.extend(inbox.new("truth/indentation"))
-        c.motions.extend(inbox.new("perception/motion"))
+        self._indentation.extend(inbox.new("truth/indentation"))
+        self._motions.extend(inbox.new("perception/motion"))
         samples = inbox.new("assessment/samples")
         c.samples.extend(samples)
         self._felt = self._felt or any(sample.header.stamp.sec >= 0 for sample in samples)

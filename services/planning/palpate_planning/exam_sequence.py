@@ -110,6 +110,8 @@ class ExamSequence:
         self._wanted: frozenset[int] | None = None
         """The targets that were left then; None: all are wanted."""
         self._skipped: dict[int, str] = {}
+        self._left = ""
+        """Why the rest could not be planned after the patient moved or a plan was left; empty when it could."""
         self._trigger = False
         self._path: Array | None = None
         self._touched: TouchedSkin | None = None
@@ -213,6 +215,8 @@ class ExamSequence:
     def _give_up(self, now: Observation, why: str) -> None:
         """Ends an examination that cannot be planned; what was felt before, if anything was, is assessed all the same."""
         if self._moves or self._replans:
+            self._left = why
+            self._skipped |= {i: f"{self._skipped[i]}: {why}" for i in self._wanted or () if i in self._skipped}
             self._correct()
             self._course.go_home(now, "")
         else:
@@ -359,7 +363,8 @@ class ExamSequence:
     def _assess(self, now: Observation) -> Setpoint | None:
         if now.findings_final:
             skipped = f", {len(self._skipped)} of {self.status.target_count} targets skipped" if self._skipped else ""
-            self._course.enter(Phase.DONE, now.t, f"examination complete{skipped}")
+            left = f"; the rest was left: {self._left}" if self._left else ""
+            self._course.enter(Phase.DONE, now.t, f"examination complete{skipped}{left}")
         elif now.t - self._course.since > ASSESS_PATIENCE:
             self._course.abort(now, f"no final findings after {ASSESS_PATIENCE / SECOND:.0f} s")
         return None
