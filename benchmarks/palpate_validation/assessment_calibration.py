@@ -91,7 +91,7 @@ def weigh(seed: int) -> WeighedPatient:
     patient = scenario(seed)
     gathered = examined(patient)
     known = truth_of_run(patient, gathered).felt
-    gathered.exam_states.pop()  # that asks for findings
+    gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
     service, calibration = AssessmentService(exam_input(patient)), learned()
     assess(service, gathered)
     observations = observe(service.samples, calibration)

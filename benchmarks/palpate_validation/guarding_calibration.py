@@ -74,7 +74,7 @@ def weigh(case: Case) -> list[Weighed]:
     scenario = Scenario.model_validate(case.scenario)
     gathered = examined(scenario)
     known = truth_of_run(scenario, gathered).felt
-    gathered.exam_states.pop()  # that asks for findings
+    gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
     service = AssessmentService(exam_input(scenario))
     assess(service, gathered)
     calibration = learned()
