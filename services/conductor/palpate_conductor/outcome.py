@@ -25,7 +25,7 @@ class Patience:
     """Without a finished tick before it says who blocks."""
     hard: float = 120.0
     """Without a finished tick before it ends the run."""
-    frozen: float = 3.0
+    frozen: float = 2.5
     """How long somebody may have stopped a process before its service counts as lost ..."""
     asleep: float = 15.0
     """... and of one that sleeps and uses no processor time: longer than zenoh lets a sender wait for a reader that is gone."""
