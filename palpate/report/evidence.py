@@ -163,7 +163,7 @@ def peak_force(message: Any) -> float:
 def steady_contact(
     exam_states: Iterable[Any], indentation: Iterable[Any], X_WA: Array, motion: BodyMotion, registered_X_WA: Array
 ) -> ContactRecord:
-    """Exam states that count, with the true contact at the same stamp.
+    """Exam states that count, with the true contact at the same stamp, in order of time; of messages with one stamp the first.
 
     Poses of A in world: the true one at first, how the body moves from there, and the registered one.
     """
