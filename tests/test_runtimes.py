@@ -207,6 +207,19 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
     assert "| robot/status | ERROR |" in str(drawn["/text/services"][-1])
 
 
+def test_the_first_diagnostics_miss_no_service_that_came_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("palpate_conductor.contract_watch.POLL_S", 3600.0)
+    first: list[DiagnosticStatus] = []
+
+    def keep(running: Running) -> None:
+        first.extend(running.conductor.diagnose() if not first else ())
+
+    assert run_toys(keep).failure is None
+    topics = {f"palpate/topic/{topic.name}" for topic in contract().topics.values() if topic.producer in ROLES}
+    assert topics
+    assert not [status.name for status in first if status.name in topics and status.level == DiagnosticStatus.STALE]
+
+
 def test_a_service_that_never_comes_is_named() -> None:
     def leave() -> Mapping[str, str]:
         return {}

@@ -80,7 +80,7 @@ class Conductor:
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = RunOutcome()
         self._contract = ContractWatch(session, rules, domain, timing.wallclock and timing.rate == 1.0)
-        collector.diagnose = self._diagnose
+        collector.diagnose = self.diagnose
         self.grants = Grants(lambda tick, last: self._say(RunControl.GRANT, tick, last), timing)
         self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace)
         self._started_at = 0.0
@@ -127,7 +127,7 @@ class Conductor:
             if sentence not in self.outcome.trouble:
                 self._tell(sentence)
 
-    def _diagnose(self) -> list[Any]:
+    def diagnose(self) -> list[Any]:
         """Services, then topics, for `diagnostics`."""
         services = service_statuses(self.watchdog.progress, self.outcome.lost, self._patience.soft, self._contract.of)
         return [*services, *self._contract.statuses()]
@@ -216,6 +216,7 @@ class Conductor:
                 raise RunFailed(
                     f"not ready after {patience:.0f} s: " + (f"no answer from {', '.join(silent)}. " if silent else "") + deaf
                 )
+        self._contract.take_in()  # all are there: the first diagnostics shall not miss who came last
 
     def _absent(self, name: str) -> bool:
         """Whether it is a topic whose producer has no part in this run."""

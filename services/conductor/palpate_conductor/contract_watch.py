@@ -45,14 +45,18 @@ class ContractWatch:
         now = monotonic()
         if now - self._polled < POLL_S:
             return
-        self._polled = now
-        self._live.poll()
+        self.take_in()
         if not self._looking and now - self._round >= ROUND_S - LOOK_S:
             self._looking, self._round = True, now
             self._live.listen([*self._slow, next(self._turns)])
         elif self._looking and now - self._round >= LOOK_S:
             self._looking, self._round = False, now
             self._live.listen(self._slow)
+
+    def take_in(self) -> None:
+        """Takes in what came by now."""
+        self._polled = monotonic()
+        self._live.poll()
 
     def statuses(self) -> list[Any]:
         """`diagnostic_msgs/DiagnosticStatus` of every topic."""
