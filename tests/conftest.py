@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import threading
@@ -14,6 +15,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 from examination import GATE, Finished, palpate_run
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores Ctrl-C: so would what a test starts
 
 LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_cli.py")
 """Files whose tests take long: they begin early, so that no worker is left with them at the end."""

@@ -20,12 +20,7 @@ LEAVES_S = 2.0
 
 
 def start(out: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "palpate", "run", "-o", str(out)],
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - a shell ignores it in the background
-    )
+    return subprocess.Popen([sys.executable, "-m", "palpate", "run", "-o", str(out)], stderr=subprocess.PIPE, text=True)
 
 
 def test_it_ends_soon_and_leaves_neither_processes_nor_a_folder(tmp_path: Path) -> None:
