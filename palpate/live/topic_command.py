@@ -11,7 +11,7 @@ from palpate.live.options import AsJson, ChosenBus, ChosenRun, Connect, Domain
 app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
 
 Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
-Seconds = Annotated[float | None, typer.Option("--seconds", help="Stop after this long; by default Ctrl-C ends it.")]
+Seconds = Annotated[float | None, typer.Option("--seconds", min=0, help="Stop after this long; by default Ctrl-C ends it.")]
 
 
 @app.command("list")

@@ -60,12 +60,12 @@ def opened(folder: Path, study: str, cases: Sequence[Case], command: str, keep: 
 
     `keep`: cases that other code has made count. Raises StudyError for them otherwise, and for a folder of another study.
     """
-    manifest = manifest_of(study, cases, command)
-    open_folder(folder, manifest)
     if not keep and (old := of_other_code(folder, cases)):
         raise StudyError(
             f"{folder}: {len(old)} of its cases were made by other code: give another folder with -o, or --keep them"
         )
+    manifest = manifest_of(study, cases, command)
+    open_folder(folder, manifest)
     return manifest
 
 

@@ -25,10 +25,10 @@ from toy_study import TOY, study
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import FindingScore
 from palpate.study.digest import Session, digest
-from palpate.study.folder import FAILURES, add_session, manifest_of, open_folder, outcomes_of, sessions
+from palpate.study.folder import FAILURES, add_session, manifest_of, open_folder, outcomes_of, read_manifest, sessions
 from palpate.study.manifest import Case, cases_of
 from palpate.study.outcome import ATTEMPTS, case_file, read_outcome
-from palpate.study.runner import StudyStopped, failures, missing, of_other_code, run_cases
+from palpate.study.runner import StudyStopped, failures, missing, of_other_code, opened, run_cases
 from palpate.study.shards import Shard, merge
 from palpate.study.spec import StudyError
 from palpate.study.tables import write_tables
@@ -251,6 +251,9 @@ def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
     assert of_other_code(folder, CASES) == []
     path.write_text(outcome.model_copy(update={"code": "0" * 64}).model_dump_json())
     assert of_other_code(tmp_path, CASES) == [CASES[0]]
+    with pytest.raises(StudyError, match="1 of its cases were made by other code"):
+        opened(tmp_path, "toy", CASES, "palpate study toy.yaml")
+    assert read_manifest(tmp_path) == manifest_of("toy", CASES), "what was refused leaves its command there"
     path.write_text("{}")
     with pytest.raises(StudyError, match=f"{path} is no outcome of this version"):
         of_other_code(tmp_path, CASES)
