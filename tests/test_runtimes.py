@@ -137,8 +137,11 @@ def test_a_frozen_service_ends_the_run_and_is_blamed() -> None:
     def freeze(running: Running) -> None:
         if at(running, 0.3, done):
             running.processes["tissue"].send_signal(signal.SIGSTOP)
+        told.extend(sentence for sentence in running.conductor.outcome.trouble if sentence not in told)
 
+    told: list[str] = []
     outcome = run_toys(freeze, {"TOY_END_S": "30"}, Patience(soft=0.5, hard=60.0, frozen=1.0))
+    assert told == [outcome.failure]
     assert outcome.failure is not None
     assert outcome.failure.startswith("tissue lost at")
     assert "is stopped and has used no processor time" in outcome.failure

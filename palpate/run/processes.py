@@ -276,10 +276,13 @@ class LocalProcesses:
     def stop(self, patience_s: float = 5.0, *, at_once: bool = False) -> None:
         """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets.
 
+        One that somebody stopped is woken: it hears that the run is over, and leaves as the others do.
         `at_once`: they have nothing to complete, and many are still importing, so that they do not hear the bus.
         """
         steps: tuple[signal.Signals | None, ...] = (None, signal.SIGTERM, signal.SIGKILL)
         try:
+            for child in self._left():
+                child.send_signal(signal.SIGCONT)
             for send in steps[-1:] if at_once else steps:
                 left = self._left()
                 deadline = monotonic() + patience_s

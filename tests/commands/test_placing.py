@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -113,9 +116,20 @@ def test_two_runs_on_one_machine_want_no_port_unless_their_user_names_one(
         local.stop()
 
 
-def test_what_is_given_for_a_while_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    import os
+def test_a_stopped_process_is_woken_at_the_end_and_closes_what_it_has_open(tmp_path: Path) -> None:
+    files = write_scenario_files(load_scenario("clean"), tmp_path)
+    local = LocalProcesses(placement(ROLES, (), None), tmp_path, files, Timing())
+    closed = tmp_path / "closed"
+    words = "import os, pathlib, signal, sys; os.kill(os.getpid(), signal.SIGSTOP); pathlib.Path(sys.argv[1]).touch()"
+    process = subprocess.Popen([sys.executable, "-c", words, str(closed)])
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+    local.running["recorder"] = process
+    local.stop()
+    assert process.returncode == 0
+    assert closed.exists()
 
+
+def test_what_is_given_for_a_while_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_A", "before")
     with given({"PALPATE_A": "meanwhile", "PALPATE_B": "new"}):
         assert (os.environ["PALPATE_A"], os.environ["PALPATE_B"]) == ("meanwhile", "new")

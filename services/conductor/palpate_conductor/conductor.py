@@ -172,6 +172,10 @@ class Conductor:
             self.outcome.failure = self.outcome.failure or why
             self.outcome.wall_time_s = monotonic() - self._started_at
             self.abort(why)
+            if isinstance(failure, RunFailed):  # told at once: to end the services and to write the report takes seconds
+                if why not in "; ".join(self.outcome.trouble):
+                    self._tell(why)
+                tell(self)
         self._operator_requests.close()
         self._contract.close()
         self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
