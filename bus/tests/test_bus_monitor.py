@@ -88,6 +88,18 @@ def test_a_healthy_bus_has_no_violation_at_any_speed() -> None:
         assert all(row.alive for row in bus.monitor.health() if row.topic.name in MAKE)
 
 
+@pytest.mark.parametrize("rate", [0.25, 1.0])
+def test_a_run_by_the_wall_clock_is_judged_at_its_own_rate(rate: float) -> None:
+    """There stamps need not go with the sequence numbers: who is late goes on at the present tick."""
+    bus = Bus(monitor=Monitor(RULES, rate), factor=1 / rate)
+    bus.run(3000, lambda name, t, _: MAKE[name](t + 200 * MS if t > 1000 * MS else t))
+    assert bus.named == {}
+    assert bus.monitor.time.progress == pytest.approx(rate, rel=0.05)
+    late = Bus(monitor=Monitor(RULES, rate), factor=2 / rate)
+    late.run(3000)
+    assert set(late.named) == {f"{name} rate" for name in MAKE}
+
+
 def spoiled(name: str, change: Callable[[Any], None]) -> Callable[[str, int, Any], Any]:
     def meddle(topic: str, t: int, message: Any) -> Any:
         if topic == name:
@@ -211,7 +223,7 @@ def test_anyone_may_send_on_an_open_topic() -> None:
 
 
 def test_a_topic_that_lags_behind_the_others_is_too_old() -> None:
-    bus = Bus(monitor=Monitor(RULES, wallclock=False), factor=1.0)
+    bus = Bus(monitor=Monitor(RULES), factor=1.0)
     late: dict[str, list[Any]] = {"sent": []}
 
     def lag(name: str, t: int, message: Any) -> Any:

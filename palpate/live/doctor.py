@@ -73,8 +73,7 @@ class Diagnosis:
 
 def examine(bus: Joined, rules: Contract, seconds: float, tell: Callable[[Violation], None] = lambda _: None) -> Diagnosis:
     """Looks at a bus for `seconds`; every violation is told as soon as it is seen."""
-    wallclock = bus.target.run is not None and bus.target.run.runtime == "wallclock"
-    live = LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), wallclock)
+    live = LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), bus.target.rate)
     end = monotonic() + seconds
     try:
         while monotonic() < end:
@@ -149,7 +148,7 @@ def _clock(live: LiveMonitor) -> list[Remark]:
     findings = []
     time, progress = live.monitor.time.now, live.monitor.time.progress
     if time is not None:
-        kind = "wall-clock" if live.monitor.wallclock else "simulated"
+        kind = "wall-clock" if live.monitor.rate == 1.0 else "simulated"
         moves = f"at {progress:.2f} x real time" if progress else "stands still (paused, or a service holds it up)"
         findings.append(Remark("clock", Severity.OK if progress else Severity.WARN, f"{kind} time {time / 1e9:.2f} s, {moves}"))
     else:

@@ -32,8 +32,7 @@ def watch_violations(chosen: ChosenBus, as_json: bool) -> None:
     """Prints every violation of the contract when it occurs, until Ctrl-C."""
     with command(), joined(chosen) as bus:
         rules = contract()
-        wallclock = bus.target.run is not None and bus.target.run.runtime == "wallclock"
-        _watch(LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), wallclock), as_json)
+        _watch(LiveMonitor(bus.session, rules, bus.domain, bus.audible(rules), bus.target.rate), as_json)
 
 
 def report(chosen: ChosenBus, seconds: float, as_json: bool) -> None:

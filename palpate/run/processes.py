@@ -195,6 +195,7 @@ class LocalProcesses:
                 endpoints=endpoints,
                 domain=settings.domain,
                 runtime=timing.runtime,
+                rate=timing.wallclock_rate,
                 router=router,
                 out=str(out),
                 keys=None if secure is None else str(secure.keys),

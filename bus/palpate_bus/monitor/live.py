@@ -1,7 +1,7 @@
 """A monitor on a bus: it listens to every topic of the contract under any type, to liveliness tokens and to reports of services.
 
     with session(run.options()) as bus:
-        monitor = LiveMonitor(bus, contract(), run.domain, wallclock=run.runtime == "wallclock")
+        monitor = LiveMonitor(bus, contract(), run.domain, rate=run.rate)
         while True:
             for violation in monitor.poll():
                 print(violation)
@@ -49,9 +49,9 @@ class LiveMonitor:
     """A `Monitor` that listens to a bus, to all topics or to `topics` only; see `listen`."""
 
     def __init__(
-        self, session: zenoh.Session, rules: Contract, domain: int, topics: Iterable[str] | None = None, wallclock: bool = False
+        self, session: zenoh.Session, rules: Contract, domain: int, topics: Iterable[str] | None = None, rate: float | None = None
     ) -> None:
-        self.monitor = Monitor(rules, wallclock)
+        self.monitor = Monitor(rules, rate)
         self.graph = GraphWatch(session, domain)
         self.reports: dict[str, RoleReport] = {}
         self.offsets: dict[str, float] = {}
@@ -106,7 +106,7 @@ class LiveMonitor:
             except codec.CodecError:
                 continue
             if message.command == RunControl.GRANT and message.tick > WALL_CLOCK_TICK:
-                self.monitor.wallclock = True
+                self.monitor.rate = self.monitor.rate or 1.0
 
     def _hear_reports(self, now: float) -> None:
         while (sample := self._reports.handler.try_recv()) is not None:

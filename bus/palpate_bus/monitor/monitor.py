@@ -20,11 +20,11 @@ from palpate_bus.wire.liveliness import Entity, EntityKind
 
 
 class Monitor:
-    """Judges a bus by the contract; `wallclock`: the time on it is wall time, not simulated time."""
+    """Judges a bus by the contract. `rate`: how fast time passes in a run by the wall clock, 1 in real time; None in lockstep."""
 
-    def __init__(self, rules: Contract, wallclock: bool = False) -> None:
+    def __init__(self, rules: Contract, rate: float | None = None) -> None:
         self.rules = rules
-        self.wallclock = wallclock
+        self.rate = rate
         self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
         """Every violation so far, by (topic, sender, kind, field)."""
         self.time = timing.BusTime(0.0, 0, None)
@@ -122,11 +122,11 @@ class Monitor:
         rows = self.rules.topics
         periodic = [(rows[name], streams) for name, streams in self._streams.items() if rows[name].periodic]
         there = (stream for _, streams in periodic for gid, stream in streams.items() if gid not in self._left)
-        self.time = timing.bus_time(there, self.wallclock)
+        self.time = timing.bus_time(there, self.rate)
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:
-                    for problem in timing.problems(topic, stream, self.time, self.wallclock, now):
+                    for problem in timing.problems(topic, stream, self.time, self.rate, now):
                         self._note(topic, stream.sender, problem.kind, problem.expected, problem.got, now)
         self._judge_unheard(now)
         news, self._news = self._news, []
@@ -202,7 +202,7 @@ class Monitor:
     def _check_stamp(self, topic: Topic, stream: Stream, sequence: int, stamp: int, now: float) -> None:
         if stream.stamp is not None and stamp < stream.stamp:
             self._note(topic, stream.sender, Kind.STAMP, f"at least {stream.stamp} ns", f"{stamp} ns: it goes backwards", now)
-        elif topic.periodic and not self.wallclock and stamp != (sequence - 1) * topic.period:
+        elif topic.periodic and self.rate is None and stamp != (sequence - 1) * topic.period:
             expected = f"{(sequence - 1) * topic.period} ns, by its sequence number {sequence}"
             self._note(topic, stream.sender, Kind.STAMP, expected, f"{stamp} ns", now)
 

@@ -1,8 +1,8 @@
 """Rate, silence and age of a periodic topic against its row, measured in the bus's own time.
 
 A rate is the number of messages over the time that passed by their own stamps, so that a run at a third of real time has right
-rates and a busy monitor does not misjudge; in wall-clock mode by their source times. A topic is silent when nothing came while
-the time of the bus, the median of all periodic topics' stamps, went on.
+rates and a busy monitor does not misjudge; in wall-clock mode by their source times and the rate of the run. A topic is silent
+when nothing came while the time of the bus, the median of all periodic topics' stamps, went on.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class BusTime(NamedTuple):
     seconds: float
     """Wall time [s]."""
     passed: int
-    """Bus time [ns]: simulated, or in wall-clock mode the wall's."""
+    """Bus time [ns]: in wall-clock mode the wall's at the rate of the run."""
     now: int | None
     """The newest [ns]; None while no stamped message came."""
 
@@ -52,8 +52,8 @@ class TimingProblem(NamedTuple):
     got: str
 
 
-def bus_time(streams: Iterable[Stream], wallclock: bool) -> BusTime:
-    """The median over the streams of the periodic topics."""
+def bus_time(streams: Iterable[Stream], rate: float | None) -> BusTime:
+    """The median over the streams of the periodic topics. `rate` as for `Monitor`."""
     moved, newest = [], []
     for stream in streams:
         passed = stream.passed()
@@ -63,27 +63,27 @@ def bus_time(streams: Iterable[Stream], wallclock: bool) -> BusTime:
     if not moved:
         return BusTime(0.0, 0, None)
     seconds = median(s for _, s in moved)
-    progress = seconds * 1e9 if wallclock else median(p for p, _ in moved)
+    progress = seconds * 1e9 * rate if rate else median(p for p, _ in moved)
     return BusTime(seconds, int(progress), int(median(newest)))
 
 
-def problems(topic: Topic, stream: Stream, time: BusTime, wallclock: bool, now: float) -> Iterator[TimingProblem]:
+def problems(topic: Topic, stream: Stream, time: BusTime, rate: float | None, now: float) -> Iterator[TimingProblem]:
     """What is wrong with rate and age of a periodic topic's stream; `now` [s] is the clock by which it is marked."""
     own = stream.passed()
     if now - stream.began < GRACE_S or own.seconds < GRACE_S:
         return
-    wanted = f"{1000 / topic.period_ms:g} {'Hz' if wallclock else 'Hz of simulated time'}"
+    wanted = f"{1000 / topic.period_ms:g} {'Hz' if rate == 1.0 else 'Hz of simulated time'}"
     if not own.messages:
         if is_due(topic, time) and time.passed > SILENCE_NS:
             yield TimingProblem(Kind.SILENT, wanted, f"nothing for {own.seconds:.1f} s")
         return
-    spent = own.sent if wallclock else own.stamps
+    spent = own.sent * rate if rate else own.stamps
     if spent:
         off = abs(own.messages - spent / topic.period)
         if off > LEAST_OFF and off > RATE_TOLERANCE * spent / topic.period:
             unit = wanted.partition(" ")[2]
             yield TimingProblem(Kind.RATE, wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
-    yield from _age(topic, stream, time, wallclock)
+    yield from _age(topic, stream, time, rate)
 
 
 def is_due(topic: Topic, time: BusTime) -> bool:
@@ -91,11 +91,11 @@ def is_due(topic: Topic, time: BusTime) -> bool:
     return time.passed / topic.period > LEAST_OFF
 
 
-def _age(topic: Topic, stream: Stream, time: BusTime, wallclock: bool) -> Iterator[TimingProblem]:
+def _age(topic: Topic, stream: Stream, time: BusTime, rate: float | None) -> Iterator[TimingProblem]:
     if topic.max_age_ms is None or len(stream.ages) < AGES:
         return
-    if wallclock:
-        age = median(stream.ages)
+    if rate:
+        age = median(stream.ages) * rate
         if age > topic.max_age_ms + topic.period_ms:
             yield TimingProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{age:.0f} ms")
     elif stream.stamp is not None and time.now is not None:

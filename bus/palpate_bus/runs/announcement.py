@@ -47,6 +47,8 @@ class Run:
     """ROS domain."""
     runtime: str = "lockstep"
     """`lockstep` or `wallclock`."""
+    rate: float | None = None
+    """By the wall clock: simulated seconds a second."""
     router: str | None = None
     out: str = ""
     """The results folder."""

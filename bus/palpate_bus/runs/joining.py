@@ -33,6 +33,11 @@ class BusTarget:
         """What to call it before a user."""
         return self.run.name if self.run else self.options.router or ", ".join(self.options.connect) or "the bus"
 
+    @property
+    def rate(self) -> float | None:
+        """Simulated seconds a second of a run by the wall clock; None in lockstep, or where that is not known."""
+        return self.run.rate if self.run else None
+
     def operator(self) -> BusOptions:
         """How an operator joins it: in a secure run with the operator's key, where `options` has a viewer's."""
         return self.run.options(OPERATOR) if self.run else self.options

@@ -79,7 +79,7 @@ class Conductor:
         self._freezes = FreezeWatch(self._patience)
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
         self.outcome = RunOutcome()
-        self._contract = ContractWatch(session, rules, domain, timing.wallclock and timing.rate == 1.0)
+        self._contract = ContractWatch(session, rules, domain, timing.wallclock_rate)
         collector.diagnose = self.diagnose
         self.grants = Grants(lambda tick, last: self._say(RunControl.GRANT, tick, last), timing)
         self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace)
@@ -232,25 +232,13 @@ class Conductor:
         while not finished >= set(self._workers) - self.outcome.lost.keys():
             self._heartbeat.turn()
             self._observed.drain_and_step()
-            for role, message, detail in self._heard():
-                if message.waiting_for == CONDUCTOR:
-                    self._missed(role, message.tick, detail.get("lost", ""))
-                if "told" in detail:
-                    when = max(message.tick, 0) / NS
-                    raise RunFailed(
-                        f"{role} was told to end at {when:.3f} s ({detail['told']}) in the conductor's name, "
-                        "but not by this conductor: a forged or doubled sender of palpate/control"
-                    )
-                if self._places.take(role):
-                    self.watchdog.progress[role].moved = monotonic()  # the time before is nobody's
-                    self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
-                if message.state == ServiceReport.FINISHED:
-                    finished.add(role)
-                    self._close(role, detail)
-                elif message.state == ServiceReport.FAILED:
-                    self._miss(role, detail.get("error", "unknown error"))
-            for role, how in self._missing(died).items():
-                if role in self._roles and role not in finished:
+            self._take_reports(finished)
+            known = finished | self.outcome.lost.keys()
+            if missing := {role: how for role, how in self._missing(died).items() if role in self._roles and role not in known}:
+                sleep(POLL_S)  # who leaves reports its end right before
+                self._take_reports(finished)
+            for role, how in missing.items():
+                if role not in finished:
                     self._miss(role, how)
             self._lose_frozen(finished)
             for role, how in self._places.expired().items():
@@ -264,6 +252,26 @@ class Conductor:
             self._watch()
             tell(self)
             sleep(POLL_S)
+
+    def _take_reports(self, finished: set[str]) -> None:
+        """Takes in what the services report of themselves, and adds who has finished."""
+        for role, message, detail in self._heard():
+            if message.waiting_for == CONDUCTOR:
+                self._missed(role, message.tick, detail.get("lost", ""))
+            if "told" in detail:
+                when = max(message.tick, 0) / NS
+                raise RunFailed(
+                    f"{role} was told to end at {when:.3f} s ({detail['told']}) in the conductor's name, "
+                    "but not by this conductor: a forged or doubled sender of palpate/control"
+                )
+            if self._places.take(role):
+                self.watchdog.progress[role].moved = monotonic()  # the time before is nobody's
+                self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
+            if message.state == ServiceReport.FINISHED:
+                finished.add(role)
+                self._close(role, detail)
+            elif message.state == ServiceReport.FAILED:
+                self._miss(role, detail.get("error", "unknown error"))
 
     def _extend(self) -> None:
         """Grants as much time as may be granted."""
@@ -374,15 +382,15 @@ class Conductor:
         while waiting and monotonic() - begin < OBSERVERS_FINISH_S:
             self._heartbeat.turn()
             self._observed.drain_and_step()
+            dead = died()
+            sleep(POLL_S)  # who leaves reports its end right before
             for role, message, detail in self._heard():
                 if message.state == ServiceReport.FINISHED:
                     waiting.discard(role)
                     self._close(role, detail)
                     self._suspect(filter(None, [detail.get("facts", {}).get("trouble")]))
-            for role, how in died().items():
-                if role in waiting:
-                    waiting.discard(role)
-                    self._tell(f"{role} died while closing: {how}")
-            sleep(POLL_S)
+            for role in waiting & dead.keys():
+                self._tell(f"{role} died while closing: {dead[role]}")
+            waiting -= dead.keys()
         for role in waiting:
             self._tell(f"{role} did not finish within {OBSERVERS_FINISH_S:.0f} s")

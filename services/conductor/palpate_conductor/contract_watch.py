@@ -28,15 +28,15 @@ ROUND_S = 12.0
 
 
 class ContractWatch:
-    """Watches the bus of a run. `attend` it often."""
+    """Watches the bus of a run, whose wall-clock `rate` is None in lockstep. `attend` it often."""
 
-    def __init__(self, session: zenoh.Session, rules: Contract, domain: int, wallclock: bool = False) -> None:
+    def __init__(self, session: zenoh.Session, rules: Contract, domain: int, rate: float | None = None) -> None:
         watching = [rules.topics[name] for name in watched(rules)]
         heard = [topic for topic in watching if topic.producer != WATCHER or topic.open]  # it need not listen to itself
         fast = [topic.name for topic in heard if topic.periodic and topic.period_ms < FAST_MS]
         self._slow = [topic.name for topic in heard if topic.name not in fast]
         self._turns = cycle(fast)
-        self._live = LiveMonitor(session, rules, domain, self._slow, wallclock)
+        self._live = LiveMonitor(session, rules, domain, self._slow, rate)
         self._polled = self._round = monotonic()
         self._looking = False
 

@@ -26,6 +26,11 @@ class Timing:
     """With `wallclock`: for how long the place of a service that goes is kept (see `handover`); 0 keeps none."""
 
     @property
+    def wallclock_rate(self) -> float | None:
+        """The rate of a run by the wall clock; None in lockstep."""
+        return self.rate if self.wallclock else None
+
+    @property
     def runtime(self) -> str:
         """The runtime of the services, as PALPATE_RUNTIME names it."""
         return "wallclock" if self.wallclock else "lockstep"
