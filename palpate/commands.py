@@ -16,7 +16,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from palpate.command_line import EXIT_BAD_INPUT
+from palpate.command_line import EXIT_BAD_INPUT, say
 
 HELP = "A robot arm feels for lumps in a simulated abdomen. You can replace each part of it with a program of your own."
 GROUPS = {
@@ -88,6 +88,13 @@ def main() -> None:
         sys.exit(1)
     except ModuleNotFoundError as error:  # of a library that the command imports late
         _lacking(word, error)
+    except ValueError as error:
+        from palpate_bus.settings import BusConfigError  # noqa: PLC0415 - it takes two seconds to import
+
+        if not isinstance(error, BusConfigError):
+            raise
+        say(error)
+        sys.exit(EXIT_BAD_INPUT)
 
 
 def app_for(word: str, columns: int | None = None) -> typer.Typer:

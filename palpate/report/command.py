@@ -17,7 +17,7 @@ def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of a run.")],
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write report.pdf; needs Chromium.")] = False,
     recover: Annotated[
-        bool, typer.Option("--recover", help="Make the results of a run that lost its conductor from its recording.")
+        bool, typer.Option("--recover", help="Make the results of a run that was killed, from its recording.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,

@@ -119,6 +119,8 @@ class Drawing:
         axes.axvline(0, color="white", lw=0.8, alpha=0.55)
         axes.plot(0, 0, "o", ms=5, mfc="none", mec="white", mew=1.1)
         for name, x, y in (("RUQ", 0, 1), ("LUQ", 1, 1), ("RLQ", 0, 0), ("LLQ", 1, 0)):
+            if not ((high[0] > 0 if x else low[0] < 0) and (high[1] > 0 if y else low[1] < 0)):
+                continue  # it lies outside the view
             text = axes.text(
                 0.03 + 0.94 * x, 0.03 + 0.94 * y, name, transform=axes.transAxes, color="white", fontsize=10, weight="bold"
             )

@@ -97,6 +97,7 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
         skipped=skipped,
         safety=_safety(report, evidence),
         targets=evidence.target_count,
+        reached=_reached(report, evidence),
         layers=None if solid is None else solid[0],
         surface=None if solid is None else Markup(json.dumps(solid[1])),
         viewer=Markup((Path(__file__).parent / "templates" / "surface.js").read_text(encoding="utf-8")),
@@ -126,6 +127,13 @@ def verdict(report: Report) -> str:
     if not report.findings:
         return f"{unassessed(report)}No lump was found{_unreached(report)}. {muscles}".rstrip()
     return f"{unassessed(report)}{' '.join(map(_in_words, report.findings))} {muscles}".rstrip()
+
+
+def _reached(report: Report, evidence: Evidence) -> int:
+    """How many targets the indenter came to."""
+    if not report.failure:
+        return evidence.target_count - report.skipped_targets
+    return int(evidence.visited[-1]) if evidence.visited.size else 0
 
 
 def _unreached(report: Report) -> str:

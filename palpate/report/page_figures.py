@@ -87,7 +87,7 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     drawing.panel(left, drawing.force_layer, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", small)
     words, small = "Apparent stiffness", "times the background; findings outlined"
     drawing.panel(middle, _ratio_layer(drawing), "b", words, small, labels=True)
-    drawing.panel(right, drawing.spread_layer, "c", "How sure", "half width of the 90 % band of the apparent stiffness")
+    drawing.panel(right, drawing.spread_layer, "c", "Uncertainty", "half width of the 90 % band of the apparent stiffness")
     return _png(figure)
 
 

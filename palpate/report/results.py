@@ -99,7 +99,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         platform=fingerprint(),
         sim_time_s=result.sim_time_s,
         wall_time_s=result.wall_time_s,
-        real_time_factor=result.sim_time_s / max(result.wall_time_s, 1e-9),
+        real_time_factor=result.sim_time_s / result.wall_time_s if result.wall_time_s else 0.0,
         start_time_s=result.start_time_s,
         run_hash=result.run_hash,
         digests=result.digests,
@@ -227,7 +227,7 @@ def print_findings(console: Console, report: Report) -> None:
     elif report.assessed:
         console.print("no finding" if report.failure is None else "no finding in what was scanned")
     else:
-        console.print("not assessed")
+        console.print(f"not assessed: {report.samples} samples are too few for a map")
     if muscles := words.tensed(report.candidates):
         console.print(muscles.rstrip(), highlight=False, soft_wrap=True)
     if searched := report.services.get("search", {}).get("facts"):
@@ -238,8 +238,8 @@ def print_findings(console: Console, report: Report) -> None:
 
 
 def print_scores(console: Console, report: Report) -> None:
-    """The scores against the truth in a line, where there are any."""
-    if report.scores is not None:
+    """The scores against the truth in a line, where anything was assessed that could be right or wrong."""
+    if report.scores is not None and report.assessed:
         console.print(f"against the truth{clean_words(report)}: {in_words(report.scores)}", highlight=False, soft_wrap=True)
 
 
@@ -256,12 +256,20 @@ def in_words(s: scoring.Scores) -> str:
     parts += [f"place within {s.place_error_m * 1e3:.1f} mm"] if s.place_error_m is not None else []
     parts += [f"Dice {s.dice:.2f}"] if s.dice is not None else []
     parts += [f"size off by {100 * s.size_error:.0f} %"] if s.size_error is not None else []
-    parts += [f"ratio off by {100 * s.ratio_error:.0f} %"] if s.ratio_error is not None else []
+    parts += [f"ratio off by {100 * s.ratio_error:.0f} %{_beyond_bands(s)}"] if s.ratio_error is not None else []
     if s.coverage_90 is not None:
         places = (("in lumps", s.coverage_90_in_lumps), ("on guarding", s.coverage_90_on_guarding))
         inside = ", ".join(f"{100 * share:.0f} % {where}" for where, share in places if share is not None)
-        parts += [f"90 % band holds on {100 * s.coverage_90:.0f} %" + (f" ({inside})" if inside else "")]
+        parts += [f"the map's 90 % band holds on {100 * s.coverage_90:.0f} %" + (f" ({inside})" if inside else "")]
     return ", ".join(parts)
+
+
+def _beyond_bands(s: scoring.Scores) -> str:
+    """How many of the ratios lie outside the bands that were told with them."""
+    outside = sum(finding.ratio_held is False for finding in s.findings)
+    if not outside:
+        return ""
+    return ", outside its 90 % band" if s.matched == 1 else f", {outside} of {s.matched} outside their 90 % bands"
 
 
 def finding_row(f: Any) -> FindingRow:

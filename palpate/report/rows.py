@@ -88,6 +88,7 @@ class Report(_Row):
     wall_time_s: float
     """From the first tick to the last."""
     real_time_factor: float
+    """0 where the wall time is not known: of what was recovered."""
     start_time_s: float
     """Wall time from the command to the first tick."""
     run_hash: str | None

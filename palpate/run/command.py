@@ -32,7 +32,12 @@ def run(  # noqa: PLR0913 - the options of a command
     ] = None,
     realtime: Annotated[bool, typer.Option("--realtime", help="Run lockstep no faster than real time.")] = False,
     wallclock: Annotated[
-        bool, typer.Option("--wallclock", help="Run every service in real time, on its own timer, as with hardware.")
+        bool,
+        typer.Option(
+            "--wallclock",
+            help="Run every service in real time, on its own timer, as with hardware; slower where the machine cannot keep it "
+            "(or by PALPATE_RATE).",
+        ),
     ] = False,
     handover: Annotated[
         float, typer.Option(min=0, help="With --wallclock: seconds that a stopped service may take to be replaced; see takeover.")
@@ -91,6 +96,8 @@ def run(  # noqa: PLR0913 - the options of a command
       palpate run --resume out/lump-20260101-120000  goes on with a run that was killed or stopped
 
       palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
+
+    The exit status is 0 when the examination came to its end, 2 when it was not begun, 3 when it was broken off, by Ctrl-C, too.
     """
     from palpate.command_line import refuse
     from palpate.run.inputs import usable

@@ -19,6 +19,7 @@ from palpate.run.roles import write_scenario_files
 from palpate.run.space import another_folder, megabytes_of
 from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import violations
+from palpate_bus.settings import RECORDING
 from palpate_conductor.result import RunResult
 from palpate_models.scenario import Scenario
 
@@ -50,6 +51,8 @@ def conclude(
         say(trouble)
     if result.failure:
         say(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+        if (folder / RECORDING).is_dir() and not quiet:
+            console.print(f"to examine what is left: palpate run --resume {folder}", highlight=False, soft_wrap=True)
     if result.failure or trouble:
         raise typer.Exit(EXIT_FAILED)
 

@@ -154,6 +154,7 @@ def examine_again(scenario: Scenario, out: Path | None, count: int) -> None:
         if left.status == EXIT_BAD_INPUT:  # what cannot start once cannot start again
             raise typer.Exit(EXIT_BAD_INPUT)
         if left.interrupted:
+            say(f"broken off in examination {number} of {count}")
             raise typer.Exit(EXIT_FAILED if failed else left.status)
         if left.status < 0:
             say(f"{own}: the examination was ended by {signal.Signals(-left.status).name}")

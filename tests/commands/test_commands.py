@@ -15,7 +15,8 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from palpate import commands
-from palpate.commands import COMMANDS, app_for
+from palpate.command_line import EXIT_BAD_INPUT
+from palpate.commands import COMMANDS, app_for, main
 from palpate.reference import walked
 from palpate.run import examine
 from palpate_bus.implementations import ChoiceError
@@ -138,16 +139,20 @@ def test_help_reads_well_in_a_terminal_of_80_columns(word: str) -> None:
             assert Text.from_markup(told).plain == told, f"{path} {option.name}: brackets are not printed"
 
 
+def test_a_variable_that_cannot_be_used_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("PALPATE_RATE", "7")
+    monkeypatch.setattr(sys, "argv", ["palpate", "doctor"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == EXIT_BAD_INPUT
+    assert capsys.readouterr().err == "palpate: PALPATE_RATE is '7'; allowed: a number above 0, up to 1\n"
+
+
 def test_ctrl_c_during_the_start_is_a_line() -> None:
     """The signal is there before the interpreter is, and before the environment is fixed."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        started = subprocess.Popen(
-            [sys.executable, "-m", "palpate", "plan"],
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - a shell ignores it in the background
-        )
+        started = subprocess.Popen([sys.executable, "-m", "palpate", "plan"], stderr=subprocess.PIPE, text=True)
         started.send_signal(signal.SIGINT)
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -83,6 +83,17 @@ def test_a_run_that_failed_says_so_first(tmp_path: Path) -> None:
     assert "12.35 s" in page  # among the safety events
 
 
+def test_a_run_that_broke_off_did_not_reach_all_targets(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path, failure="tissue lost at 12.345 s: killed by signal 9")
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    (folder / "report.json").write_text(json.dumps({**report, "services": {}, "skipped_targets": 0}), encoding="utf-8")
+    page = write_page(folder).read_text(encoding="utf-8")
+    reached, targets = map(int, re.findall(r"<dt>Targets reached</dt><dd>(\d+) of (\d+)", page)[0])
+    assert reached < targets
+    assert f"{targets - reached} of {targets} targets were not reached" in page
+    assert "targets were reached" not in page
+
+
 def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> None:
     scenario, nothing = load_scenario("clean"), Known(None, None, None)
     whole = assemble(scenario, result(collected(), failure=None), nothing).model_copy(

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from palpate.report.evidence import samples_of, steady_contact
 from palpate.report.page import write_page
-from palpate.report.results import Known, assemble, clean_world, print_findings, truth_of_run, write_results
+from palpate.report.results import Known, assemble, clean_world, in_words, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
 from palpate.run.roles import write_scenario_files
 from palpate_models.load import load_scenario
@@ -133,6 +133,17 @@ def test_findings_in_words(scenario: Scenario, felt: Known) -> None:
     print_findings(Console(file=text, width=120), assemble(scenario, result(collected()), felt))
     assert "RLQ" in text.getvalue()
     assert "1 matched, 0 missed, 0 false" in text.getvalue()
+
+
+def test_a_ratio_outside_its_band_is_told(scenario: Scenario, felt: Known) -> None:
+    scores = assemble(scenario, result(collected()), felt).scores
+    assert scores is not None
+    told = {}
+    for held in (True, False):
+        findings = [replace(finding, ratio_held=held) for finding in scores.findings]
+        told[held] = in_words(replace(scores, findings=findings))
+    assert "outside" not in told[True]
+    assert "outside its 90 % band" in told[False]
 
 
 def test_where_no_copy_can_be_made_nothing_is_scored(scenario: Scenario, felt: Known, tmp_path: Path) -> None:
