@@ -40,8 +40,10 @@ def report(
 
             page = write_page(folder)
             paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
-    except (EvidenceError, PrintError, OSError) as error:
+    except (EvidenceError, PrintError) as error:
         refuse(error)
+    except OSError as error:  # of a full disk it names no file
+        refuse(f"{error.filename or folder}: {error.strerror}")
     if as_json:
         print(json.dumps({kind: str(path) for kind, path in paths.items()}))
     elif not quiet:

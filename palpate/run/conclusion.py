@@ -19,6 +19,8 @@ from palpate.run.roles import write_scenario_files
 from palpate.run.space import another_folder, megabytes_of
 from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import violations
+from palpate_bus.messages import RobotStatus
+from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.settings import RECORDING
 from palpate_conductor.result import RunResult
 from palpate_models.scenario import Scenario
@@ -50,11 +52,19 @@ def conclude(
     if trouble:
         say(trouble)
     if result.failure:
-        say(f"the run failed: {result.failure} (logs in {folder / 'logs'})")
+        say(f"the run failed: {result.failure} (logs in {folder / 'logs'}){_held(result)}")
         if (folder / RECORDING).is_dir() and not quiet:
             console.print(f"to examine what is left: palpate run --resume {folder}", highlight=False, soft_wrap=True)
     if result.failure or trouble:
         raise typer.Exit(EXIT_FAILED)
+
+
+def _held(result: RunResult) -> str:
+    """That the arm was held at last, and why, where the failure does not tell it."""
+    changes = result.collected.status_changes
+    if not changes or changes[-1].mode != RobotStatus.MODE_SAFE_HOLD or changes[-1].reason in (result.failure or ""):
+        return ""
+    return f"; the arm holds since {nanoseconds(changes[-1].header.stamp) / NS:.3f} s: {changes[-1].reason}"
 
 
 def _unfit(result: RunResult) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from rich.console import Console
 
 from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
+from palpate_bus.messages import RobotStatus
+from palpate_bus.messages.stamps import header
 from palpate_models.load import load_scenario
 
 
@@ -25,6 +28,19 @@ def test_findings_that_break_the_contract_are_told(
     gathered.findings.findings[0].confidence = confidence
     conclude(Console(quiet=True), tmp_path, scenario, result(gathered), quiet=True)
     assert ("findings.confidence" in capsys.readouterr().err) is told
+
+
+def test_that_the_arm_is_held_is_told_with_the_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = load_scenario("clean", SETTINGS, seed=3)
+    write_scenario_files(scenario, tmp_path)
+    gathered = collected()
+    why = "emergency stop of the supervisor: planning is silent"
+    held = SimpleNamespace(header=header(17_830_000_000), mode=RobotStatus.MODE_SAFE_HOLD, reason=why)
+    gathered.status_changes.append(held)
+    for failure in ("planning lost at 17.780 s", f"planning lost at 17.780 s: {why}"):
+        with pytest.raises(typer.Exit):
+            conclude(Console(quiet=True), tmp_path, scenario, result(gathered, failure), quiet=True)
+        assert capsys.readouterr().err.count(why) == 1
 
 
 def test_a_map_that_cannot_be_drawn_costs_the_map_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -290,7 +290,7 @@ class Conductor:
             role, sentence = self.watchdog.culprit(judged)
             raise RunFailed(f"{role} blocks the run for {stalled:.0f} s: {sentence}")
         if stalled > self._patience.soft and not self._complained:
-            log.warning("no tick for %.0f s: %s", stalled, self.watchdog.culprit(judged)[1])
+            log.warning("no tick for %.0f s, still waiting: %s", stalled, self.watchdog.culprit(judged)[1])
         self._complained = stalled > self._patience.soft
 
     def _lose_frozen(self, finished: Container[str]) -> None:
