@@ -47,8 +47,6 @@ class Run:
     """ROS domain."""
     runtime: str = "lockstep"
     """`lockstep` or `wallclock`."""
-    rate: float | None = None
-    """By the wall clock: simulated seconds a second."""
     router: str | None = None
     out: str = ""
     """The results folder."""
@@ -58,6 +56,8 @@ class Run:
     started: float = field(default_factory=time.time)
     """Wall time [s]."""
     versions: Mapping[str, str] = field(default_factory=versions)
+    rate: float | None = None
+    """By the wall clock: simulated seconds a second."""
 
     def options(self, member: str = "viewer") -> BusOptions:
         """How a tool joins: as a peer of everyone, listening nowhere; in a secure run as its router's client, as that member."""
