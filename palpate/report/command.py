@@ -43,7 +43,7 @@ def report(
     except (EvidenceError, PrintError) as error:
         refuse(error)
     except OSError as error:  # of a full disk it names no file
-        refuse(f"{error.filename or folder}: {error.strerror}")
+        refuse(f"{error.filename or folder}: {error.strerror or error}")
     if as_json:
         print(json.dumps({kind: str(path) for kind, path in paths.items()}))
     elif not quiet:

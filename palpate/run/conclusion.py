@@ -64,7 +64,7 @@ def _held(result: RunResult) -> str:
     changes = result.collected.status_changes
     if not changes or changes[-1].mode != RobotStatus.MODE_SAFE_HOLD or changes[-1].reason in (result.failure or ""):
         return ""
-    return f"; the arm holds since {nanoseconds(changes[-1].header.stamp) / NS:.3f} s: {changes[-1].reason}"
+    return f"; the arm has been held since {nanoseconds(changes[-1].header.stamp) / NS:.3f} s: {changes[-1].reason}"
 
 
 def _unfit(result: RunResult) -> list[str]:
