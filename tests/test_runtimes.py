@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from rerun.chunk import RrdReader
 from toy_runs import ROLES, Running, at, composed_hash, run_toys, toy_services
 
 from palpate_bus.contract import MS, Topic, contract
-from palpate_bus.messages import DiagnosticStatus, codec
+from palpate_bus.messages import DiagnosticStatus, ServiceReport, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
@@ -232,6 +233,26 @@ def test_a_service_that_never_comes_is_named() -> None:
         conductor = Conductor(session, contract(), 0, ("robot",), Collector(), Patience(start=0.5))
         with pytest.raises(RunFailed, match="no answer from robot"):
             conductor.run(leave)
+        close_session(session)
+
+
+def test_what_an_observer_reports_right_before_it_leaves_is_heard(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Report and end of its process come between two looks of the conductor."""
+    gone: dict[str, str] = {}
+
+    def died() -> Mapping[str, str]:
+        gone["recorder"] = "left with status 0"
+        return gone
+
+    session = open_session(mesh(("conductor",), tmp_path)["conductor"])
+    try:
+        conductor = Conductor(session, contract(), 0, ("recorder",), Collector())
+        report = ("recorder", SimpleNamespace(state=ServiceReport.FINISHED), {})
+        monkeypatch.setattr(conductor, "_heard", lambda: [report] if gone else [])
+        conductor._end(died)
+        assert conductor.outcome.trouble == []
+        assert conductor.outcome.reports.keys() == {"recorder"}
+    finally:
         close_session(session)
 
 

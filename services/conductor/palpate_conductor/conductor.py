@@ -232,13 +232,25 @@ class Conductor:
         while not finished >= set(self._workers) - self.outcome.lost.keys():
             self._heartbeat.turn()
             self._observed.drain_and_step()
-            self._take_reports(finished)
-            known = finished | self.outcome.lost.keys()
-            if missing := {role: how for role, how in self._missing(died).items() if role in self._roles and role not in known}:
-                sleep(POLL_S)  # who leaves reports its end right before
-                self._take_reports(finished)
-            for role, how in missing.items():
-                if role not in finished:
+            for role, message, detail in self._heard():
+                if message.waiting_for == CONDUCTOR:
+                    self._missed(role, message.tick, detail.get("lost", ""))
+                if "told" in detail:
+                    when = max(message.tick, 0) / NS
+                    raise RunFailed(
+                        f"{role} was told to end at {when:.3f} s ({detail['told']}) in the conductor's name, "
+                        "but not by this conductor: a forged or doubled sender of palpate/control"
+                    )
+                if self._places.take(role):
+                    self.watchdog.progress[role].moved = monotonic()  # the time before is nobody's
+                    self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
+                if message.state == ServiceReport.FINISHED:
+                    finished.add(role)
+                    self._close(role, detail)
+                elif message.state == ServiceReport.FAILED:
+                    self._miss(role, detail.get("error", "unknown error"))
+            for role, how in self._missing(died).items():
+                if role in self._roles and role not in finished:
                     self._miss(role, how)
             self._lose_frozen(finished)
             for role, how in self._places.expired().items():
@@ -252,26 +264,6 @@ class Conductor:
             self._watch()
             tell(self)
             sleep(POLL_S)
-
-    def _take_reports(self, finished: set[str]) -> None:
-        """Takes in what the services report of themselves, and adds who has finished."""
-        for role, message, detail in self._heard():
-            if message.waiting_for == CONDUCTOR:
-                self._missed(role, message.tick, detail.get("lost", ""))
-            if "told" in detail:
-                when = max(message.tick, 0) / NS
-                raise RunFailed(
-                    f"{role} was told to end at {when:.3f} s ({detail['told']}) in the conductor's name, "
-                    "but not by this conductor: a forged or doubled sender of palpate/control"
-                )
-            if self._places.take(role):
-                self.watchdog.progress[role].moved = monotonic()  # the time before is nobody's
-                self._tell(f"another process plays {role} from {max(message.tick, 0) / NS:.3f} s on")
-            if message.state == ServiceReport.FINISHED:
-                finished.add(role)
-                self._close(role, detail)
-            elif message.state == ServiceReport.FAILED:
-                self._miss(role, detail.get("error", "unknown error"))
 
     def _extend(self) -> None:
         """Grants as much time as may be granted."""
