@@ -16,6 +16,6 @@ if __name__ == "__main__":
     if find_spec("matplotlib"):
         import_module("matplotlib.font_manager")
     for name in [one for one in COMPILED if "-" not in one] if extra == STUDY else {extra}.intersection(COMPILED):
-        scenario = import_module("palpate_models.load").load_scenario("clean")
+        scenario = import_module("palpate_models.scenario.load").load_scenario("clean")
         role, _, backend = name.partition("-")
         create(role, backend or getattr(scenario.services, role), scenario)

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from palpate.interface.scenarios import scenario
     from palpate.interface.studies import StudyResult, study
     from palpate.quick.patient import Patient, Touch
-    from palpate_models.load import ScenarioError
-    from palpate_models.scenario import Scenario
+    from palpate_models.scenario.load import ScenarioError
+    from palpate_models.scenario.schema import Scenario
 
 __all__ = [
     "Assessment",
@@ -44,8 +44,8 @@ _HOMES = {
     "Assessment": "palpate.interface.assessment",
     "Examination": "palpate.interface.examination",
     "Patient": "palpate.quick.patient",
-    "Scenario": "palpate_models.scenario",
-    "ScenarioError": "palpate_models.load",
+    "Scenario": "palpate_models.scenario.schema",
+    "ScenarioError": "palpate_models.scenario.load",
     "StiffnessMap": "palpate.interface.assessment",
     "StudyResult": "palpate.interface.studies",
     "Touch": "palpate.quick.patient",

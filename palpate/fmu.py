@@ -14,7 +14,7 @@ from rich.table import Table
 from palpate.command_line import refuse
 
 if TYPE_CHECKING:
-    from palpate_models.scenario import Scenario
+    from palpate_models.scenario.schema import Scenario
 
 DENSE = 2000
 """Continuous states that a dense Jacobian can do: at this number it has 32 MB."""
@@ -27,9 +27,9 @@ app = typer.Typer(name="fmu", help="The abdomen as an FMU; FMUs of any kind look
 
 def _scenario(name: str, settings: list[str]) -> Scenario:
     """A scenario by name or file, or the default one with a mesh as its phantom."""
-    from palpate_models.load import ScenarioError, load_scenario
-    from palpate_models.patient import Phantom
-    from palpate_models.scenario import Scenario
+    from palpate_models.patient.schema import Phantom
+    from palpate_models.scenario.load import ScenarioError, load_scenario
+    from palpate_models.scenario.schema import Scenario
 
     if Path(name).suffix.lower() in MESHES:
         if settings:
@@ -60,8 +60,8 @@ def build(
     from palpate_fmu.compiling import CompileError, platforms
     from palpate_fmu.export import build_scenario_fmu
     from palpate_fmu.phantom_file import ExportError
-    from palpate_models.load import ScenarioError
-    from palpate_models.phantom import MeshError
+    from palpate_models.patient.mesh import MeshError
+    from palpate_models.scenario.load import ScenarioError
 
     console = Console(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -15,7 +15,7 @@ WIDE = 160
 
 def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False) -> None:
     """List the scenarios that come with Palpate."""
-    from palpate_models.load import load_scenario, scenario_names
+    from palpate_models.scenario.load import load_scenario, scenario_names
 
     if as_json:
         print(json.dumps([load_scenario(name).model_dump(mode="json") for name in scenario_names()]))

@@ -7,8 +7,8 @@ from typing import Any
 
 from palpate_bus.messages import ExamState
 from palpate_bus.service import Inbox, Outbox
-from palpate_models.load import exam_input
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 from palpate_planning.service import PlanningService
 
 MS = 1_000_000

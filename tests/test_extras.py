@@ -46,10 +46,9 @@ EXTRA_OF = {
     "palpate_bus.security.keys": "secure",
     "palpate_bus.testing.strategies": "fuzz",
     "palpate_models": "models",
-    "palpate_models.placement": "planning",
-    "palpate_models.placement_base": "planning",
-    "palpate_models.placement_batch": "planning",
-    "palpate_models.placement_symbolic": "planning",
+    "palpate_planning.placement.redundancy": "planning",
+    "palpate_planning.placement.inverse_kinematics": "planning",
+    "palpate_planning.placement.symbolic": "planning",
     "palpate_robot": "models",  # what its backends share
     "palpate_robot.backends.dart": "robot",
     "palpate_robot.backends.mujoco": "robot-mujoco",

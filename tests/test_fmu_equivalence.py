@@ -27,10 +27,10 @@ from palpate_conductor.collector import Collector
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
-from palpate_models.breathing import BreathingCurve
-from palpate_models.load import load_scenario
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.fmu.service import create as create_fmu
 from palpate_tissue.backends.winkler.service import create as create_native
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

@@ -16,8 +16,8 @@ import palpate
 from palpate.interface.examination import ExaminationError
 from palpate.quick.patient import Touch
 from palpate.truth.tissue import true_tissue
-from palpate_models import press
-from palpate_models.load import ScenarioError, dump_scenario, load_scenario
+from palpate_models.scenario import press
+from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.py"))

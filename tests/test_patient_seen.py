@@ -13,13 +13,13 @@ from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import CameraService
-from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.errors import Errors
-from palpate_models.frames import look_at
-from palpate_models.load import plant_input
-from palpate_models.motion import Motion
-from palpate_models.patient import Phantom
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import look_at
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.motion import Motion
+from palpate_models.patient.schema import Phantom
+from palpate_models.scenario.errors import Errors
+from palpate_models.scenario.load import plant_input
+from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.winkler.service import create
 
 BREATHING = Breathing(kind="quiet", peak_to_peak_m=0.008, depth_cv=0)

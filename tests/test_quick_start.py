@@ -20,8 +20,8 @@ from palpate_bus.contract.conformance import violations
 from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.lockstep import Stepper
-from palpate_models.load import load_scenario
-from palpate_models.phantom import build_phantom
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import load_scenario
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")

@@ -14,7 +14,7 @@ from palpate_bus.messages.stamps import NS, header
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox
 from palpate_conductor.collector import Collected, Collector
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 HELD_FOR = NS
 

@@ -30,7 +30,7 @@ from palpate_conductor.outcome import Patience, RunFailed
 from palpate_dashboard.replay import draw
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 
 def test_composed_an_observer_or_a_tap_that_fails_ends_no_run() -> None:

@@ -22,7 +22,7 @@ from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_conductor.collector import Collector
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 MS = 1_000_000
 SHORT = ("exam.region_m=[0.03,0.03]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=2")

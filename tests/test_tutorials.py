@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from palpate.commands import app_for
 from palpate_bus.implementations import create
-from palpate_models.load import load_scenario
-from palpate_models.phantom import build_phantom
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backend import TissueBackend
 
 ROOT = Path(__file__).parents[1]

@@ -25,7 +25,7 @@ from palpate.run.distributed import run_distributed
 from palpate.run.placement import placement
 from palpate.run.roles import OBSERVERS, workers
 from palpate_conductor.result import RunResult
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 
 def _figures(result: RunResult) -> dict[str, Any]:

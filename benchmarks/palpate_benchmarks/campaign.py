@@ -33,7 +33,7 @@ from palpate_conductor.grants import WALLCLOCK_LEAD
 from palpate_conductor.outcome import Patience, RunFailed
 from palpate_conductor.result import RunProgress, RunResult
 from palpate_conductor.timing import Timing
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 SETTINGS: Final = (
     "exam.region_m=[0.0125, 0.03]",

@@ -19,11 +19,11 @@ import numpy as np
 
 from palpate_benchmarks.turns import compared, in_turns
 from palpate_bus.contract import contract
-from palpate_models.breathing import BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.guarding import Guarding
-from palpate_models.patient import Lesion, Phantom, Stiffness
-from palpate_models.phantom import PhantomModel, build_phantom, flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.guarding import Guarding
+from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
+from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue

@@ -35,7 +35,7 @@ from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.run import chosen, run_service
 from palpate_bus.wire.transport import Sender, Transport
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 DELAY_S: Final = 0.5
 PAST_S: Final = 3600

@@ -15,9 +15,9 @@ from palpate_benchmarks.turns import compared, in_turns
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuInstance
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion, Phantom, Stiffness
-from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 
 RADIUS_M = 0.015
 DEPTH_M = 0.010

@@ -13,7 +13,7 @@ from palpate.run.composed import load_services
 from palpate.run.roles import WORKERS
 from palpate_bus.runtime.collection import rare_collections
 from palpate_bus.runtime.composed import Composed
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 SCENARIO, REGION = "clean", "exam.region_m=[0.1, 0.1]"
 

@@ -19,7 +19,7 @@ import numpy as np
 import typer
 
 from palpate.quick.case import run_quick
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """As a study's cases have it. Libraries read it when they are loaded."""

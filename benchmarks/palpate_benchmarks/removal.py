@@ -30,8 +30,8 @@ from palpate_bus.messages.struct_codecs import STRUCT_CODECS
 from palpate_bus.runtime.composed import Composed
 from palpate_conductor.collector import Collector
 from palpate_conductor.tree import FrameTree
-from palpate_models.load import exam_input, load_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import Scenario
 
 SLOT_MS = 100
 MODULES: dict[str, tuple[str, ...]] = {
@@ -43,7 +43,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "rest point's triangles": ("palpate_tissue.surface",),
     "path and its splines": ("palpate_planning.path", "palpate_planning.poses", "palpate_planning.compiled_splines"),
     "perceived surface": ("palpate_planning.surface", "palpate_planning.compiled_splines"),
-    "nearest vertex": ("palpate_models.nearest",),
+    "nearest vertex": ("palpate_models.numerics.nearest",),
 }
 """The modules whose compiled functions call each other: taken away together."""
 SELDOM = {"tissue's step": 6}

@@ -41,7 +41,7 @@ from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.conduct import conduct
 from palpate_conductor.result import RunProgress
 from palpate_conductor.timing import Timing
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 Blow = Callable[[Mapping[str, psutil.Process]], None]
 """Does the damage to some of the processes of a run, which it is given by role, the conductor among them."""

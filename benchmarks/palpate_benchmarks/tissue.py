@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 
 from palpate_benchmarks.turns import compared, in_turns
-from palpate_models.breathing import BreathingCurve
-from palpate_models.patient import Lesion, Phantom, Stiffness
-from palpate_models.phantom import build_phantom
-from palpate_models.wall import MEDIAN
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Lesion, Phantom, Stiffness
+from palpate_models.patient.wall import MEDIAN
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.surface import SkinSurface
 

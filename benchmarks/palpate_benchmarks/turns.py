@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 
 def in_turns(ways: Sequence[Callable[[int], Any]], count: int) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 import typer
 from scipy.stats import trim_mean
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 TURN_S = 0.1
 """Simulated time of a turn."""

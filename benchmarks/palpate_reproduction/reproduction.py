@@ -17,7 +17,7 @@ from palpate.report.archive import Evidence, read_evidence
 from palpate.report.page import known_truth, read_report, sample_places
 from palpate_bus.messages import ExamState
 from palpate_dashboard.replay import recording_of
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 from palpate_reproduction import figures
 from palpate_reproduction.limits import limits
 from palpate_reproduction.runs import GRAPH, SCENARIO, SNAKE, ReproductionCase, RunError

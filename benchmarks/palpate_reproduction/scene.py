@@ -14,11 +14,11 @@ from palpate_bus.messages.geometry import transform_matrix
 from palpate_dashboard import arrays, palette, patient
 from palpate_dashboard.geometry import Carry, VertexNormals, creased
 from palpate_dashboard.replay import RecordedInbox, messages
-from palpate_models import table
-from palpate_models.frames import apply, inverse
-from palpate_models.lbr_visual import visual_meshes
-from palpate_models.load import exam_input
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import apply, inverse
+from palpate_models.robot import table
+from palpate_models.robot.visual import visual_meshes
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 from palpate_reproduction.render import Body
 
 SEEN = ("sim/link_poses", "sim/surface", "assessment/map")

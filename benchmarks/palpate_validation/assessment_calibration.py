@@ -41,9 +41,9 @@ from palpate_assessment.detection import FEATURES, FELT, SURE, Candidate
 from palpate_assessment.findings import causes
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
-from palpate_models.frames import Array
-from palpate_models.load import exam_input, load_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import Scenario
 
 Mask = NDArray[np.bool_]
 

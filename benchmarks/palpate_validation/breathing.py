@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models.breathing import TABLE_S, Breathing, BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.patient import Phantom
-from palpate_models.phantom import build_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import TABLE_S, Breathing, BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Phantom
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK
 

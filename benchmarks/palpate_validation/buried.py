@@ -1,4 +1,4 @@
-"""Lumps below the skin: the formula of `palpate_models.phantom.buried` against the elastic tier, which has depth."""
+"""Lumps below the skin: the formula of `palpate_models.patient.field` against the elastic tier, which has depth."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion
-from palpate_models.phantom import flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.schema import Lesion
 from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, PageSection

@@ -22,13 +22,13 @@ from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Service
 from palpate_bus.setpoint import TOPIC
 from palpate_control.service import create as create_control
-from palpate_models import lbr
-from palpate_models.breathing import Breathing
-from palpate_models.errors import ArmErrors, Errors
-from palpate_models.frames import Array, matrix
-from palpate_models.load import plant_input, true_pose
-from palpate_models.patient import Background, Phantom, Stiffness
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, matrix
+from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.schema import Background, Phantom, Stiffness
+from palpate_models.robot import lbr
+from palpate_models.scenario.errors import ArmErrors, Errors
+from palpate_models.scenario.load import plant_input, true_pose
+from palpate_models.scenario.schema import Scenario
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.poses import least_twist, pose
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_validation.check import Check, PageSection
 from palpate_validation.dart_scene import DartScene, Ellipsoid, Flesh, SoftBox
 from palpate_validation.plots import COLOURS

@@ -19,7 +19,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import open_recording
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_validation.plots import COLOURS, write_figure
 
 STATES, TRUTH = "exam/state", "truth/indentation"

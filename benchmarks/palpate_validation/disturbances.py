@@ -21,9 +21,8 @@ from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient, felt_patient
 from palpate_assessment.assess import assess
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.sampling import ForceSample
-from palpate_models.draw import Build
-from palpate_models.frames import Array
-from palpate_models.patient import Background, Phantom, Stiffness
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.schema import Background, Build, Phantom, Stiffness
 from palpate_validation.felt_scans import ScanErrors, felt_samples
 
 TYPICAL: Final = ScanErrors(stroke_m=7e-4, field_m=5e-4, breathing_m=7e-4, tare_n=0.05)

@@ -16,10 +16,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import find_peaks
 
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, PageSection
 from palpate_validation.dart_scene import DartScene, Flesh, SoftBox

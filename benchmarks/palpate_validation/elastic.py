@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_validation.check import Check, PageSection
 from palpate_validation.hertz import YOUNG_PA, hertz_force, sneddon_force

@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion, Stiffness
-from palpate_models.phantom import PhantomModel, flat_phantom
-from palpate_models.wall import MEDIAN
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.schema import Lesion, Stiffness
+from palpate_models.patient.wall import MEDIAN
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK

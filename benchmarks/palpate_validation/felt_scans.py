@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.sampling import ForceSample
-from palpate_models.seeds import generator
+from palpate_models.numerics.seeds import generator
 
 FIELD_LENGTH_M: Final = 0.015
 """As whole examinations have it: what touches leave of the error of the perceived surface."""

@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models.frames import Array
-from palpate_models.phantom import flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, PageSection
 from palpate_validation.hertz import POISSON, YOUNG_PA, hertz_force

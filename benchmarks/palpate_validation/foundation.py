@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 Profile = Callable[[Array], Array]
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models import press
-from palpate_models.frames import Array
-from palpate_models.guarding import FADING_S, Guarding
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import flat_phantom
-from palpate_models.phantom.tension import tension_of_ratio
-from palpate_models.wall import MEDIAN
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.guarding import FADING_S, Guarding
+from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.schema import Stiffness
+from palpate_models.patient.tension import tension_of_ratio
+from palpate_models.patient.wall import MEDIAN
+from palpate_models.scenario import press
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK, QUIET

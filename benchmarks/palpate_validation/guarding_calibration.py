@@ -33,9 +33,9 @@ from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.detection import Candidate
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
-from palpate_models.frames import Array
-from palpate_models.load import exam_input
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 from palpate_validation.assessment_calibration import real
 
 FIRST: Final = 50

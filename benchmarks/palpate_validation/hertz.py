@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models.frames import Array
-from palpate_models.phantom import flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import flat_phantom
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK, QUIET
 from palpate_validation.probing import static_curve

@@ -29,9 +29,9 @@ from palpate_assessment.calibration import learned
 from palpate_assessment.detection import detect
 from palpate_assessment.model import Bump, errors, fixed
 from palpate_assessment.observations import Observations, observe
-from palpate_models.frames import Array
-from palpate_models.load import load_scenario
-from palpate_models.seeds import generator
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.scenario.load import load_scenario
 from palpate_validation.felt_scans import FIELD_LENGTH_M, ScanErrors, felt_samples
 
 LENGTHS_M: Final = (0.015, 0.05, 0.15)

@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel, flat_phantom
-from palpate_models.remus2024 import RADIUS_M, SPEED_MPS
-from palpate_models.wall import WallParameters
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.remus2024 import RADIUS_M, SPEED_MPS
+from palpate_models.patient.schema import Stiffness
+from palpate_models.patient.wall import WallParameters
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 HALF_M = 0.08

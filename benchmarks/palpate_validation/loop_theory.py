@@ -27,9 +27,9 @@ from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Reference
-from palpate_models.frames import Array
-from palpate_models.lbr import urdf
-from palpate_models.phantom import build_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.robot.lbr import urdf
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.friction import shear_stiffness

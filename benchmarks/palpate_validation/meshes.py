@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.sparse.linalg import spsolve
 
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion, Stiffness
-from palpate_models.phantom import flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, PageSection
 from palpate_validation.foundation import static_force, uniform

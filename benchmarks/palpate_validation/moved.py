@@ -13,8 +13,8 @@ import numpy as np
 import typer
 
 from palpate.report.archive import EvidenceError, read_evidence
-from palpate_models.load import ScenarioError, load_scenario
-from palpate_models.motion import BodyMotion
+from palpate_models.patient.motion import BodyMotion
+from palpate_models.scenario.load import ScenarioError, load_scenario
 
 NOTICED: Final = "the patient has moved"
 """What `exam/state` says when it is noticed."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate_models import remus2024
-from palpate_models.frames import Array
-from palpate_models.remus2024 import Fit, exponent
-from palpate_models.wall import MEDIAN
+from palpate_models.numerics.frames import Array
+from palpate_models.patient import remus2024
+from palpate_models.patient.remus2024 import Fit, exponent
+from palpate_models.patient.wall import MEDIAN
 from palpate_validation.check import Check, PageSection
 from palpate_validation.indentation import SPACING_M, force_along, press, wall_tissue
 from palpate_validation.people_fit import COMPARED_M, RATIO_AT_M, at_depths

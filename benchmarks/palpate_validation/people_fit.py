@@ -15,10 +15,10 @@ from rich.progress import track
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import least_squares
 
-from palpate_models import remus2024
-from palpate_models.frames import Array
-from palpate_models.remus2024 import Fit
-from palpate_models.wall import MEDIAN, WallParameters
+from palpate_models.numerics.frames import Array
+from palpate_models.patient import remus2024
+from palpate_models.patient.remus2024 import Fit
+from palpate_models.patient.wall import MEDIAN, WallParameters
 from palpate_validation.indentation import SPACING_M, press
 
 LENGTHS_M = np.geomspace(0.005, 0.026, 9)

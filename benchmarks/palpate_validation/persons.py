@@ -11,12 +11,11 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from palpate.quick.felt import force_at_10_mm
-from palpate_models.draw import Build
-from palpate_models.frames import Array
-from palpate_models.patient import Phantom
-from palpate_models.person import drawn
-from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.phantom.bones import bone_share
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.abdomen import bone_share
+from palpate_models.patient.person import drawn
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.patient.schema import Build, Phantom
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK, QUIET
 

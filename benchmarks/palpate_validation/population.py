@@ -8,14 +8,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from palpate_models import remus2024
-from palpate_models.draw import Build
-from palpate_models.frames import Array
-from palpate_models.patient import Phantom
-from palpate_models.person import drawn
-from palpate_models.phantom.healthy import belly, healthy_wall
-from palpate_models.phantom.tension import pressed_force
-from palpate_models.seeds import generator
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.patient import remus2024
+from palpate_models.patient.healthy import belly, healthy_wall
+from palpate_models.patient.person import drawn
+from palpate_models.patient.schema import Build, Phantom
+from palpate_models.patient.tension import pressed_force
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK
 
@@ -75,7 +74,7 @@ def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> PopulationSa
     """Persons of the seeds 0, 1, 2 .., each pressed at `PLACES` random places of the belly away from bone.
 
     The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
-    (`palpate_models.phantom.tension.pressed_force`, which is within 3 % of the file at nearly all of its fitted places); the zero
+    (`palpate_models.patient.tension.pressed_force`, which is within 3 % of the file at nearly all of its fitted places); the zero
     offset is the fits' median.
     """
     offset = float(np.median([fit.zero_offset_m for fit in remus2024.fitted().values()]))

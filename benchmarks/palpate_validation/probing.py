@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 ELASTIC = Stiffness(k_w_n_per_m3=1.7e5, length_m=0.015, stiffening_per_m=0.0, prony_g=(), prony_tau_s=(), friction=0.0)

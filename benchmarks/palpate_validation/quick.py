@@ -30,9 +30,9 @@ from palpate.report.rows import Report
 from palpate.report.scoring import Map
 from palpate.truth.felt import Felt
 from palpate.truth.touched import Touched
-from palpate_models.frames import Array
-from palpate_models.load import load_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_validation.plots import COLOURS, QUIET, write_figure
 
 LEVEL: Final = 0.90

@@ -31,9 +31,9 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import open_recording
 from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected
-from palpate_models.load import load_scenario
-from palpate_models.phantom.field import gaussian_field
-from palpate_models.scenario import Scenario
+from palpate_models.patient.field import gaussian_field
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_validation.felt_scans import FIELD_LENGTH_M
 
 Change = Callable[[Any, float], None]

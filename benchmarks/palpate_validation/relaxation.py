@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import curve_fit
 
-from palpate_models.frames import Array
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import Check, PageSection
 from palpate_validation.plots import COLOURS, INK

@@ -17,10 +17,10 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.recordings import open_recording
-from palpate_models.frames import Array, apply, inverse, matrix
-from palpate_models.load import exam_input, load_scenario, true_pose
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, apply, inverse, matrix
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import exam_input, load_scenario, true_pose
+from palpate_models.scenario.schema import Scenario
 from palpate_validation.plots import write_figure
 
 SURFACE, IMAGES, ALL = "perception/surface", "perception/correction", "exam/correction"

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate_models.frames import Array
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.dart_scene import Ellipsoid, Flesh, SoftBox
 

@@ -1,7 +1,7 @@
 """The main of every service process: `python -m palpate_<role> [NAME_OR_FILE]`.
 
     from palpate_bus.run import main
-    from palpate_models.load import load_scenario
+    from palpate_models.scenario.load import load_scenario
 
     if __name__ == "__main__":
         main("control", load_scenario)

@@ -11,7 +11,7 @@ from palpate.fuzz.bus_targets import Broken, FuzzTarget
 from palpate.fuzz.fuzz import all_targets, attempt, campaign, choose, mutate
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
-from palpate_models.load import ScenarioError, load_scenario
+from palpate_models.scenario.load import ScenarioError, load_scenario
 
 
 @pytest.mark.parametrize("target", all_targets(), ids=lambda target: target.name)

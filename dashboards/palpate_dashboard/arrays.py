@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.messages import Transform
 from palpate_bus.messages.codec import Message
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 
 def points(items: Any) -> Array:

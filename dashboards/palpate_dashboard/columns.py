@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 TIMELINE = "sim_time"
 """The recording's only timeline: simulated time."""

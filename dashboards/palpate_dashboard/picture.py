@@ -21,7 +21,7 @@ from PIL import Image
 from palpate_dashboard.replay import draw, messages, recording_of
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live, address
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")

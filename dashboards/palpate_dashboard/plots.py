@@ -12,7 +12,7 @@ import rerun as rr
 from palpate_bus.contract import contract
 from palpate_dashboard.columns import TIMELINE, Columns, scalars
 from palpate_dashboard.words import LEVELS, Health
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 PHASES: Final = (
     ("home", (120, 130, 145)),

@@ -22,7 +22,7 @@ from palpate_bus.recordings import BROKEN, complete_records
 from palpate_bus.settings import RECORDING
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 DISORDER = 2_000_000_000
 """Messages in a recording are at most so far out of order [ns]."""

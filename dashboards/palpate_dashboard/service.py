@@ -32,13 +32,13 @@ from palpate_dashboard.map import MapView
 from palpate_dashboard.plots import Plots
 from palpate_dashboard.scene import SceneView, Shaded
 from palpate_dashboard.sinks import Live, open_recording
-from palpate_models import lbr, table
-from palpate_models.band import half_width
-from palpate_models.frames import apply, inverse
-from palpate_models.lbr_visual import visual_meshes
-from palpate_models.level_lines import level_lines
-from palpate_models.load import exam_input
-from palpate_models.scenario import Robot, Scenario
+from palpate_models.numerics.band import half_width
+from palpate_models.numerics.frames import apply, inverse
+from palpate_models.numerics.level_lines import level_lines
+from palpate_models.robot import lbr, table
+from palpate_models.robot.visual import visual_meshes
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Robot, Scenario
 
 FILE: Final = "recording.rrd"
 CAMERA_FRAME: Final = contract().topics["camera/depth/image_raw"].frame

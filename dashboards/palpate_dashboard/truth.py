@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from palpate_models.breathing import BreathingCurve
-from palpate_models.errors import DrawnErrors, draw_errors
-from palpate_models.frames import Array
-from palpate_models.motion import BodyMotion
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.motion import BodyMotion
+from palpate_models.scenario.errors import DrawnErrors, draw_errors
+from palpate_models.scenario.schema import Scenario
 
 
 def page(scenario: Scenario) -> str:

@@ -42,9 +42,9 @@ from palpate_bus.messages import (
     Wrench,
 )
 from palpate_bus.messages.stamps import header, time_message
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 
 MS = 1_000_000
 OBSERVED = frozenset(topic.name for topic, _ in contract().inputs("dashboard"))

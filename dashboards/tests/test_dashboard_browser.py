@@ -20,7 +20,7 @@ from palpate_dashboard import palette
 from palpate_dashboard.picture import BROWSERS, PATIENCE_S, look, page_at
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 SCENE = {"skin": (palette.SKIN, 4, 0.001), "table": (palette.SHEET, 4, 0.001), "drape": (palette.DRAPE, 5, 0.01)}
 """What the scene must show: colour, reach of its hue [deg], part of the page (of a small region 0.003 is skin)."""

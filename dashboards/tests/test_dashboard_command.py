@@ -20,8 +20,8 @@ from palpate_bus.messages import codec
 from palpate_dashboard import replay
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
-from palpate_models.load import dump_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import dump_scenario
+from palpate_models.scenario.schema import Scenario
 
 app = typer.Typer()
 app.command()(dashboard)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from palpate_dashboard.patient import HANG_M, Bed, parts, window
-from palpate_models.patient import Phantom
-from palpate_models.phantom import build_phantom
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Phantom
 
 BED = Bed(height=-0.20, half_width=0.275)
 REGION, CENTRE = (0.20, 0.20), (0.0, 0.0)

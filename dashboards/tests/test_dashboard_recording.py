@@ -22,9 +22,9 @@ from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import AWAITED
 from palpate_dashboard.service import FILE, DashboardService, create
 from palpate_dashboard.sinks import Live
-from palpate_models import lbr
-from palpate_models.load import dump_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import dump_scenario
+from palpate_models.scenario.schema import Scenario
 
 SECONDS = 12.0
 

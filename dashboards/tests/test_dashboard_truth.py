@@ -7,11 +7,11 @@ import re
 import numpy as np
 
 from palpate_dashboard.truth import page
-from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.errors import Errors, draw_errors
-from palpate_models.motion import BodyMotion, Motion
-from palpate_models.patient import Phantom
-from palpate_models.scenario import Scenario
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.motion import BodyMotion, Motion
+from palpate_models.patient.schema import Phantom
+from palpate_models.scenario.errors import Errors, draw_errors
+from palpate_models.scenario.schema import Scenario
 
 
 def numbers(scenario: Scenario, row: str) -> list[float]:

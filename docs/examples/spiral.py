@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from palpate_models.patterns.scan import Scan
+from palpate_models.scenario.patterns import Scan
 
 
 def scan(exam, surface):

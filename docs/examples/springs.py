@@ -4,10 +4,10 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
-from palpate_models import press
-from palpate_models.breathing import BreathingCurve
-from palpate_models.load import true_pose
-from palpate_models.phantom import build_phantom
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario import press
+from palpate_models.scenario.load import true_pose
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.service import TissueService
 

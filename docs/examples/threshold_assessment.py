@@ -5,9 +5,9 @@ import numpy as np
 from palpate_bus.messages import ExamState, Finding, Findings, Point
 from palpate_bus.messages.stamps import header
 from palpate_bus.service import Service
-from palpate_models.frames import apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.phantom import quadrant
+from palpate_models.numerics.frames import apply, inverse
+from palpate_models.scenario.load import exam_input
+from palpate_models.section import quadrant
 
 
 class Threshold(Service):

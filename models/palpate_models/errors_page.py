@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from palpate_models.errors import LEVEL, Errors, table
+from palpate_models.scenario.errors import LEVEL, Errors, table
 
 PAGE: Final = Path("docs/errors.md")
 _HEAD: Final = f"""# Errors of sensors, calibrations and arm
 
-Made from [`errors.py`](../models/palpate_models/errors.py) and
+Made from [`errors.py`](../models/palpate_models/scenario/errors.py) and
 [`error_levels.yaml`](../models/palpate_models/error_levels.yaml) by `make docs`.
 
     palpate run --set errors=typical                              a level: none, typical or poor; {LEVEL} is the default

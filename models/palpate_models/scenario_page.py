@@ -8,13 +8,13 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, Final, get_args, get_origin
 
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_models.section import UNITS, Section
 
 PAGE: Final = Path("docs/scenario.md")
 _HEAD: Final = """# Fields of a scenario
 
-Made from the models in [`palpate_models`](../models/palpate_models/scenario.py) by `make docs`.
+Made from the models in [`palpate_models`](../models/palpate_models/scenario/schema.py) by `make docs`.
 
 A scenario is a YAML file; what it does not mention has the default. `palpate scenarios` lists those that come with Palpate, and
 `--set` changes a field for one run:

@@ -39,3 +39,8 @@ class Pose(Section):
 
     xyz_m: Vec3 = (0.0, 0.0, 0.0)
     rpy_rad: Vec3 = (0.0, 0.0, 0.0)
+
+
+def quadrant(x: float, y: float) -> str:
+    """The quadrant of a point of A [m]: RUQ, LUQ, RLQ or LLQ. The patient's right is x < 0, lower is y < 0."""
+    return ("R" if x < 0 else "L") + ("L" if y < 0 else "U") + "Q"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from palpate_models.breathing import MOST_M, STILL, TABLE_S, Breathing, BreathingCurve
+from palpate_models.patient.breathing import MOST_M, STILL, TABLE_S, Breathing, BreathingCurve
 
 QUIET = Breathing(kind="quiet")
 

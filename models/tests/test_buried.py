@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.phantom import build_phantom
-from palpate_models.phantom.buried import at_skin
-from palpate_models.phantom.field import lesion_field
+from palpate_models.patient.field import at_skin, lesion_field
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Lesion, Phantom
 
 radius = st.floats(0.005, 0.040)
 depth = st.floats(0.0, 0.040)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models import cache
-from palpate_models.cache import content_key, remembered
+from palpate_models.numerics import cache
+from palpate_models.numerics.cache import content_key, remembered
 
 
 def test_a_result_is_named_by_what_it_depends_on_and_by_the_code_that_makes_it(tmp_path):

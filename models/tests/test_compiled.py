@@ -9,7 +9,7 @@ from pathlib import Path
 
 CALLER = """
 from inner import inner
-from palpate_models.compiled import compiled
+from palpate_models.numerics.compiled import compiled
 
 @compiled
 def outer(x):
@@ -18,7 +18,7 @@ def outer(x):
 print(outer(1.0))
 """
 INNER = """
-from palpate_models.compiled import compiled
+from palpate_models.numerics.compiled import compiled
 
 @compiled
 def inner(x):

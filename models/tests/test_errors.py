@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from palpate_models.errors import MOMENT_PER_FORCE_M, Errors, draw_errors, levels, table
 from palpate_models.errors_page import PAGE, page
-from palpate_models.frames import matrix
-from palpate_models.load import ScenarioError, load_scenario, true_pose
+from palpate_models.numerics.frames import matrix
+from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, Errors, draw_errors, levels, table
+from palpate_models.scenario.load import ScenarioError, load_scenario, true_pose
 from palpate_models.section import Pose
 
 ROOT = Path(__file__).resolve().parents[2]

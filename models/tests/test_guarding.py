@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from palpate_models.guarding import Activation, Guarding
-from palpate_models.patient import Background, Phantom, Stiffness
-from palpate_models.phantom import MeshError, build_phantom
-from palpate_models.phantom.tension import pressed_force, tension_of_ratio
+from palpate_models.patient.guarding import Activation, Guarding
+from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Background, Phantom, Stiffness
+from palpate_models.patient.tension import pressed_force, tension_of_ratio
 
 LOWER_RIGHT = Guarding(centre_m=(-0.06, -0.06))
 

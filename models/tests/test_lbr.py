@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from palpate_models import lbr
-from palpate_models.scenario import Robot
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ import numpy as np
 import pinocchio
 import pytest
 
-from palpate_models import lbr
-from palpate_models.lbr_kinematics import link_transforms, tool_jacobian, tool_pose
-from palpate_models.scenario import Robot
+from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import link_transforms, tool_jacobian, tool_pose
+from palpate_models.scenario.schema import Robot
 
 ROBOT = Robot(base_yaw_rad=0.3)
 POSES = [lbr.HOME, np.linspace(-1, 1, 7), np.full(7, 0.4)]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from palpate_models import lbr
-from palpate_models.lbr_shape import Z, blend, box, cone, cut, cylinder, half_space, mesh, revolve
-from palpate_models.lbr_visual import VisualMesh, visual_meshes
-from palpate_models.scenario import Robot
+from palpate_models.robot import lbr
+from palpate_models.robot.solids import Z, blend, box, cone, cut, cylinder, half_space, mesh, revolve
+from palpate_models.robot.visual import VisualMesh, visual_meshes
+from palpate_models.scenario.schema import Robot
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate_models.load import ScenarioError, dump_scenario, load_scenario, scenario_names
+from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario, scenario_names
 
 
 def scenario(folder: Path, text: str) -> str:

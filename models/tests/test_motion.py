@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from palpate_models.frames import apply
-from palpate_models.motion import BodyMotion, Motion
+from palpate_models.numerics.frames import apply
+from palpate_models.patient.motion import BodyMotion, Motion
 
 SHIFT = Motion(kind="shift", shift_m=0.010, at_s=20.0, over_s=0.5)
 TURN = Motion(kind="turn", at_s=20.0, over_s=0.5)

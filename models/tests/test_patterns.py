@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from palpate_models.load import ScenarioError, load_scenario
-from palpate_models.pattern_choice import OURS, PatternError
-from palpate_models.patterns.lattice import lattice
-from palpate_models.patterns.scan import Scan, scan_of
-from palpate_models.scenario import Exam
+from palpate_models.scenario.load import ScenarioError, load_scenario
+from palpate_models.scenario.named_function import OURS, PatternError
+from palpate_models.scenario.patterns import Scan, lattice, scan_of
+from palpate_models.scenario.schema import Exam
 
 SPIRAL = Path(__file__).parents[2] / "docs" / "examples" / "spiral.py"
 exams = st.builds(
@@ -99,7 +98,7 @@ def test_a_pattern_of_ones_own_is_a_file_with_a_function() -> None:
 def test_a_file_that_is_no_pattern_is_told_with_its_line(tmp_path: Path, text: str | None, said: str) -> None:
     file = tmp_path / "mine.py"
     if text is not None:
-        file.write_text(text.replace("HEAD", "import numpy as np\nfrom palpate_models.patterns.scan import Scan"))
+        file.write_text(text.replace("HEAD", "import numpy as np\nfrom palpate_models.scenario.patterns import Scan"))
     with pytest.raises(PatternError, match=said):
         made(Exam(), str(file))
 

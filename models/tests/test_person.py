@@ -9,20 +9,17 @@ import pytest
 from pydantic import ValidationError
 from scipy.stats import kurtosis
 
-from palpate_models.anatomy import Anatomy, Muscles, Skeleton, Variation
-from palpate_models.breathing import Breathing
-from palpate_models.draw import Build, Draw
-from palpate_models.load import ScenarioError, dump_scenario, load_scenario
-from palpate_models.patient import Phantom, Stiffness
-from palpate_models.person import FAT_YOUNG_PA, MEASURED_FAT_M, drawn, under_fat
-from palpate_models.phantom import build_phantom
-from palpate_models.phantom.bones import bone_share
-from palpate_models.phantom.healthy import belly, healthy_wall
-from palpate_models.phantom.variation import NaturalField
-from palpate_models.remus2024 import fitted
-from palpate_models.scenario import Scenario
-from palpate_models.seeds import generator
-from palpate_models.wall_statistics import moments, wall_statistics
+from palpate_models.numerics.seeds import generator
+from palpate_models.patient.abdomen import bone_share
+from palpate_models.patient.anatomy import Anatomy, Muscles, Skeleton, Variation
+from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.healthy import NaturalField, belly, healthy_wall
+from palpate_models.patient.person import FAT_YOUNG_PA, MEASURED_FAT_M, drawn, moments, under_fat, wall_statistics
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.remus2024 import fitted
+from palpate_models.patient.schema import Build, Draw, Phantom, Stiffness
+from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario
+from palpate_models.scenario.schema import Scenario
 
 PERSON = Phantom(kind="person")
 SIZE = (0.36, 0.46, 0.20)

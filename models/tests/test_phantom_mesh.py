@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from palpate_models.frames import look_at
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.phantom import MeshError, build_phantom
-from palpate_models.phantom.mesh import orient, refine
-from palpate_models.phantom.parametric import parametric_surface
-from palpate_models.scenario import Limits
+from palpate_models.numerics.frames import look_at
+from palpate_models.patient.abdomen import parametric_surface
+from palpate_models.patient.mesh import MeshError, orient, refine
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.schema import Limits
 
 
 def dome(subdivisions=4):

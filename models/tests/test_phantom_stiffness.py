@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_models.patient import Background, Lesion, Phantom
-from palpate_models.phantom import build_phantom
-from palpate_models.phantom.field import background_factor, edge_distance, gaussian_field, lesion_field
+from palpate_models.patient.field import background_factor, edge_distance, gaussian_field, lesion_field
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Background, Lesion, Phantom
 
 
 def test_background_has_the_asked_mean_variation_and_correlation():

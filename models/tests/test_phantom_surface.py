@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_models.patient import Phantom
-from palpate_models.phantom import build_phantom, quadrant
-from palpate_models.phantom.parametric import parametric_surface
+from palpate_models.patient.abdomen import parametric_surface
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Phantom
+from palpate_models.section import quadrant
 
 
 def edges_of(triangles):

@@ -7,8 +7,8 @@ from hashlib import sha256
 import numpy as np
 import pytest
 
-from palpate_models import remus2024
-from palpate_models.remus2024 import curve, curves, exponent, fitted, relaxed_people
+from palpate_models.patient import remus2024
+from palpate_models.patient.remus2024 import curve, curves, exponent, fitted, relaxed_people
 
 
 def test_the_file_is_as_published() -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate_models.scenario import Robot
-from palpate_models.table import Box, boxes
+from palpate_models.robot.table import Box, boxes
+from palpate_models.scenario.schema import Robot
 
 
 def _corners(box: Box) -> np.ndarray:

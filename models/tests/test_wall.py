@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_models import wall
+from palpate_models.patient import wall
 
 BETAS = (20.0, 77.0, 200.0)
 

@@ -42,7 +42,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.live.console import EXIT_TROUBLE, print_json
     from palpate_bus.implementations import ChoiceError
     from palpate_bus.runs.joining import NoBus
-    from palpate_models.load import ScenarioError, load_scenario
+    from palpate_models.scenario.load import ScenarioError, load_scenario
 
     with refusing():
         if role not in SUITES:

@@ -16,7 +16,7 @@ from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.runtime.lockstep import Packet, Sent, Stepper
 from palpate_bus.service import Service
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 Source = Callable[[int], "Message | None"]
 """The message of a topic at a time [ns] on the rig's clock; None for silence."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate_bus.messages import SurfaceMesh
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import header
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 CURVATURE = 2.0
 """z = -CURVATURE (x^2 + y^2) [1/m]: a radius of a quarter metre at the top."""

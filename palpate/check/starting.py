@@ -13,7 +13,7 @@ from pathlib import Path
 
 from palpate.check.rig import RigSettings
 from palpate_bus.runs.joining import NoBus
-from palpate_models.load import dump_scenario, view_of
+from palpate_models.scenario.load import dump_scenario, view_of
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from importlib import resources
 from pathlib import Path
 
 from palpate.fuzz.bus_targets import FuzzTarget
-from palpate_models.load import ScenarioError, dump_scenario, load_scenario, scenario_names
+from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario, scenario_names
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="palpate-fuzz-")
 

@@ -27,8 +27,8 @@ from palpate.report.rows import Report
 from palpate.run.folder import usual_folder
 from palpate.run.options import DEFAULT_SCENARIO
 from palpate_bus.settings import RECORDING
-from palpate_models.load import dump_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import dump_scenario
+from palpate_models.scenario.schema import Scenario
 
 _SEEN_FRAMES: Final = ("time", "phase", "depth", "setpoint", "force", "in_contact", "steady", "force_limited")
 

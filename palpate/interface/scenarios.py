@@ -8,8 +8,8 @@ from typing import Any
 
 from palpate.run.inputs import examinable
 from palpate.run.options import DEFAULT_SCENARIO
-from palpate_models.load import ScenarioError, as_settings, load_scenario, whole_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import ScenarioError, as_settings, load_scenario, whole_scenario
+from palpate_models.scenario.schema import Scenario
 
 
 def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int | None = None, **settings: Any) -> Scenario:
@@ -49,7 +49,7 @@ def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int |
     >>> palpate.scenario("lump", exam={"dept_m": 0.008})
     Traceback (most recent call last):
         ...
-    palpate_models.load.ScenarioError: --set exam.dept_m: exam.dept_m = 0.008: there is no such field. Did you mean depth_m?
+    ScenarioError: --set exam.dept_m: exam.dept_m = 0.008: there is no such field. Did you mean depth_m?
     """
     words = as_settings(dict(paths(settings)))
     if isinstance(source, Scenario):

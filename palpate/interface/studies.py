@@ -18,7 +18,7 @@ from palpate.study.runner import missing, opened, run_cases
 from palpate.study.spec import Split, StudyError, load_study, with_methods
 from palpate.study.summary import PAGE
 from palpate.study.workers import cores, threads
-from palpate_models.load import as_settings
+from palpate_models.scenario.load import as_settings
 
 
 class StudyResult:

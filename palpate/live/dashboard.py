@@ -44,7 +44,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
     from palpate_bus.runs.joining import NoBus, named_runs
     from palpate_bus.settings import BusConfigError
     from palpate_dashboard.picture import NoPicture, film, take
-    from palpate_models.load import ScenarioError
+    from palpate_models.scenario.load import ScenarioError
 
     console = Console(stderr=True)
 

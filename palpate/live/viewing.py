@@ -20,7 +20,7 @@ from palpate_dashboard import replay
 from palpate_dashboard.follow import follow
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import MEMORY_LIMIT, Live, address
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 class NothingToShow(RuntimeError):

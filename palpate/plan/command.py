@@ -37,8 +37,8 @@ def plan(
     from palpate.plan.drawing import draw
     from palpate.plan.prospect import NoPathError, prospect, summary
     from palpate.run.inputs import usable
-    from palpate_models.pattern_choice import PatternError
-    from palpate_models.phantom import build_phantom
+    from palpate_models.patient.phantom import build_phantom
+    from palpate_models.scenario.named_function import PatternError
 
     chosen = usable(scenario, settings, seed)
     try:

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from palpate.plan.prospect import Prospect
-from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Scenario
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.scenario.schema import Scenario
 
 MM = 1e3
 CONTOURS = "#c9d1d4"

@@ -10,12 +10,12 @@ from scipy.spatial import Delaunay
 from palpate.quick.patient import seen_lattice
 from palpate.run.outlook import Outlook
 from palpate.run.region import scan_over, surface_of
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.lbr import HOME
-from palpate_models.load import exam_input
-from palpate_models.patterns.scan import Scan
-from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Exam, Mode, Scenario
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.robot.lbr import HOME
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.patterns import Scan
+from palpate_models.scenario.schema import Exam, Mode, Scenario
 from palpate_planning.exam_planner import ExamPlanner, PerceivedAbdomen
 from palpate_planning.motion_planning import NoPathError
 from palpate_planning.surface import PerceivedSurface

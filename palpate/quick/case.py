@@ -24,7 +24,7 @@ from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.service import Service
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunResult
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 RUNTIME: Final = "quick"
 _HASHED: Final = ("assessment/samples", "assessment/map", "assessment/findings")

@@ -28,12 +28,12 @@ from scipy.signal import lfilter
 from palpate.quick.patient import PERIOD_S
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
-from palpate_models import lbr
-from palpate_models.errors import Level, draw_errors, levels
-from palpate_models.frames import Array
-from palpate_models.scenario import Exam, Following, Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.robot import lbr
+from palpate_models.scenario.errors import Level, draw_errors, levels
+from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_models.section import NonNegative, Positive, Section
-from palpate_models.seeds import generator
 from palpate_planning.descent import TARE_S
 from palpate_robot.ft_sensor import FtSensor
 

@@ -18,10 +18,10 @@ import numpy as np
 from palpate.quick.errors import Loop
 from palpate.quick.patient import PERIOD_S, Patient, seen_lattice
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.patterns.scan import scan_of
-from palpate_models.scenario import Following, Mode, Scenario
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.patterns import scan_of
+from palpate_models.scenario.schema import Following, Mode, Scenario
 from palpate_planning.breath import Breath
 from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
 from palpate_planning.coverage import strokes, transfer

@@ -15,11 +15,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.signal import fftconvolve
 from scipy.special import k0, k1
 
-from palpate_models.frames import Array
-from palpate_models.patient import Phantom, Stiffness
-from palpate_models.person import drawn
-from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.phantom.tension import pressed_force
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.person import drawn
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.patient.schema import Phantom, Stiffness
+from palpate_models.patient.tension import pressed_force
 
 PITCH_M: Final = 0.004
 HALF_M: Final = 0.148

@@ -13,7 +13,7 @@ from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Poin
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
-from palpate_models.frames import apply
+from palpate_models.numerics.frames import apply
 from palpate_planning.status import PHASE_OF
 
 LEAVES_S: Final = 1.0

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.tissue import true_tissue
-from palpate_models.frames import Array, inverse, matrix
-from palpate_models.load import seen, true_pose, whole_scenario
-from palpate_models.motion import BodyMotion
-from palpate_models.patterns.lattice import stations
-from palpate_models.scenario import Exam, Following, Scenario
+from palpate_models.numerics.frames import Array, inverse, matrix
+from palpate_models.patient.motion import BodyMotion
+from palpate_models.scenario.load import seen, true_pose, whole_scenario
+from palpate_models.scenario.patterns import stations
+from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
 from palpate_planning.wall_watch import GATE_M
 

@@ -31,11 +31,11 @@ from palpate.report.archive import read_evidence
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
-from palpate_models.breathing import BreathingCurve
-from palpate_models.frames import Array, apply, matrix
-from palpate_models.load import exam_input, load_scenario, true_pose
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, apply, matrix
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import exam_input, load_scenario, true_pose
+from palpate_models.scenario.schema import Scenario
 
 APART_S: Final = 3.0
 """Measurements that lie further apart in time share nothing but the surface's own error."""

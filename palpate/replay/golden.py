@@ -16,8 +16,8 @@ from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Service
-from palpate_models.load import load_scenario, view_of
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import load_scenario, view_of
+from palpate_models.scenario.schema import Scenario
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from palpate_bus.implementations import ChoiceError
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_bus.settings import BusConfigError
-from palpate_models.load import ScenarioError
+from palpate_models.scenario.load import ScenarioError
 
 
 @dataclass(frozen=True)

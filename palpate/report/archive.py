@@ -28,7 +28,7 @@ from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 FILE: Final = "evidence.npz"
 _MESSAGES: Final = {

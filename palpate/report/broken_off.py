@@ -16,8 +16,8 @@ from palpate_bus.runs.announcement import live
 from palpate_bus.runs.run_name import in_use
 from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected, Collector
-from palpate_models.load import ScenarioError, load_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import ScenarioError, load_scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_recorder.recover import salvage
 
 STILL_S: Final = 3.0

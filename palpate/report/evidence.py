@@ -19,10 +19,10 @@ from palpate.truth.touched import Touched
 from palpate_bus.messages import StiffnessMap
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.motion import BodyMotion
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.patient.motion import BodyMotion
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 
 Mask = NDArray[np.bool_]
 xyz: Final = attrgetter("x", "y", "z")

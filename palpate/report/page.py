@@ -24,10 +24,10 @@ from palpate.report.files import write_text
 from palpate.report.results import clean_words, unassessed
 from palpate.report.rows import FindingRow, Report
 from palpate.report.scoring import Truth
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.load import ScenarioError, exam_input, load_scenario
-from palpate_models.phantom import quadrant
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario.load import ScenarioError, exam_input, load_scenario
+from palpate_models.scenario.schema import Scenario
+from palpate_models.section import quadrant
 
 FILE: Final = "report.html"
 QUADRANTS: Final = {

@@ -24,7 +24,7 @@ from palpate.report.figures import (
 )
 from palpate.report.scoring import Truth
 from palpate_bus.messages import ExamState
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 MEASURED: Final = "#c2410c"
 TRUE: Final = "#7c3aed"

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from palpate.report.evidence import map_of
 from palpate.report.figures import FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS
-from palpate_models.band import half_width
-from palpate_models.frames import Array
-from palpate_models.level_lines import level_lines
-from palpate_models.phantom.mesh import vertex_normals
+from palpate_models.numerics.band import half_width
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.level_lines import level_lines
+from palpate_models.patient.mesh import vertex_normals
 
 MAX_VERTICES = 65_535
 """The viewer's indices have 16 bits."""

@@ -20,8 +20,8 @@ from palpate_bus.messages import ExamState, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordedMessage, RecordingError
 from palpate_conductor.result import RunResult, given_up
-from palpate_models.load import seen, view_of
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import seen, view_of
+from palpate_models.scenario.schema import Scenario
 
 RUNTIME: Final = "recovered"
 

@@ -36,11 +36,11 @@ from palpate.truth.surface import TrueBody
 from palpate_bus.runs.run_name import run_of
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunResult
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.motion import BodyMotion
-from palpate_models.phantom import quadrant
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.patient.motion import BodyMotion
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
+from palpate_models.section import quadrant
 
 log = logging.getLogger(__name__)
 

@@ -25,10 +25,10 @@ from palpate_bus.messages.geometry import vector
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.settings import variable
 from palpate_conductor.collector import Collected
-from palpate_models.checkpoint import Checkpoint
-from palpate_models.frames import apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import apply, inverse
+from palpate_models.scenario.checkpoint import Checkpoint
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 
 FOLDER: Final = "resumed"
 """Within the folder of the run that is gone on with."""

@@ -21,7 +21,7 @@ from scipy.spatial import Delaunay
 from palpate.truth.felt import Felt, Lump
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.touched import Touched
-from palpate_models.frames import Array, apply
+from palpate_models.numerics.frames import Array, apply
 
 Mask = NDArray[np.bool_]
 

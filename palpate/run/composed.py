@@ -20,8 +20,8 @@ from palpate_conductor.outcome import in_words
 from palpate_conductor.result import RunProgress, RunResult, Tell, given_up
 from palpate_conductor.timing import SIM_LIMIT
 from palpate_conductor.tree import FrameTree
-from palpate_models.load import exam_input, seen, view_of
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import exam_input, seen, view_of
+from palpate_models.scenario.schema import Scenario
 
 
 def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:

@@ -23,7 +23,7 @@ from palpate_bus.messages import RobotStatus
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.settings import RECORDING
 from palpate_conductor.result import RunResult
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 log = logging.getLogger(__name__)
 

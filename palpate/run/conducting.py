@@ -17,7 +17,7 @@ from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.conduct import conduct
 from palpate_conductor.timing import Timing
 from palpate_conductor.tree import FrameTree
-from palpate_models.load import ScenarioError, exam_input, load_scenario
+from palpate_models.scenario.load import ScenarioError, exam_input, load_scenario
 
 NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
 

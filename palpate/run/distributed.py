@@ -20,8 +20,8 @@ from palpate_conductor.outcome import Patience
 from palpate_conductor.result import RunProgress, RunResult, Tell
 from palpate_conductor.timing import Timing
 from palpate_conductor.tree import FrameTree
-from palpate_models.load import exam_input
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 
 
 def run_distributed(

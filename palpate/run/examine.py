@@ -39,7 +39,7 @@ from palpate_bus.settings import BusConfigError, Settings
 from palpate_conductor.outcome import RunFailed
 from palpate_conductor.result import RunResult, Tell
 from palpate_conductor.timing import Timing
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from palpate_bus.run import Hosted, chosen, host
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 class GroupMember(NamedTuple):

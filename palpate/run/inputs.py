@@ -8,10 +8,11 @@ from palpate.command_line import refuse
 from palpate.run.region import scan_over, with_whole_path
 from palpate.run.roles import NONE, checked, settings_of
 from palpate_bus.implementations import ChoiceError
-from palpate_models.load import ScenarioError, load_scenario
-from palpate_models.pattern_choice import PatternError
-from palpate_models.phantom import MeshError, build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import ScenarioError, load_scenario
+from palpate_models.scenario.named_function import PatternError
+from palpate_models.scenario.schema import Scenario
 
 
 def usable(

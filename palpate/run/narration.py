@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from palpate.run.outlook import Outlook
 from palpate_bus.messages import ExamState
-from palpate_models.scenario import Exam, Mode
+from palpate_models.scenario.schema import Exam, Mode
 
 PHASES: Final = {
     getattr(ExamState, f"PHASE_{name}"): name.lower()

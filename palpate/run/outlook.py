@@ -7,10 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.patterns.scan import Scan, scan_of
-from palpate_models.patterns.touches import touch_centres
-from palpate_models.scenario import Exam, Mode
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.patterns import Scan, scan_of, touch_centres
+from palpate_models.scenario.schema import Exam, Mode
 
 _BEFORE_AND_AFTER_S = 12.0
 """What an examination takes before its first descent and after its last."""

@@ -32,7 +32,7 @@ from palpate_bus.settings import Settings, variable
 from palpate_bus.wire.tags import make_key
 from palpate_bus.wire.zenoh_config import mesh
 from palpate_conductor.timing import Timing
-from palpate_models.load import view_of
+from palpate_models.scenario.load import view_of
 
 COMPOSE = "docker-compose.yml"
 OBSERVERS = frozenset(name for name, role in contract().roles.items() if role.observer)

@@ -15,7 +15,7 @@ from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
 from palpate_bus.runs.operator_requests import WORDS
 from palpate_conductor.result import RunProgress
-from palpate_models.scenario import Exam
+from palpate_models.scenario.schema import Exam
 
 EVERY = 0.1
 """Where there is no terminal, a line is printed each time that so much of the scan is done."""

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate_models.named_function import is_file
-from palpate_models.pattern_choice import PatternError
-from palpate_models.patterns.scan import Scan, scan_of
-from palpate_models.phantom import PhantomModel
-from palpate_models.scenario import Scenario
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.scenario.named_function import PatternError, is_file
+from palpate_models.scenario.patterns import Scan, scan_of
+from palpate_models.scenario.schema import Scenario
 
 
 def surface_of(phantom: PhantomModel) -> TrueSurface:

@@ -13,9 +13,9 @@ from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.run_name import name_run
 from palpate_bus.settings import Settings
-from palpate_models.explain import did_you_mean
-from palpate_models.load import HIDDEN, dump_scenario, view_of
-from palpate_models.scenario import Scenario, Services
+from palpate_models.scenario.explain import did_you_mean
+from palpate_models.scenario.load import HIDDEN, dump_scenario, view_of
+from palpate_models.scenario.schema import Scenario, Services
 from palpate_search.choice import PolicyError, findable
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}

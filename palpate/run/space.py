@@ -12,7 +12,7 @@ from palpate.run.folder import FolderError
 from palpate.run.options import Record
 from palpate.run.outlook import Outlook, in_words
 from palpate_conductor.result import RunProgress, Tell
-from palpate_models.scenario import Exam
+from palpate_models.scenario.schema import Exam
 
 MB = 1_000_000
 REPORT_MB = 10

@@ -15,8 +15,8 @@ from rich.progress import track
 
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.population import case
-from palpate_models.frames import Array
-from palpate_models.seeds import generator
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
 
 PRESSES: Final = 25
 

@@ -17,7 +17,7 @@ import typer
 from matplotlib.figure import Figure
 from statsmodels.stats.proportion import proportion_confint
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 TUNING: Final = 1000
 """Seeds below this are tuning patients."""

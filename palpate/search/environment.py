@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.population import SearchCase, case
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_search.maps import LAYERS, maps, shape
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, Task, seconds

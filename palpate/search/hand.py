@@ -14,11 +14,11 @@ import numpy as np
 from palpate.quick.errors import Loop, LoopErrors, loop_errors
 from palpate.quick.felt import FeltPatient, felt_patient
 from palpate.quick.patient import PERIOD_S, Patient
-from palpate_models.breathing import BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.load import exam_input
-from palpate_models.scenario import Scenario
-from palpate_models.seeds import generator
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 from palpate_search.presses import Press, Task, seconds
 
 DESCENT_MPS: Final = 0.030

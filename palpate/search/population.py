@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 
 from palpate.quick.felt import FeltPatient, felt_patient
-from palpate_models.frames import Array
-from palpate_models.load import load_scenario
-from palpate_models.scenario import Scenario
-from palpate_models.seeds import generator
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 
 CONTRAST: Final = 2.0
 """Felt contrast of each lump, by the surrogate, at its centre."""

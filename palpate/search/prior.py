@@ -19,8 +19,8 @@ from palpate.search.population import case
 from palpate.search.trial import search
 from palpate_assessment.calibration import learned
 from palpate_assessment.model import LENGTHS_M, SURFACE_M, TARE_N, WHITE_SD, natural
-from palpate_models import press
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario import press
 from palpate_search.choice import policy
 from palpate_search.posterior import Posterior
 

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 
 from palpate.search.hand import Hand
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_search.choice import Policy
 from palpate_search.posterior import Posterior
 

@@ -17,10 +17,11 @@ from typing import Any, Final, NamedTuple
 from palpate.run.roles import checked
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
 from palpate_bus.implementations import ChoiceError, is_file
-from palpate_models.errors import Errors
-from palpate_models.load import ScenarioError, as_settings, load_scenario
-from palpate_models.phantom import MeshError, build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.errors import Errors
+from palpate_models.scenario.load import ScenarioError, as_settings, load_scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Section
 
 ID_DIGITS: Final = 16

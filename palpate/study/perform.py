@@ -26,8 +26,8 @@ from palpate.study.spec import Method, Study, StudyError, checked_study, load_st
 from palpate.study.statistics.reading import TablesError
 from palpate.study.workers import Workers, WorkersError, cluster, cores, threads
 from palpate_bus.implementations import ChoiceError
-from palpate_models.load import dump_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import dump_scenario
+from palpate_models.scenario.schema import Scenario
 
 TOLD = 10
 """Cases that did not complete that are told one by one."""

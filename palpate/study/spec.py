@@ -20,10 +20,10 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from palpate.run.roles import OBSERVERS, WORKERS
-from palpate_models.draw import MOST_LUMPS, Draw, Range
-from palpate_models.errors import Errors, Level, table
-from palpate_models.explain import explain
-from palpate_models.load import ScenarioError, parse_yaml
+from palpate_models.patient.schema import MOST_LUMPS, Draw, Range
+from palpate_models.scenario.errors import Errors, Level, table
+from palpate_models.scenario.explain import explain
+from palpate_models.scenario.load import ScenarioError, parse_yaml
 from palpate_models.section import Length, Section
 
 Split = Literal["tune", "test"]

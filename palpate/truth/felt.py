@@ -18,8 +18,8 @@ from scipy.spatial import Delaunay
 
 from palpate.truth.pressed import Pressed
 from palpate.truth.surface import TrueSurface
-from palpate_models.frames import Array
-from palpate_models.scenario import Exam
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Exam
 
 Mask = NDArray[np.bool_]
 

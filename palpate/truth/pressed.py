@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 import palpate_models
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate_models.breathing import Breathing
-from palpate_models.cache import content_key, remembered
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.phantom.field import edge_distance
-from palpate_models.scenario import Exam, Scenario
+from palpate_models.numerics.cache import content_key, remembered
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.field import edge_distance
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.schema import Exam, Scenario
 
 if TYPE_CHECKING:
     from palpate_tissue.backend import TissueBackend

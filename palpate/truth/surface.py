@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 
 @dataclass(frozen=True)

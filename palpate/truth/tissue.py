@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from palpate_bus.implementations import create
-from palpate_models.motion import Motion
-from palpate_models.scenario import Scenario
+from palpate_models.patient.motion import Motion
+from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.service import TissueService
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 _NEAREST: Final = 4
 """Contacts whose errors are averaged, the nearer the more."""

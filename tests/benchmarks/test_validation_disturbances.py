@@ -6,7 +6,7 @@ import numpy as np
 
 from palpate.quick.case import run_quick
 from palpate.report.results import truth_of_run
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 from palpate_validation import reassessed
 from palpate_validation.disturbances import ROWS, Disturbance, examined, line
 

@@ -8,8 +8,8 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from palpate_models.patient import Stiffness
-from palpate_models.remus2024 import relaxed_people
+from palpate_models.patient.remus2024 import relaxed_people
+from palpate_models.patient.schema import Stiffness
 from palpate_validation import drop, energy, hertz, lumps, meshes, people, relaxation
 from palpate_validation.check import Check, PageSection
 from palpate_validation.foundation import lump, static_force, uniform

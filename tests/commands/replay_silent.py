@@ -3,7 +3,7 @@
 from typing import Any
 
 from palpate_assessment.service import create as create_assessment
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 
 def create(scenario: Scenario) -> Any:

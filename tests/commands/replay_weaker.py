@@ -4,7 +4,7 @@ from typing import Any
 
 from palpate_bus.service import Inbox, Outbox
 from palpate_control.service import create as create_control
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 
 def create(scenario: Scenario) -> Any:

@@ -20,7 +20,7 @@ from palpate.commands import COMMANDS, app_for, main
 from palpate.reference import walked
 from palpate.run import examine
 from palpate_bus.implementations import ChoiceError
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 def names(word: str) -> set[str]:

@@ -15,7 +15,7 @@ from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
 from palpate_bus.messages import RobotStatus
 from palpate_bus.messages.stamps import header
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 @pytest.mark.parametrize(("confidence", "told"), [(0.8, False), (80.0, True)])

@@ -13,7 +13,7 @@ from palpate.report.evidence import samples_of
 from palpate.report.figures import draw_map
 from palpate.report.results import truth_of_run
 from palpate.report.scoring import Truth
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 @pytest.fixture(scope="module")

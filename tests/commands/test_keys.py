@@ -13,7 +13,7 @@ from palpate_bus.messages import OperatorRequest
 from palpate_conductor.collector import Collected
 from palpate.run.progress import RunDisplay
 from palpate_conductor.result import RunProgress
-from palpate_models.scenario import Exam
+from palpate_models.scenario.schema import Exam
 from rich.console import Console
 
 collected, asked = Collected(), []

@@ -15,7 +15,7 @@ from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunProgress
-from palpate_models.scenario import Exam
+from palpate_models.scenario.schema import Exam
 from palpate_planning.stages import StrokeStage
 from palpate_planning.status import PHASE_OF, Phase
 

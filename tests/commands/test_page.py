@@ -16,7 +16,7 @@ from palpate.report import archive
 from palpate.report.page import verdict, write_page
 from palpate.report.results import Known, assemble, write_results
 from palpate.run.roles import write_scenario_files
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 def run_folder(folder: Path, **what: object) -> Path:

@@ -21,7 +21,7 @@ from palpate_bus.contract import contract
 from palpate_bus.runtime.group import Group
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_conductor.timing import Timing
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 ROLES = (*WORKERS, *OBSERVERS)
 LOOP = ("robot", "tissue", "control")

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
 from palpate.run.region import scan_over
-from palpate_models.load import load_scenario, scenario_names
-from palpate_models.pattern_choice import PatternError
-from palpate_models.phantom import build_phantom
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import load_scenario, scenario_names
+from palpate_models.scenario.named_function import PatternError
 
 SPIRAL = Path(__file__).parents[2] / "docs" / "examples" / "spiral.py"
 

@@ -11,7 +11,7 @@ from palpate.commands import app_for
 from palpate.run.processes import ProcessListError, compose_file, how, override_files, read_processes
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers
 from palpate.study.spec import load_study
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 INHERITED = "${PALPATE_SETTINGS:-}"
 

@@ -18,9 +18,9 @@ from palpate.report.page import write_page
 from palpate.report.results import Known, assemble, clean_world, in_words, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
 from palpate.run.roles import write_scenario_files
-from palpate_models.load import load_scenario
-from palpate_models.motion import BodyMotion, Motion
-from palpate_models.scenario import Scenario
+from palpate_models.patient.motion import BodyMotion, Motion
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 
 ISSUE_FIELDS = [
     *("scenario", "seed", "runtime", "platform", "sim_time_s", "wall_time_s", "real_time_factor", "run_hash", "samples"),

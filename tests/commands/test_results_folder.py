@@ -17,7 +17,7 @@ from palpate.report.results import write_results
 from palpate.run.folder import FolderError, _locked, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_name import name_run, run_of
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 def test_a_folder_with_anything_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from palpate.truth.felt import Felt
 from palpate.truth.pressed import Pressed
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.touched import Touched
-from palpate_models.frames import Array
-from palpate_models.scenario import Exam
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Exam
 
 CENTRE, RADIUS = np.array((-0.03, -0.02)), 0.03
 EXAM = Exam()

@@ -10,7 +10,7 @@ from palpate.command_line import EXIT_BAD_INPUT
 from palpate.run import examine
 from palpate.run.self_test import RATES, Kept, measure
 from palpate_bus.messages.stamps import NS
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from palpate_bus import implementations
 from palpate_bus.implementations import ChoiceError, check, check_libraries, create, create_for, names
 from palpate_bus.runtime.failure import described
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_models.load import load_scenario
-from palpate_models.scenario import Scenario, Services
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario, Services
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "threshold_assessment.py"
 

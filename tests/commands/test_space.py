@@ -19,8 +19,8 @@ from palpate.run.outlook import Outlook
 from palpate.run.space import WatchedRoom, another_folder, check_room, what_it_takes
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunProgress
-from palpate_models.load import load_scenario
-from palpate_models.scenario import Exam, Mode
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Exam, Mode
 
 Usage = namedtuple("Usage", "total used free")
 

@@ -22,7 +22,7 @@ from palpate_bus.messages import JointTorqueCommand, Point, Pose
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 SCENARIO = load_scenario("clean", STILL)
 HARDWARE = {"robot.lbr", "camera.ros", "camera.replay"}

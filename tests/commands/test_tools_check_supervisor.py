@@ -10,7 +10,7 @@ import pytest
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 from palpate_supervisor.service import create
 
 SCENARIO = load_scenario("clean")

@@ -12,11 +12,11 @@ from palpate.truth.felt import Felt
 from palpate.truth.pressed import Copies, Pressed, press_patient
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.touched import Touched
-from palpate_models.load import load_scenario
-from palpate_models.patient import Lesion
-from palpate_models.phantom import flat_phantom
-from palpate_models.press import LIMIT_N
-from palpate_models.scenario import Scenario
+from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.schema import Lesion
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.press import LIMIT_N
+from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 

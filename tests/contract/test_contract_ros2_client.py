@@ -25,7 +25,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import CameraTrigger, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.wire.zenoh_config import BusOptions, free_port, session
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 CLIENT = Path(__file__).with_name("ros2_client.py")
 RULES = contract()

@@ -18,8 +18,8 @@ from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, workers, write_scenario_files
 from palpate_bus.contract import contract
 from palpate_conductor.timing import Timing
-from palpate_models.load import dump_scenario, load_scenario, view_of
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import dump_scenario, load_scenario, view_of
+from palpate_models.scenario.schema import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = (11, 4711)
@@ -170,7 +170,7 @@ def test_who_may_not_know_draws_no_errors(role: str) -> None:
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom):
                 drawn = {alias.name for alias in node.names} & DRAWING
-                assert node.module != "palpate_models.errors", f"{path}:{node.lineno}"
+                assert node.module != "palpate_models.scenario.errors", f"{path}:{node.lineno}"
                 assert not drawn, f"{path}:{node.lineno} imports {sorted(drawn)}"
             if isinstance(node, ast.Import):
-                assert "palpate_models.errors" not in {alias.name for alias in node.names}, f"{path}:{node.lineno}"
+                assert "palpate_models.scenario.errors" not in {alias.name for alias in node.names}, f"{path}:{node.lineno}"

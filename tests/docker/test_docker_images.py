@@ -13,7 +13,7 @@ import yaml
 from palpate.run.options import DEFAULT_SCENARIO
 from palpate_bus.contract import contract
 from palpate_bus.settings import COMPOSE_VARIABLES
-from palpate_models.load import view_of
+from palpate_models.scenario.load import view_of
 
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "compose/Dockerfile").read_text(encoding="utf-8")

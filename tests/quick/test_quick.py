@@ -14,14 +14,14 @@ from palpate.quick.examination import QuickExamination
 from palpate.quick.messages import collected
 from palpate.quick.patient import NoTissueError, Patient, Touch
 from palpate.quick.study import renewed
-from palpate_models.load import load_scenario
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 
 SMALL = ("exam.region_m=[0.06, 0.05]", "exam.centre_m=[-0.05, -0.05]")
 ALONE = """
 import sys
 from palpate.quick.case import run_quick
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 print(run_quick(load_scenario("lump", sys.argv[1:], 3)).report.run_hash)
 """
 CLEAN = (*SMALL, "errors=none", "phantom.breathing.kind=none")

@@ -33,7 +33,7 @@ from palpate.study.shards import Shard, merge
 from palpate.study.spec import StudyError
 from palpate.study.tables import write_tables
 from palpate.study.workers import cluster, threads
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 CASES = cases_of(study())

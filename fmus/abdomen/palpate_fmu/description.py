@@ -10,8 +10,8 @@ import numpy as np
 
 from palpate_fmu.structure import Indices, structure_2, structure_3
 from palpate_fmu.variables import Sizes, Variable, VariableKind, VariableRole, variables
-from palpate_models.frames import Array
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.phantom import PhantomModel
 
 MODEL = "abdomen"
 """The model identifier: name of binaries and prefix of functions."""

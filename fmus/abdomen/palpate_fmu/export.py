@@ -13,11 +13,11 @@ from palpate_fmu.compiling import compile_library, fmi_headers, platforms
 from palpate_fmu.description import MODEL, SOURCES, build_description, description_2, description_3, documentation
 from palpate_fmu.phantom_file import encode_phantom, sizes_of, start_values
 from palpate_fmu.variables import c_table
-from palpate_models.breathing import BreathingCurve
-from palpate_models.patient import Phantom
-from palpate_models.person import drawn
-from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.person import drawn
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.patient.schema import Phantom
+from palpate_models.scenario.schema import Scenario
 
 _NAMESPACE = uuid.UUID("6f1f5a0e-6a0c-5c7e-9a39-0d9b5c1f4a11")
 _EPOCH = (2020, 1, 1, 0, 0, 0)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fmu.variables import BRANCHES, LESIONS, Sizes, parameters
-from palpate_models.frames import Array
-from palpate_models.patient import Phantom
-from palpate_models.phantom import PhantomModel
-from palpate_models.phantom.buried import at_skin
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.field import at_skin
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Phantom
 
 SAMPLES = 64
 """Vertices whose displacement an FMI 2.0 master sees."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_fmu.instance import FmuInstance
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 GAP_M = 0.002
 """Distance from the surface at which the motion starts and ends."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from palpate_fmu.phantom_file import sample_vertices
 from palpate_fmu.variables import Sizes, Variable, VariableRole, variables
-from palpate_models.phantom import PhantomModel
+from palpate_models.patient.phantom import PhantomModel
 
 
 def couplings(model: PhantomModel) -> tuple[NDArray[np.intp], ...]:

@@ -14,8 +14,8 @@ from fmpy import fmi2, fmi3
 from numpy.typing import ArrayLike
 
 from palpate_fmu.instance import read_variables
-from palpate_models.breathing import Breathing
-from palpate_models.patient import Lesion, Phantom
+from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.schema import Lesion, Phantom
 
 Array = np.ndarray
 

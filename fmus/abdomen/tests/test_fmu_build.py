@@ -18,8 +18,8 @@ from palpate_fmu.export import build_fmu, write_sources
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.phantom_file import ExportError, sizes_of, start_values
 from palpate_fmu.probing import probe
-from palpate_models.patient import Lesion, Phantom, Stiffness
-from palpate_models.phantom import build_phantom
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 
 HERE = Path(__file__).parent
 STRICT = (*WARNINGS, "-Wshadow", "-Wconversion")

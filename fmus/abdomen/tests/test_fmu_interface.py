@@ -14,8 +14,8 @@ from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuError, FmuInstance
 from palpate_fmu.variables import TABLE, Sizes, VariableKind
-from palpate_models.patient import Phantom
-from palpate_models.phantom import build_phantom
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Phantom
 
 
 def press(fmu: FmuInstance, steps: int = 300, first: int = 0) -> np.ndarray:

@@ -12,9 +12,9 @@ from model_exchange import Exchange
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_fmu.instance import FmuInstance
-from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.patient import Phantom, Stiffness
-from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.patient.schema import Phantom, Stiffness
 
 BREATHING = Breathing(kind="held", coughs_per_min=3)
 PHANTOM = Phantom(

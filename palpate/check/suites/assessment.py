@@ -13,8 +13,8 @@ from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, SurfaceMesh
 from palpate_bus.messages.stamps import header
-from palpate_models.frames import Array, apply
-from palpate_models.load import exam_input
+from palpate_models.numerics.frames import Array, apply
+from palpate_models.scenario.load import exam_input
 
 SAMPLES, MAP, FINDINGS = "assessment/samples", "assessment/map", "assessment/findings"
 STIFF_AT = np.array((0.02, -0.015))

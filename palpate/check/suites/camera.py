@@ -14,7 +14,7 @@ from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
 SMALL_IMAGE, SMALL_INFO = "camera/follow/depth", "camera/follow/camera_info"

@@ -12,9 +12,9 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 
 TORQUE = "control/joint_torque"
 VALID = contract().topics["planning/setpoint"].expiry

@@ -24,8 +24,8 @@ from palpate_bus.messages import (
     Vector3,
 )
 from palpate_bus.messages.stamps import header
-from palpate_models.frames import Array, apply, inverse, look_at
-from palpate_models.load import exam_input
+from palpate_models.numerics.frames import Array, apply, inverse, look_at
+from palpate_models.scenario.load import exam_input
 
 IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
 SMALL_IMAGE, SMALL_INFO, MOTION = "camera/follow/depth", "camera/follow/camera_info", "perception/motion"

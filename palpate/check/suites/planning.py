@@ -11,8 +11,8 @@ from palpate.check.rig import Feed, HeardMessage, Rig
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models import lbr
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
 
 SETPOINT, STATE = "planning/setpoint", "exam/state"
 WEIGHT_N = 6.0

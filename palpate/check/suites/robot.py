@@ -20,7 +20,7 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.geometry import rotation
 from palpate_bus.messages.stamps import duration_message, header
-from palpate_models import lbr
+from palpate_models.robot import lbr
 
 COMMAND = "control/joint_torque"
 PUSH = np.array([6.0, 6.0, 4.0, 4.0, 1.0, 0.6, 0.4])

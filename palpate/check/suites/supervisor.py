@@ -13,11 +13,11 @@ from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench
 from palpate_bus.messages.stamps import header
-from palpate_models import lbr
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.gravity import GRAVITY
-from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
-from palpate_models.load import exam_input
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import tool_jacobian, tool_pose
+from palpate_models.scenario.load import exam_input
 
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
 FORCE_ERROR_N = 3.0

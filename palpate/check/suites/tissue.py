@@ -11,7 +11,7 @@ from palpate.check.rig import Feed, HeardMessage, Rig
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.geometry import rotation, vector
 from palpate_bus.messages.stamps import header
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 WRENCH = "sim/contact_wrench"
 TRUTH = "truth/indentation"

@@ -18,7 +18,7 @@ from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression, usual_amplitudes
 from palpate_assessment.observations import FEWEST, Observations, observe
 from palpate_assessment.sampling import ForceSample
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 _MOST_CONTRADICTED = 0.3
 """When more than this part of the samples contradicts the rest, it is not known which of them is right: all stay in."""

@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 
 class Calibration(BaseModel):

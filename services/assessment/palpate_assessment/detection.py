@@ -22,7 +22,7 @@ from palpate_assessment.calibration import Calibration
 from palpate_assessment.guarding import Signs, signs
 from palpate_assessment.model import EDGE_M, Bump, Regression, amplitudes, bone
 from palpate_assessment.observations import FEWEST, Observations
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 RADII_M = (0.008, 0.012, 0.018, 0.026, 0.036)
 PITCH_M = 0.01

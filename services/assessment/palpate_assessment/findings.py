@@ -14,7 +14,7 @@ from palpate_assessment.calibration import Calibration
 from palpate_assessment.detection import SOFTER, SURE, Candidate
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import UNLIKE, Regression
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 Mask = NDArray[np.bool_]
 

@@ -9,7 +9,7 @@ from numpy.polynomial.polynomial import polyvander
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 _DEGREE = 4
 """Degree of the polynomial that stands for the abdomen's shape: slopes are those of the trunk, not of the noise."""

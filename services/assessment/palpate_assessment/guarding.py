@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from palpate_assessment.model import Bump, Regression
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 MUSCLE_M, MUSCLE_EDGE_M = 0.06, 0.025
 """Radius of a muscle that is tensed, and how soft its edge is [assumption]."""

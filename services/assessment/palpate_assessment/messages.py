@@ -10,7 +10,7 @@ from palpate_assessment.skin import KnownSkin
 from palpate_bus.messages import SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_models.frames import Array, apply
+from palpate_models.numerics.frames import Array, apply
 
 SEEN: Final = frozenset({SurfaceMotion.QUIET, SurfaceMotion.SPOILED})
 """States of `perception/motion` in which the wall was seen, and where it was expected."""

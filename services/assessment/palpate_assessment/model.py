@@ -22,7 +22,7 @@ from scipy.special import erfc, expit
 
 from palpate_assessment.calibration import Calibration
 from palpate_assessment.observations import Observations
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 LENGTHS_M = (0.012, 0.022, 0.045, 0.09, 0.18)
 """Lengths of the fields that natural variation is made of."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from palpate_assessment.calibration import Calibration
 from palpate_assessment.sampling import ForceSample
-from palpate_models import press
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario import press
 
 SHALLOWEST_M, WEAKEST_N = 0.002, 0.1
 """Depth and force from which a sample tells stiffness."""

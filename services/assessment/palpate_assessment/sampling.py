@@ -8,8 +8,8 @@ from math import sqrt
 
 import numpy as np
 
-from palpate_models.checkpoint import FeltSoFar
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.checkpoint import FeltSoFar
 
 TRAVEL = 0.005
 """Travel that one sample averages [m]: a third of the radius in which the indenter feels, so it blurs little."""

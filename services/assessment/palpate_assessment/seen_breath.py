@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate_assessment.sampling import ContactState
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 LONGEST_S: Final = 0.5
 """Images further apart tell nothing of the time between them, and a state waits no longer for the next."""

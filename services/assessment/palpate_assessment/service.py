@@ -22,12 +22,12 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
-from palpate_models import press
-from palpate_models.checkpoint import Checkpoint, read_checkpoint
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.phantom import quadrant
-from palpate_models.scenario import ExamInput, Following, Scenario
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario import press
+from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import ExamInput, Following, Scenario
+from palpate_models.section import quadrant
 
 FRAME = contract().topics["assessment/map"].frame or ""
 PITCH = 0.005

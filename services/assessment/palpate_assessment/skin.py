@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
 from palpate_assessment.sampling import ForceSample
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 
 class KnownSkin:

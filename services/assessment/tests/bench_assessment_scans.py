@@ -23,12 +23,12 @@ from palpate.truth.touched import Touched
 from palpate_assessment.service import AssessmentService
 from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.stamps import header
-from palpate_models.frames import Array, apply, matrix
-from palpate_models.load import exam_input, true_pose
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.phantom import build_phantom
-from palpate_models.phantom.field import gaussian_field
-from palpate_models.scenario import Mode, Scenario
+from palpate_models.numerics.frames import Array, apply, matrix
+from palpate_models.patient.field import gaussian_field
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.load import exam_input, true_pose
+from palpate_models.scenario.schema import Mode, Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue as Tissue
 
 SURFACE_SD, SURFACE_LENGTH = 0.0001, 0.012

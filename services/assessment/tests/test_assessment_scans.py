@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from bench_assessment_scans import random_lesion, scan, scenario_with, scored
 
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.scenario import Exam, Mode, Scenario
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.schema import Exam, Mode, Scenario
 
 RLQ = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.035, 0.030), contrast=4.0)
 SMALL_RLQ = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.030, 0.030), contrast=4.0)

@@ -16,9 +16,9 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import encode
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models.load import exam_input
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.scenario import Exam, Scenario
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Exam, Scenario
 
 REGION = (0.11, 0.10)
 Examined = tuple[Any, Any, list[Any]]

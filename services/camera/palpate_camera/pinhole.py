@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.scenario import Camera
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Camera
 
 
 @dataclass(frozen=True, slots=True)

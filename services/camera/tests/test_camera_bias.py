@@ -14,9 +14,9 @@ from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.bias import DepthBias, field
 from palpate_camera.backends.kinect.service import CameraService
 from palpate_camera.pinhole import Pinhole
-from palpate_models.errors import CameraErrors, DrawnCamera, Errors, draw_errors
-from palpate_models.load import plant_input
-from palpate_models.scenario import Camera, Scenario
+from palpate_models.scenario.errors import CameraErrors, DrawnCamera, Errors, draw_errors
+from palpate_models.scenario.load import plant_input
+from palpate_models.scenario.schema import Camera, Scenario
 
 PINHOLE = Pinhole.of(Camera())
 SHAPE = (PINHOLE.height, PINHOLE.width)

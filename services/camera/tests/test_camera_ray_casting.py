@@ -8,7 +8,7 @@ import trimesh
 
 from palpate_camera.backends.kinect.scene import Caster, Mesh, Scene
 from palpate_camera.pinhole import Pinhole
-from palpate_models.frames import apply, inverse, look_at
+from palpate_models.numerics.frames import apply, inverse, look_at
 
 PINHOLE = Pinhole(160, 120, 150.0, 150.0, 79.5, 59.5)
 X_WC = look_at(np.array([0.3, -0.4, 1.2]), np.array([0.05, 0.02, 0.0]))

@@ -17,7 +17,7 @@ from palpate_bus.recordings import RecordingError, open_recording
 from palpate_camera.backends.kinect.service import create as create_camera
 from palpate_camera.backends.replay.service import POSE, ReplayedCamera, create
 from palpate_camera.messages import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
-from palpate_models.load import load_scenario
+from palpate_models.scenario.load import load_scenario
 from palpate_recorder.service import RecorderService
 
 FRAMES = 4

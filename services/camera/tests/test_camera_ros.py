@@ -28,7 +28,7 @@ from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera.backends.ros.convert import CameraError
 from palpate_camera.backends.ros.service import CameraPort, RosCameraService, ZenohCamera
-from palpate_models.scenario import RosCamera
+from palpate_models.scenario.schema import RosCamera
 
 FRAME = "camera_depth_optical_frame"
 METRES = np.array([[1.0, np.nan, 0.731], [0.5, 2.25, 1.125]], dtype=np.float32)

@@ -12,10 +12,10 @@ from palpate_bus.messages import CameraTrigger, SurfaceMesh, TFMessage, codec
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform
-from palpate_models.errors import Errors
-from palpate_models.frames import look_at
-from palpate_models.load import plant_input
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import look_at
+from palpate_models.scenario.errors import Errors
+from palpate_models.scenario.load import plant_input
+from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Pose
 
 

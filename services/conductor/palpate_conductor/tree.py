@@ -9,9 +9,9 @@ import numpy as np
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped
 from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import header
-from palpate_models import lbr
-from palpate_models.lbr_kinematics import link_transforms
-from palpate_models.scenario import ExamInput
+from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import link_transforms
+from palpate_models.scenario.schema import ExamInput
 
 _AXES = np.array(lbr.JOINT_AXIS)
 _FIRST_JOINT = 1

@@ -33,8 +33,8 @@ from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.model import DOF, ArmModel
 from palpate_control.reference import QD, F, P, Q, Reference, V
 from palpate_control.safety import SafetyNet
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
 
 Arrays = tuple[Array, ...]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pinocchio as pin
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 DOF = 7
 _AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 BRIDGED_PERIODS = 3
 """A set-point older than this many periods stands still. One is one to two periods old in use, and one may be missing."""

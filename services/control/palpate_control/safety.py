@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
 
 TORQUE_RATE_NM = 1.0
 """Largest change of a joint's torque in one millisecond [N m] (libfranka and CRISP bound it to 0.5 to 1.0)."""

@@ -17,10 +17,10 @@ from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import DOF, ArmModel
 from palpate_control.reference import Extrapolator
-from palpate_models.frames import Array
-from palpate_models.lbr import HOME, JOINT_NAMES, urdf
-from palpate_models.load import exam_input
-from palpate_models.scenario import Limits, Robot, Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.lbr import HOME, JOINT_NAMES, urdf
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Limits, Robot, Scenario
 
 _NAMES = list(JOINT_NAMES)
 

@@ -12,7 +12,7 @@ from palpate_control import impedance, safety
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Reference
-from palpate_models.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
+from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
 
 REST = np.zeros(7)
 NO_POSTURE = {"joint_stiffness": np.zeros(7)}

@@ -13,8 +13,8 @@ from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_control import impedance, safety
 from palpate_control.service import ControlService, create
-from palpate_models.lbr import HOME, JOINT_NAMES
-from palpate_models.scenario import Scenario
+from palpate_models.robot.lbr import HOME, JOINT_NAMES
+from palpate_models.scenario.schema import Scenario
 
 EXPIRY = 50 * MS
 

@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models import lbr
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array, apply
-from palpate_models.lbr_kinematics import link_transforms
-from palpate_models.scenario import Robot
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array, apply
+from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import link_transforms
+from palpate_models.scenario.schema import Robot
 
 MARGIN_M: Final = 0.02
 """Hand-eye calibration, arm and camera agree to about so much, each its own way (docs/errors.md)."""

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array, apply
+from palpate_models.numerics.frames import Array, apply
 from palpate_perception import surface
 from palpate_perception.surface import HeightField
 from palpate_perception.wall import SeenWall

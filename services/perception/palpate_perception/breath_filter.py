@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 RATES_PER_MIN: Final = (4.0, 40.0)
 """Breaths a minute that are looked for."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.scenario import Exam
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario.schema import Exam
 
 JUMP: Final = 0.015
 """Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth: 16 mm at 1.1 m,

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array
-from palpate_models.table import TABLE_TOP_M
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.table import TABLE_TOP_M
 from palpate_perception import cloud
 from palpate_perception.views import Intrinsics
 from palpate_perception.wall import EDGE, steady

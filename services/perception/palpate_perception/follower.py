@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array
-from palpate_models.scenario import Exam, Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Exam, Robot
 from palpate_perception.arm import ArmMask
 from palpate_perception.average import WallAverage
 from palpate_perception.drift import CameraDrift

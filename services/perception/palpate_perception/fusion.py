@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 Image = NDArray[np.float32]
 

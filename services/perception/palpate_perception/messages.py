@@ -12,7 +12,7 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_perception.tracker import Followed
 from palpate_perception.views import Intrinsics
 

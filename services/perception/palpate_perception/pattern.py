@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 Index = NDArray[np.intp]
 

@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.patterns.lattice import stations
-from palpate_models.patterns.scan import scan_of
-from palpate_models.scenario import Exam
-from palpate_models.table import TABLE_TOP_M
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.robot.table import TABLE_TOP_M
+from palpate_models.scenario.patterns import scan_of, stations
+from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, pattern, surface, visibility
 from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth

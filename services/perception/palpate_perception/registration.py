@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_perception.wall import SeenWall
 
 PRIOR: Final = (0.010, 0.015, 0.015, 0.05)

@@ -13,9 +13,9 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.images import depth_in_metres
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_perception import messages
 from palpate_perception.cloud import Cloud
 from palpate_perception.follower import Follower

@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import coo_array, csr_array, kron
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 CUTOFF_M: Final = 0.03
 """Wave length that passes with half its amplitude: wider waves are shape, narrower ones noise."""

@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_perception.average import WallAverage
 from palpate_perception.breath_filter import BreathFilter
 from palpate_perception.registration import PRIOR, reasons

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 HEIGHT_M: Final = (-0.16, 0.06)
 """Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.scenario import Exam
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario.schema import Exam
 from palpate_perception.cloud import project
 
 CELL_M: Final = 0.01

@@ -19,9 +19,9 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.scenario import Exam
-from palpate_models.table import TABLE_TOP_M
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.robot.table import TABLE_TOP_M
+from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface
 from palpate_perception.cloud import RegionBox
 from palpate_perception.fusion import Image

@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.frames import Array, inverse
-from palpate_models.scenario import Exam
+from palpate_models.numerics.frames import Array, inverse
+from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, wall
 from palpate_perception.arm import ArmMask
 from palpate_perception.cloud import RegionBox

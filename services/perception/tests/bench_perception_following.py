@@ -17,13 +17,13 @@ from palpate_bus.messages import CameraTrigger, RobotStatus, SurfaceMesh, Surfac
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
-from palpate_models.breathing import BreathingCurve
-from palpate_models.frames import Array, apply, inverse, matrix
-from palpate_models.lbr_kinematics import link_transforms, tool_jacobian, tool_pose
-from palpate_models.load import exam_input, load_scenario, plant_input, true_pose
-from palpate_models.motion import BodyMotion
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, apply, inverse, matrix
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.motion import BodyMotion
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.robot.kinematics import link_transforms, tool_jacobian, tool_pose
+from palpate_models.scenario.load import exam_input, load_scenario, plant_input, true_pose
+from palpate_models.scenario.schema import Scenario
 from palpate_perception.service import PerceptionService
 
 TICK = 100 * MS

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_models.frames import apply, inverse, look_at
-from palpate_models.scenario import Exam
+from palpate_models.numerics.frames import apply, inverse, look_at
+from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud
 from palpate_perception.cloud import Cloud, RegionBox
 

@@ -8,11 +8,11 @@ from bench_perception_following import READY, Patient, Run, run
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_bus.messages import SurfaceMotion
-from palpate_models.errors import draw_errors
-from palpate_models.frames import apply, inverse
-from palpate_models.lbr_kinematics import tool_pose
-from palpate_models.load import exam_input, load_scenario
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import apply, inverse
+from palpate_models.robot.kinematics import tool_pose
+from palpate_models.scenario.errors import draw_errors
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import Robot
 from palpate_perception.arm import ArmMask, passes
 from palpate_perception.breath_filter import BreathFilter, strongest_rate
 from palpate_perception.tracker import jackknife

@@ -15,11 +15,11 @@ from palpate_bus.messages import CameraTrigger, SurfaceMesh, SurfaceMotion, TFMe
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
-from palpate_models.frames import apply, inverse, matrix
-from palpate_models.load import exam_input, load_scenario, plant_input, true_pose
-from palpate_models.patterns.lattice import lattice
-from palpate_models.phantom import PhantomModel, build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import apply, inverse, matrix
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.scenario.load import exam_input, load_scenario, plant_input, true_pose
+from palpate_models.scenario.patterns import lattice
+from palpate_models.scenario.schema import Scenario
 from palpate_perception import cloud, pattern, pipeline
 from palpate_perception.service import PerceptionService, create
 from palpate_perception.tracker import FORECAST_S

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_models.frames import apply, inverse, look_at
-from palpate_models.scenario import Exam
+from palpate_models.numerics.frames import apply, inverse, look_at
+from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, visibility
 
 K = np.array([[585.0, 0.0, 319.5], [0.0, 585.0, 239.5], [0.0, 0.0, 1.0]])

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.periods import MS, SECOND
 
 FORECAST_STEP = 50 * MS

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
 
 DEGREE = 3
 

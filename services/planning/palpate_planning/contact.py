@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.surface import Foot
 from palpate_planning.tool_weight import ToolWeight

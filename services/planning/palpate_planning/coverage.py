@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from palpate_models.frames import Array
-from palpate_models.patterns.touches import touch_centres
-from palpate_models.scenario import Mode
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.patterns import touch_centres
+from palpate_models.scenario.schema import Mode
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

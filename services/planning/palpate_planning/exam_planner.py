@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.patterns.scan import scan_of
-from palpate_models.placement import plan_redundancy, prepare
-from palpate_models.scenario import ExamInput
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario.patterns import scan_of
+from palpate_models.scenario.schema import ExamInput
 from palpate_planning.coverage import strokes, touches
 from palpate_planning.kinematics import STRAIGHT_RAD, ArmKinematics, stretched
 from palpate_planning.motion_planning import NoPathError, timed_motion
+from palpate_planning.placement.redundancy import plan_redundancy, prepare
 from palpate_planning.poses import centre, pose
 from palpate_planning.requests import PressPlanner
 from palpate_planning.scene import CollisionScene

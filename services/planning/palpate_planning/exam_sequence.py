@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models import lbr
-from palpate_models.checkpoint import Checkpoint
-from palpate_models.frames import Array, apply, inverse
-from palpate_models.scenario import ExamInput
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.robot import lbr
+from palpate_models.scenario.checkpoint import Checkpoint
+from palpate_models.scenario.schema import ExamInput
 from palpate_planning.background import WORKER, BackgroundTask
 from palpate_planning.contact import ContactSensing
 from palpate_planning.course import ExamCourse

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.background import BackgroundTask
 from palpate_planning.exam_planner import ExamPlanner, PerceivedAbdomen
 from palpate_planning.kinematics import ArmKinematics

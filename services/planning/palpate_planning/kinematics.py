@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.scenario import Limits, Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Limits, Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 TOLERANCE_M = 1e-4

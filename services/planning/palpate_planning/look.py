@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.scenario import ExamInput
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import ExamInput
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.scene import CollisionScene, ViewPyramid, region_corners
 

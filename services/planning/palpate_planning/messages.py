@@ -8,7 +8,7 @@ from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch,
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.breath import HIDDEN_M, BreathObservation
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.status import ExamStatus

@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 from ompl import base, geometric, util
 
-from palpate_models.frames import Array
-from palpate_models.scenario import Limits
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Limits
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.scene import STEP_RAD, CollisionScene
 from palpate_planning.timing import JointTrajectory, joint_trajectory, rounded

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.scenario import Exam, Limits
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.descent import ALLOWANCE_M, SIGMAS, Descent
 from palpate_planning.recovery import MOVED_M, Recovery

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from palpate_models import lbr
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
-from palpate_models.scenario import Limits
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Limits
 from palpate_planning.compiled_splines import CubicPieces, cubic_at
 from palpate_planning.poses import angular_velocity, frame, least_twist
 from palpate_planning.surface import PerceivedSurface

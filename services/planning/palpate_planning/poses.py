@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
 
 
 def centre(p_W: Array, n_W: Array, radius: float, depth: float | Array) -> Array:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.frames import Array
-from palpate_models.scenario import Exam, Limits
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.coverage import Bools
 from palpate_planning.path import PathPoint

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.coverage import Stroke
 from palpate_planning.periods import MS
 from palpate_planning.segments import Segment, SegmentPlanner

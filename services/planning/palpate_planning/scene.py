@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from palpate_models import lbr, table
-from palpate_models.frames import Array, apply
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array, apply
+from palpate_models.robot import lbr, table
+from palpate_models.scenario.schema import Robot
 from palpate_planning.kinematics import ArmKinematics
 
 MARGIN_M = 0.010

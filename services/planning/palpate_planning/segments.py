@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.coverage import Stroke, transfer
 from palpate_planning.kinematics import ArmKinematics, stretched
 from palpate_planning.motion_planning import NoPathError

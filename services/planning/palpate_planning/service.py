@@ -18,10 +18,10 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.runtime import priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
-from palpate_models.checkpoint import Checkpoint, read_checkpoint
-from palpate_models.frames import Array
-from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Following, Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import ExamInput, Following, Scenario
 from palpate_planning.background import WORKER
 from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import SensorReading

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 
 def _fixed(values: list[float]) -> Array:

@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.course import ExamCourse
 from palpate_planning.motion_planning import NoPathError
 from palpate_planning.palpation import Palpation

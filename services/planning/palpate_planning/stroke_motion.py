@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.frames import Array
-from palpate_models.scenario import Exam, Limits
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
 from palpate_planning.kinematics import ELBOW, TOO_STRAIGHT_RAD

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NdBSpline, NearestNDInterpolator, make_interp_spline
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array, apply, inverse
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_planning.compiled_splines import BicubicSpline, bicubic_at
 
 GRID_M = 0.004

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 OFFSET_M = 0.012
 """Standard deviations before any touch, after `docs/errors.md`: camera and its calibration, arm and warming up together [C];"""

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 import ruckig
 
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.scenario import Limits
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Limits
 from palpate_planning.kinematics import ArmKinematics
 from palpate_planning.periods import MS
 

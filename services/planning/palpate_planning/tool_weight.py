@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 
 
 class ToolWeight:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import curve_fit
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 ONSET_EXPONENT = 1.3
 FELT_N = 1.0

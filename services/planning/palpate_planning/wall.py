@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import NearestNDInterpolator
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_planning.breath import Breath
 from palpate_planning.periods import SECOND
 from palpate_planning.surface import Foot, PerceivedSurface

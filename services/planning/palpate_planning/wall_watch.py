@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from palpate_models.scenario import Following
+from palpate_models.scenario.schema import Following
 from palpate_planning.breath import Breath
 
 CALM_S = 1.0

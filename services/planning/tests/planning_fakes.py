@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_models import lbr
-from palpate_models.frames import Array, apply
-from palpate_models.load import exam_input
-from palpate_models.scenario import Exam as ExamSettings
-from palpate_models.scenario import ExamInput, Robot, Scenario
+from palpate_models.numerics.frames import Array, apply
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Exam as ExamSettings
+from palpate_models.scenario.schema import ExamInput, Robot, Scenario
 from palpate_planning.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.contact import SensorReading
 from palpate_planning.exam_planner import PerceivedAbdomen

@@ -10,7 +10,7 @@ from planning_fakes import World, known
 
 from palpate_bus.messages import SurfaceMotion
 from palpate_bus.setpoint import ControlMode
-from palpate_models.scenario import Following
+from palpate_models.scenario.schema import Following
 from palpate_planning.breath import FORECAST_STEP, JOIN_S, Breath, BreathObservation
 from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.periods import MS, SECOND

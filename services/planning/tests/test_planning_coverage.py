@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_models.patterns.touches import TOUCHES_M
-from palpate_models.scenario import Mode
+from palpate_models.scenario.patterns import TOUCHES_M
+from palpate_models.scenario.schema import Mode
 from palpate_planning.coverage import SAMPLE_M, strokes, touches, transfer
 
 SPACING = 0.0125

@@ -7,7 +7,7 @@ import pytest
 from planning_fakes import World, known
 
 from palpate_bus.setpoint import ControlMode
-from palpate_models import lbr
+from palpate_models.robot import lbr
 from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
 

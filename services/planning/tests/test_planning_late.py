@@ -9,8 +9,8 @@ import pytest
 from planning_fakes import BASE, PERIOD_S, World, known
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.scenario import Exam as ExamSettings
-from palpate_models.scenario import Limits
+from palpate_models.scenario.schema import Exam as ExamSettings
+from palpate_models.scenario.schema import Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import TrajectoryFollower
 from palpate_planning.kinematics import ArmKinematics

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
-from palpate_models import lbr
-from palpate_models.scenario import Limits, Robot
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.exam_planner import ExamPlanner
 from palpate_planning.kinematics import ELBOW, STRAIGHT_RAD, ArmKinematics
 from palpate_planning.look import look_postures

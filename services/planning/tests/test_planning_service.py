@@ -26,8 +26,8 @@ from palpate_bus.messages import (
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_models import lbr
-from palpate_models.scenario import Exam, Scenario
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Exam, Scenario
 from palpate_planning.service import PlanningService, create
 from palpate_planning.status import ExamStep, Phase
 

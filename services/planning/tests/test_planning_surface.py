@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning_fakes import grid_mesh
 
-from palpate_models.frames import apply, matrix
+from palpate_models.numerics.frames import apply, matrix
 from palpate_models.section import Pose
 from palpate_planning.surface import PerceivedSurface
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.scenario.schema import Robot
 from palpate_planning.tool_weight import ToolWeight
 
 

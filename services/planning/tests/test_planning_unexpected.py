@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from planning_fakes import World, known
 
-from palpate_models.scenario import Following
+from palpate_models.scenario.schema import Following
 from palpate_planning.breath import Breath, BreathObservation
 from palpate_planning.palpation import WAIT_MAX_S
 from palpate_planning.requests import PressRequest

@@ -18,7 +18,7 @@ from palpate_bus.messages import codec
 from palpate_bus.runs.run_name import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import RECORDING, Settings
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
 
 log = logging.getLogger(__name__)

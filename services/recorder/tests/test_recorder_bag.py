@@ -22,7 +22,7 @@ from palpate_bus.messages import JointState, SurfaceMesh, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_bus.settings import RECORDING
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_recorder.recover import recover, salvage
 from palpate_recorder.service import RecorderService, create
 

@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
 
 HOLD_DAMPING: Final = np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])
 """Joint damping in a hold [N m s/rad] [A]: about 300 N s/m at the tool. Breathing at 8 mm/s against it adds less than 3 N."""

@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.errors import MOMENT_PER_FORCE_M, DrawnForce
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, DrawnForce
 
 _BLOCK: Final = 1024
 """Readings whose errors are made at once. The slow ones are exact at a block's ends and straight in between."""

@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.compiled import compiled
-from palpate_models.errors import DrawnArm
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.errors import DrawnArm
 from palpate_robot.plant import DT
 
 RIPPLES: Final = 320

@@ -7,9 +7,9 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from palpate_models.errors import ArmErrors, DrawnArm, draw_arm
-from palpate_models.frames import Array
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.errors import ArmErrors, DrawnArm, draw_arm
+from palpate_models.scenario.schema import Robot
 
 DT: Final = 1e-3
 """Step [s]."""

@@ -30,11 +30,11 @@ from palpate_bus.messages import (
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models import lbr
-from palpate_models.errors import draw_errors
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import PlantInput
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.errors import draw_errors
+from palpate_models.scenario.schema import PlantInput
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 from palpate_robot.ft_sensor import FtSensor
 from palpate_robot.joint_sensor import JointSensor

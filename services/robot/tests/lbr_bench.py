@@ -10,9 +10,9 @@ import numpy as np
 from palpate_bus.messages import JointTorqueCommand, RobotStatus
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_models import lbr
-from palpate_models.load import exam_input, load_scenario, plant_input
-from palpate_models.scenario import Scenario
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import exam_input, load_scenario, plant_input
+from palpate_models.scenario.schema import Scenario
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lbr_bench import MS
 
-from palpate_models.load import load_scenario, plant_input
+from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_robot.backends.lbr.arm import CLOCK_SET_NS, Arm
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 

@@ -8,8 +8,8 @@ from lbr_bench import SCENARIO, Rig, active_rig
 
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models import lbr
-from palpate_models.load import ScenarioError, load_scenario
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import ScenarioError, load_scenario
 from palpate_robot.backends.lbr.arm import GravityModel
 
 

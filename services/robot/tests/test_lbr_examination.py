@@ -10,7 +10,7 @@ from palpate.run.composed import load_services
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runtime.composed import Composed
 from palpate_conductor.collector import Collector
-from palpate_models.load import load_scenario, seen
+from palpate_models.scenario.load import load_scenario, seen
 
 OTHERS = ("tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
 SHORT = ("exam.region_m=[0.03,0.03]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=2")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate_bus.messages import codec
-from palpate_models import lbr
+from palpate_models.robot import lbr
 from palpate_robot.backends.lbr import idl
 from palpate_robot.backends.lbr.fri import QUALITY_WINDOW, FriSession
 from palpate_robot.backends.lbr.idl import ConnectionQuality, SessionState

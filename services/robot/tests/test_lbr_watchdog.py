@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from lbr_bench import MS
 
-from palpate_models import lbr
-from palpate_models.load import load_scenario, plant_input
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.idl import SessionState
 from palpate_robot.backends.lbr.watchdog import TIMEOUT_NS, Watchdog

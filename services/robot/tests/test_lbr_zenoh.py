@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.scenario import LbrConnection
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import LbrConnection
 from palpate_robot.backends.lbr.idl import SessionState
 from palpate_robot.backends.lbr.port import ZenohPort
 

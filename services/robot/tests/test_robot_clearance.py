@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_models import lbr
-from palpate_models.scenario import Robot
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import LEAST_CLEARANCE_RAD, DartPlant
 
 NOTHING = np.zeros(3)

@@ -5,7 +5,7 @@ import pytest
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import message_type
-from palpate_models import lbr
+from palpate_models.robot import lbr
 from palpate_robot.driver import (
     BRAKE,
     BRAKE_TICKS,

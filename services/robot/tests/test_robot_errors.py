@@ -9,13 +9,13 @@ import pytest
 from lbr_bench import Rig
 
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_models import lbr
-from palpate_models.errors import MOMENT_PER_FORCE_M, ArmErrors, DrawnArm, DrawnForce, Errors, ForceErrors, draw_errors
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.lbr_kinematics import tool_jacobian, tool_pose
-from palpate_models.load import load_scenario, plant_input
-from palpate_models.scenario import Robot, Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import tool_jacobian, tool_pose
+from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, ArmErrors, DrawnArm, DrawnForce, Errors, ForceErrors, draw_errors
+from palpate_models.scenario.load import load_scenario, plant_input
+from palpate_models.scenario.schema import Robot, Scenario
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.dart.service import create
 from palpate_robot.backends.lbr.emulator import Emulator, Options

@@ -4,9 +4,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from palpate_models import lbr
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import DT, DartPlant
 
 NOTHING = np.zeros(3)

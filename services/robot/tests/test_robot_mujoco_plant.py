@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from palpate_models import lbr
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart import plant as in_dart
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.driver import HOLD_DAMPING

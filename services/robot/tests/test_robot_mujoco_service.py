@@ -6,8 +6,8 @@ import pytest
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate_bus.contract import MS
-from palpate_models import lbr
-from palpate_models.load import load_scenario
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import load_scenario
 from palpate_robot.backends.mujoco.service import create
 
 

@@ -5,9 +5,9 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from palpate_models import lbr
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS

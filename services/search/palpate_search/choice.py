@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from palpate_models.frames import Array
-from palpate_models.named_function import NamedFunction, is_file
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.named_function import NamedFunction, is_file
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
 
 _BINS = 64
 _BIN = 0.25

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_search.posterior import Posterior
 from palpate_search.presses import PRESS_S, seconds
 

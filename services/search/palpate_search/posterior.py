@@ -23,8 +23,8 @@ from scipy.special import erfc, logsumexp
 
 from palpate_assessment.calibration import learned
 from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, bone, natural
-from palpate_models import press
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario import press
 from palpate_search.presses import SHALLOWEST_M, Budget, Press, Task
 
 RADII_M: Final = (0.014, 0.022, 0.030)

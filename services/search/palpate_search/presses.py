@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.scenario import ExamInput
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import ExamInput
 
 PLACES_M = 0.010
 """Distance of the places that are weighed."""

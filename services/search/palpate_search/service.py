@@ -13,9 +13,9 @@ from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import Array
-from palpate_models.load import exam_input
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
 from palpate_search.choice import PolicyError, policy
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Press, Task

@@ -12,7 +12,7 @@ from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
 from palpate_bus.messages import ExamState, Point, SearchRequest
-from palpate_models.scenario import Exam, Scenario, Search, SearchBudget
+from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
 from palpate_search.choice import PolicyError
 from palpate_search.presses import Task
 from palpate_search.service import FEWEST, checked, create

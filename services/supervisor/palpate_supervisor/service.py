@@ -12,9 +12,9 @@ from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import inverse
-from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.numerics.frames import inverse
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import Breach, Cause, Level, LimitWatch

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.nearest import nearest_vertex
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.nearest import nearest_vertex
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 STILL_MPS = 0.005

@@ -8,8 +8,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.scenario import Limits
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Limits
 from palpate_supervisor.tool import Tool
 
 LOOKAHEAD_S = 0.1

@@ -10,9 +10,9 @@ import pytest
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_models import lbr
-from palpate_models.gravity import GRAVITY
-from palpate_models.load import load_scenario
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import load_scenario
 from palpate_supervisor.service import SETTLE, SupervisorService, create
 
 MS = 1_000_000

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import MS
-from palpate_models import lbr
-from palpate_models.gravity import GRAVITY
-from palpate_models.load import exam_input, load_scenario
-from palpate_models.scenario import Limits
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import Limits
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import Breach, Cause, Level, LimitWatch
 

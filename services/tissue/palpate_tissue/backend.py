@@ -7,11 +7,11 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models import press
-from palpate_models.breathing import BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.guarding import Activation
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.guarding import Activation
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.scenario import press
 
 
 class TissueBackend(ABC):
@@ -20,7 +20,7 @@ class TissueBackend(ABC):
     touching: bool = False
     """Whether the sphere holds a vertex after the step."""
     activation: float = 1.0
-    """How far guarding muscles are contracted, from 0 to 1: the a of `palpate_models.wall`."""
+    """How far guarding muscles are contracted, from 0 to 1: the a of `palpate_models.patient.wall`."""
 
     def __init__(self, model: PhantomModel, breathing: BreathingCurve, dt: float) -> None:
         self.model = model

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
-from palpate_models.vectors import Vector, add, cross, divide, dot, norm, scale, subtract, velocity_at
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.vectors import Vector, add, cross, divide, dot, norm, scale, subtract, velocity_at
 
 REFERENCE_K_W = 1.7e5
 REFERENCE_E = 1.0e4

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 RIM = 0.2
 """Vertices are held by the sphere where its surface makes less than 78 degrees with the tangent plane (cos > 0.2)."""

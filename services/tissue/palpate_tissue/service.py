@@ -19,8 +19,8 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import Array, apply, inverse, matrix
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array, apply, inverse, matrix
+from palpate_models.patient.phantom import PhantomModel
 from palpate_models.section import Pose
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.surface import SkinSurface

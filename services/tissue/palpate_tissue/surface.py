@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
-from palpate_models.nearest import nearest_vertex
-from palpate_models.phantom import PhantomModel
-from palpate_models.vectors import Vector, add, dot, row, scale, subtract
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.nearest import nearest_vertex
+from palpate_models.numerics.vectors import Vector, add, dot, row, scale, subtract
+from palpate_models.patient.phantom import PhantomModel
 
 _FAR_M = 0.15
 """Further away than this, the nearest vertex stands for the nearest point."""

@@ -15,9 +15,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "assessment" / "tests"))
 import bench_assessment_scans as scans
 import numpy as np
 
-from palpate_models.load import load_scenario
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel, build_phantom
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.patient.schema import Stiffness
+from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 

@@ -16,9 +16,9 @@ from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
-from palpate_models.frames import matrix
-from palpate_models.load import ScenarioError, load_scenario, seen, true_pose
-from palpate_models.scenario import Scenario, TissueChoice
+from palpate_models.numerics.frames import matrix
+from palpate_models.scenario.load import ScenarioError, load_scenario, seen, true_pose
+from palpate_models.scenario.schema import Scenario, TissueChoice
 from palpate_tissue.backends.fmu.mapping import MapError, load_map
 from palpate_tissue.backends.fmu.service import create, hosted
 from palpate_tissue.backends.winkler.service import create as create_winkler

@@ -11,9 +11,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import nnls
 
-from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.patient import Lesion, Stiffness
-from palpate_models.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, compliance
 from palpate_tissue.backends.elastic.contact import ContactSolver
 from palpate_tissue.backends.elastic.kernel import LayerKernel, layer_factor

@@ -10,9 +10,9 @@ from palpate_bus.implementations import create_for
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
-from palpate_models.load import load_scenario
-from palpate_models.patient import Lesion
-from palpate_models.phantom import flat_phantom
+from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.schema import Lesion
+from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.service import create
 

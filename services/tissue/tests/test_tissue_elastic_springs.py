@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from palpate_models import wall
-from palpate_models.guarding import FADING_S
-from palpate_models.patient import Lesion, Stiffness
-from palpate_models.phantom import PhantomModel, flat_phantom
-from palpate_models.phantom.tension import tension_of_ratio
-from palpate_models.wall import MEDIAN
+from palpate_models.patient import wall
+from palpate_models.patient.guarding import FADING_S
+from palpate_models.patient.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.schema import Lesion, Stiffness
+from palpate_models.patient.tension import tension_of_ratio
+from palpate_models.patient.wall import MEDIAN
 from palpate_tissue.backends.elastic.compliance import Compliance, compliance
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
 from palpate_tissue.backends.elastic.springs import MUSCLE

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate_models.guarding import FADING_S, Guarding
-from palpate_models.patient import Background, Phantom, Stiffness
-from palpate_models.phantom import build_phantom, flat_phantom
-from palpate_models.phantom.tension import DEPTH_M, RADIUS_M, SPEED_MPS, tension_of_ratio
-from palpate_models.wall import MEDIAN
+from palpate_models.patient.guarding import FADING_S, Guarding
+from palpate_models.patient.phantom import build_phantom, flat_phantom
+from palpate_models.patient.schema import Background, Phantom, Stiffness
+from palpate_models.patient.tension import DEPTH_M, RADIUS_M, SPEED_MPS, tension_of_ratio
+from palpate_models.patient.wall import MEDIAN
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 STILL = np.zeros(3)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.load import load_scenario
-from palpate_models.patient import Lesion
-from palpate_models.phantom import PhantomModel, build_phantom, flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
+from palpate_models.patient.schema import Lesion
+from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

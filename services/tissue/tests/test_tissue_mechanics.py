@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from palpate_models import phantom as phantoms
-from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.patient import Lesion, Phantom, Stiffness
-from palpate_models.phantom import build_phantom
-from palpate_models.wall import stress
+from palpate_models.patient import phantom as phantoms
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Lesion, Phantom, Stiffness
+from palpate_models.patient.wall import stress
 from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, StabilityError, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

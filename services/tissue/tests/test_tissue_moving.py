@@ -12,13 +12,13 @@ from test_tissue_service import OneTopic, tool_state, vector
 from palpate_bus.contract import MS
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Service
-from palpate_models.breathing import Breathing
-from palpate_models.errors import Errors
-from palpate_models.frames import apply, matrix
-from palpate_models.load import true_pose
-from palpate_models.motion import BodyMotion, Motion
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.scenario import Exam, Scenario
+from palpate_models.numerics.frames import apply, matrix
+from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.motion import BodyMotion, Motion
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.errors import Errors
+from palpate_models.scenario.load import true_pose
+from palpate_models.scenario.schema import Exam, Scenario
 from palpate_models.section import Pose
 from palpate_tissue.backends.fmu.service import create as create_fmu
 from palpate_tissue.backends.winkler.service import create

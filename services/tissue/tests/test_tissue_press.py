@@ -11,12 +11,12 @@ import pytest
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.tissue import true_tissue
-from palpate_models.guarding import FADING_S
-from palpate_models.load import load_scenario
-from palpate_models.patient import Lesion, Stiffness
-from palpate_models.phantom import PhantomModel, flat_phantom
-from palpate_models.phantom.tension import tension_of_ratio
-from palpate_models.press import LIMIT_N, apparent_stiffness, depths, times
+from palpate_models.patient.guarding import FADING_S
+from palpate_models.patient.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.schema import Lesion, Stiffness
+from palpate_models.patient.tension import tension_of_ratio
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.press import LIMIT_N, apparent_stiffness, depths, times
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue

@@ -10,13 +10,13 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_models.breathing import Breathing, BreathingCurve
-from palpate_models.errors import Errors, PoseErrors
-from palpate_models.frames import matrix
-from palpate_models.load import true_pose
-from palpate_models.patient import Lesion, Phantom
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Exam, Scenario
+from palpate_models.numerics.frames import matrix
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.errors import Errors, PoseErrors
+from palpate_models.scenario.load import true_pose
+from palpate_models.scenario.schema import Exam, Scenario
 from palpate_models.section import Pose as TruePose
 from palpate_tissue.backends.winkler.service import create
 from palpate_tissue.surface import SkinSurface, nearest_on_triangles

@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from palpate_models import wall
-from palpate_models.patient import Lesion, Phantom, Stiffness
-from palpate_models.phantom import build_phantom, flat_phantom
+from palpate_models.patient import wall
+from palpate_models.patient.phantom import build_phantom, flat_phantom
+from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.mechanics import STEP_LIMIT, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

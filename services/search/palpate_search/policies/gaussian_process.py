@@ -15,8 +15,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 
 from palpate_assessment.calibration import learned
-from palpate_models import press
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario import press
 from palpate_search.posterior import Posterior
 from palpate_search.presses import SHALLOWEST_M, Budget, Task
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from palpate_assessment.calibration import learned
 from palpate_assessment.model import WHITE_SD
-from palpate_models import press
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario import press
 from palpate_search.information import information
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, seconds

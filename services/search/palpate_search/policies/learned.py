@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_search.maps import maps
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget

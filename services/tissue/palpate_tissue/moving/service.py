@@ -18,10 +18,10 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_matrix, pose_message, twist, twist_message, vector, wrench, wrench_message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.frames import Array, inverse, matrix
-from palpate_models.load import true_pose
-from palpate_models.motion import BodyMotion
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, inverse, matrix
+from palpate_models.patient.motion import BodyMotion
+from palpate_models.scenario.load import true_pose
+from palpate_models.scenario.schema import Scenario
 
 TOOL = "sim/tool_state"
 

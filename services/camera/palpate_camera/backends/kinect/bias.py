@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from palpate_camera.backends.kinect.scene import Image
 from palpate_camera.pinhole import Pinhole
-from palpate_models.errors import DrawnCamera
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.errors import DrawnCamera
 
 Mask = NDArray[np.bool_]
 

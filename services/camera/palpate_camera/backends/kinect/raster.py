@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
 
 Image = NDArray[np.float32]
 _NEAR_M = 1e-3

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate_camera.backends.kinect.raster import rasterise
 from palpate_camera.pinhole import Pinhole
-from palpate_models.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, apply, inverse
 
 Image = NDArray[np.float32]
 Triangles = NDArray[np.uint32]

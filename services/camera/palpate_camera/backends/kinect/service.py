@@ -20,10 +20,10 @@ from palpate_camera.backends.kinect.noise import KinectNoise
 from palpate_camera.backends.kinect.scene import Caster, Image, Mesh, Scene
 from palpate_camera.messages import FRAME
 from palpate_camera.pinhole import Pinhole
-from palpate_models.errors import draw_errors
-from palpate_models.frames import Array, look_at
-from palpate_models.load import plant_input
-from palpate_models.scenario import PlantInput, Scenario
+from palpate_models.numerics.frames import Array, look_at
+from palpate_models.scenario.errors import draw_errors
+from palpate_models.scenario.load import plant_input
+from palpate_models.scenario.schema import PlantInput, Scenario
 
 ROBOT_TOLERANCE_M: Final = 1e-4
 """The arm's picture is kept while it trembles by less: it only hides, nobody measures it."""

@@ -8,9 +8,10 @@ import numpy as np
 import trimesh
 
 from palpate_camera.backends.kinect.scene import Mesh
-from palpate_models import lbr_visual, table
-from palpate_models.frames import Array, apply
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array, apply
+from palpate_models.robot import table
+from palpate_models.robot import visual as lbr_visual
+from palpate_models.scenario.schema import Robot
 
 
 def merge(meshes: Iterable[Mesh]) -> Mesh:

@@ -20,7 +20,7 @@ from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, o
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
 from palpate_camera.messages import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 POSE = "tf_static"
 _Pair = tuple[RecordedMessage, RecordedMessage]

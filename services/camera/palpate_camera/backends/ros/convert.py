@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 
 class CameraError(ValueError):

@@ -21,8 +21,8 @@ from palpate_camera import messages
 from palpate_camera.backends.ros.convert import CameraError, chain
 from palpate_camera.messages import FRAME
 from palpate_camera.pinhole import Pinhole
-from palpate_models.frames import Array
-from palpate_models.scenario import RosCamera, Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import RosCamera, Scenario
 
 POSE_WAIT_S = 20.0
 """How long the camera's pose is waited for before the run."""

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate_models.frames import Array
-from palpate_models.lbr import Capsule
-from palpate_models.table import Box
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.lbr import Capsule
+from palpate_models.robot.table import Box
 
 REACH_M: Final = 1.5
 """No point of arm and tool is further than this from any joint's axis, so it moves slower than this times sum |v|."""

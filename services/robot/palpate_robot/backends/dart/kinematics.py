@@ -1,4 +1,4 @@
-"""Where the links and the tool are, how fast the tool moves, and what the arm weighs, from the tables of `palpate_models.lbr`.
+"""Where the links and the tool are, how fast the tool moves, and what the arm weighs, from the tables of `robot.lbr`.
 
 With X_WL the pose of link i behind joint i, a its axis, r the way from the joint to what is behind it:
 
@@ -7,7 +7,7 @@ With X_WL the pose of link i behind joint i, a its axis, r the way from the join
     tau_g = a_W . (r x (0, 0, m g))                                         (torque that carries the mass m behind a joint)
 
 DART knows all this, too, but through its Python binding an answer takes five times as long, and the poses of all links twenty
-times. `palpate_models.lbr_kinematics` is the same in numpy; the tests hold one against the other.
+times. `palpate_models.robot.kinematics` is the same in numpy; the tests hold one against the other.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
-from palpate_models.vectors import Vector, add, cross, dot, row, scale, subtract
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.vectors import Vector, add, cross, dot, row, scale, subtract
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 
 _LIFT_W: Final = (0.0, 0.0, GRAVITY)
 """Against gravity [m/s^2]."""

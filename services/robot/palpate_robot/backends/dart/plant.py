@@ -23,12 +23,12 @@ from typing import Any, Final
 import dartpy as dart
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.errors import DrawnArm
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
-from palpate_models.table import boxes
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.robot.table import boxes
+from palpate_models.scenario.errors import DrawnArm
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.clearance import Clearance
 from palpate_robot.backends.dart.kinematics import Kinematics
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM, STICK_RADPS, Wrench

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 from palpate_bus.contract import contract
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.lbr.idl import ClientCommandMode, ConnectionQuality, SafetyState, SessionState
 
 VELOCITY_LAG_S: Final = 0.004

@@ -37,11 +37,11 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_models import lbr
-from palpate_models.errors import draw_errors
-from palpate_models.frames import Array
-from palpate_models.load import ScenarioError, load_scenario, plant_input
-from palpate_models.scenario import PlantInput
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
+from palpate_models.scenario.errors import draw_errors
+from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
+from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.lbr.fri import Drive, FriSession
 from palpate_robot.backends.lbr.idl import (

@@ -22,8 +22,8 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
+from palpate_models.robot import lbr
 from palpate_robot.backends.lbr.idl import ConnectionQuality, SessionState
 
 PERIODS_MS: Final = range(1, 101)

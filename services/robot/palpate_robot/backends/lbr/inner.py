@@ -11,7 +11,7 @@ from typing import Any, Final
 from palpate_bus.implementations import create
 from palpate_bus.messages.codec import Message
 from palpate_bus.service import Inbox, Service
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.schema import Scenario
 
 JOINTS: Final = "joint_states"
 SETPOINT: Final = "planning/setpoint"

@@ -7,8 +7,8 @@ from typing import Any
 
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_models.frames import Array
-from palpate_models.scenario import LbrConnection
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import LbrConnection
 from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"

@@ -21,11 +21,11 @@ from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusConfigError
-from palpate_models import lbr
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.load import exam_input
-from palpate_models.scenario import ExamInput, Scenario
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, GravityModel
 from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort, ZenohPort

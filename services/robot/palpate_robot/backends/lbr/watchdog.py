@@ -23,8 +23,8 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_models.frames import Array
-from palpate_models.scenario import LbrConnection
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import LbrConnection
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm
 from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
 

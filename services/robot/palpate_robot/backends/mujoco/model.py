@@ -1,4 +1,4 @@
-"""Our MuJoCo model of arm, tool, table and base, from the tables in `palpate_models.lbr` that the URDF is written from.
+"""Our MuJoCo model of arm, tool, table and base, from the tables in `palpate_models.robot.lbr` that the URDF is written from.
 
 MuJoCo's own URDF reader is not used: it merges links that are fixed to one another, and with them the F/T sensor's measuring
 face into link 7.
@@ -11,12 +11,12 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.errors import DrawnArm
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
-from palpate_models.table import boxes
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.robot.table import boxes
+from palpate_models.scenario.errors import DrawnArm
+from palpate_models.scenario.schema import Robot
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM
 
 SUBSTEPS: Final = 2

@@ -16,11 +16,11 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from palpate_models import lbr
-from palpate_models.errors import DrawnArm
-from palpate_models.frames import Array
-from palpate_models.gravity import GRAVITY
-from palpate_models.scenario import Robot
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.scenario.errors import DrawnArm
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.mujoco.model import SUBSTEPS, build
 from palpate_robot.plant import DT, NOMINAL_ARM, STICK_RADPS, Wrench
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from palpate_models.load import plant_input
-from palpate_models.scenario import Scenario
+from palpate_models.scenario.load import plant_input
+from palpate_models.scenario.schema import Scenario
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.service import RobotService
 

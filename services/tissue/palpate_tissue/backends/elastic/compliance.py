@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
-from palpate_models.cache import content_key, remembered
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion
-from palpate_models.phantom import PhantomModel, field
+from palpate_models.numerics.cache import content_key, remembered
+from palpate_models.numerics.frames import Array
+from palpate_models.patient import field
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Lesion
 from palpate_tissue import friction
 from palpate_tissue.backends.elastic import kernel, modulus, solid
 from palpate_tissue.backends.elastic.kernel import LayerKernel

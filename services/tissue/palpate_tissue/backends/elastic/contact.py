@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 Mask = NDArray[np.bool_]
 

@@ -9,7 +9,7 @@ from scipy.integrate import simpson
 from scipy.interpolate import CubicSpline
 from scipy.special import j0
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 SELF_WEIGHT = 3.92
 """Displacement that a vertex's own pressure adds, over its force / sqrt(area): what makes the sum of 1/r over a lattice equal the

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion
-from palpate_models.phantom import PhantomModel
-from palpate_models.phantom.field import lesion_field, smoothstep
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.field import lesion_field, smoothstep
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Lesion
 from palpate_tissue.friction import REFERENCE_E, REFERENCE_K_W
 
 YOUNG_OVER_K_W = REFERENCE_E / REFERENCE_K_W

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 from palpate_tissue.backends.elastic.contact import ContactSolver
 from palpate_tissue.backends.elastic.springs import VertexSprings, resistance
 from palpate_tissue.friction import Push

@@ -9,8 +9,8 @@ import argparse
 import sys
 import time
 
-from palpate_models.cache import folder
-from palpate_models.load import ScenarioError, load_scenario
+from palpate_models.numerics.cache import folder
+from palpate_models.scenario.load import ScenarioError, load_scenario
 from palpate_tissue.backends.elastic.compliance import SizeError
 from palpate_tissue.backends.elastic.service import create
 

@@ -14,10 +14,10 @@ from typing import Literal
 
 import numpy as np
 
-from palpate_models.breathing import STILL, BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.patient import Lesion, Stiffness
-from palpate_models.phantom import PhantomModel, flat_phantom
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import STILL, BreathingCurve
+from palpate_models.patient.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_tissue.backends.elastic.compliance import POISSON, Compliance, compliance
 from palpate_tissue.backends.elastic.contact import ContactSolver
 from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W

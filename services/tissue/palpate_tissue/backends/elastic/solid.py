@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
-from palpate_models.frames import Array
+from palpate_models.numerics.frames import Array
 
 IntArray = NDArray[np.intp]
 

@@ -1,4 +1,4 @@
-"""What resists the skin beside the linear solid: the stiffening of the wall, and contracted muscle (`palpate_models.wall`)."""
+"""What resists the skin beside the linear solid: the stiffening of the wall, and contracted muscle (`patient.wall`)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models import wall
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.patient import wall
 
 MUSCLE = 1.06
-"""A muscle's tension over the one that the foundation has (`palpate_models.phantom.tension`): the solid spreads the load wider,
+"""A muscle's tension over the one that the foundation has (`palpate_models.patient.tension`): the solid spreads the load wider,
 so that the press that defines the ratio of guarding would feel 3 % less. With it that press feels it within 2 %."""
 
 
@@ -53,7 +53,7 @@ class VertexSprings:
 def resistance(table: Array, u: Array, activation: float) -> Array:
     """The springs' force q [N], outward, at displacements `u` [m] with muscle contracted by `activation`, shape (m,).
 
-    `table` (m, 3) is `Springs.table`; the stiffening part is `palpate_models.wall.stress`.
+    `table` (m, 3) is `Springs.table`; the stiffening part is `palpate_models.patient.wall.stress`.
     """
     q = np.zeros(len(u))
     for i in range(len(u)):

@@ -20,10 +20,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.breathing import STILL, BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import STILL, BreathingCurve
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Stiffness
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import Compliance

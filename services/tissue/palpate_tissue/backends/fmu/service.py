@@ -20,10 +20,10 @@ from palpate_fmu.compiling import CompileError, native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuError, FmuInstance
 from palpate_fmu.phantom_file import ExportError
-from palpate_models.frames import Array, matrix
-from palpate_models.load import true_pose
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.numerics.frames import Array, matrix
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import true_pose
+from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.wiring import Wiring
 from palpate_tissue.moving.service import carried

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.codec import Message
 from palpate_fmu.instance import FmuInstance, FmuVariable, Port
-from palpate_models.frames import Array, inverse
+from palpate_models.numerics.frames import Array, inverse
 from palpate_tissue.backends.fmu.fields import Make, maker, reader, size
 from palpate_tissue.backends.fmu.mapping import FmuMap, FrameChange, InputEntry, MapError, OutputEntry, _Entry
 from palpate_tissue.backends.fmu.units import fmu_unit, parse_unit

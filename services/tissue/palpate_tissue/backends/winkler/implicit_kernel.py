@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
-from palpate_models.vectors import add, divide, dot, row, scale, subtract
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
 from palpate_tissue.friction import Bristle, Push, Sphere, rub
 from palpate_tissue.near import RIM
 

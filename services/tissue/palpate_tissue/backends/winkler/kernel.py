@@ -4,7 +4,7 @@
     u  = max(u*, w),  f = C (u - u*) / h                                             `hold`: w is where the sphere holds a vertex
     y_k = e_k y_k + (1 - e_k) g_k u                                                  `relax`
 
-The FMU's C source has the same equations; sigma is `palpate_models.wall.stress`.
+The FMU's C source has the same equations; sigma is `palpate_models.patient.wall.stress`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
-from palpate_models.vectors import add, divide, dot, row, scale, subtract
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
 from palpate_tissue.friction import Bristle, Push, Sphere, rub
 from palpate_tissue.near import RIM
 
@@ -123,7 +123,7 @@ def move_freely(wall: Membrane) -> None:
 
 @compiled
 def stiffen(wall: Membrane) -> None:
-    """What the springs beside the linear wall do to a displacement in a step. The law is in `palpate_models.wall`."""
+    """What the springs beside the linear wall do to a displacement in a step. The law is in `palpate_models.patient.wall`."""
     u, beta2, straight_from, tension = wall.u, wall.spring[_BETA2], wall.spring[_BENT], wall.spring[_TENSION]
     share, activation = wall.share, wall.activation[0]
     for i in range(len(u)):

@@ -9,10 +9,10 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
-from palpate_models import wall
-from palpate_models.frames import Array
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array
+from palpate_models.patient import wall
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Stiffness
 
 STEP_LIMIT = 1.8
 """Largest dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps and more."""

@@ -1,6 +1,6 @@
 """Standard presses into the Winkler-Pasternak wall, one after another in compiled code, by few long implicit steps.
 
-What counts of a press is the force at its end (`palpate_models.press`). The sphere goes at one speed and is then held, so that
+What counts of a press is the force at its end (`scenario.press`). The sphere goes at one speed and is then held, so that
 between two instants every displacement is nearly a straight line: for such a line the branches are exact,
 
     y = e y0 + g (1 - r) u + g (r - e) u0,    e = exp(-h / tau),    r = tau / h (1 - e),
@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate_models import press
-from palpate_models.compiled import compiled
-from palpate_models.frames import Array
-from palpate_models.guarding import Activation
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel
-from palpate_models.vectors import add, dot, row, scale, subtract
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.vectors import add, dot, row, scale, subtract
+from palpate_models.patient.guarding import Activation
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Stiffness
+from palpate_models.scenario import press
 from palpate_tissue.backends.winkler.implicit import implicit_wall
 from palpate_tissue.backends.winkler.implicit_kernel import ImplicitWall, Stride, sweep, unbalanced
 from palpate_tissue.near import RIM
@@ -91,7 +91,7 @@ def press_in_turn(
 def contracted(voluntary: bool, ends: Array, depths: Array) -> Array:
     """How far muscle that guards is contracted at the `ends` [s] of a press's steps, where it is `depths` deep [m]; both (n,).
 
-    At rest it is contracted wholly, and the press provokes it or lets it fade (`palpate_models.guarding`).
+    At rest it is contracted wholly, and the press provokes it or lets it fade (`palpate_models.patient.guarding`).
     """
     levels = [1.0]
     for lasted, depth, deeper in zip(np.diff(ends, prepend=0.0), depths, np.diff(depths, prepend=0.0), strict=True):

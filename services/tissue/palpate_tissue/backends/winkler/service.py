@@ -6,10 +6,10 @@ from palpate_bus.contract import contract
 from palpate_bus.implementations import ChoiceError
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Service
-from palpate_models.breathing import BreathingCurve
-from palpate_models.load import true_pose
-from palpate_models.phantom import build_phantom
-from palpate_models.scenario import Scenario
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import true_pose
+from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.winkler.mechanics import StabilityError
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.moving.service import carried

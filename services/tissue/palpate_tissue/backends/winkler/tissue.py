@@ -5,7 +5,7 @@ State: displacement u of every vertex along its inward rest normal [m], and one 
     C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f,     y_k' = (g_k u - y_k) / tau_k
     f >= 0,  u >= w,  f (u - w) = 0
 
-sigma is the stiffening of `palpate_models.wall`, a how far muscles are contracted, w(p) where the sphere holds a vertex on its
+sigma is the stiffening of `patient.wall`, a how far muscles are contracted, w(p) where the sphere holds a vertex on its
 inward normal. See the README for the derivation, and `kernel.py` for the step.
 """
 
@@ -16,11 +16,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models import wall
-from palpate_models.breathing import STILL, BreathingCurve
-from palpate_models.frames import Array
-from palpate_models.patient import Stiffness
-from palpate_models.phantom import PhantomModel
+from palpate_models.numerics.frames import Array
+from palpate_models.patient import wall
+from palpate_models.patient.breathing import STILL, BreathingCurve
+from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Stiffness
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler import kernel

@@ -1,0 +1,64 @@
+"""Vectors of three numbers as tuples: inside compiled code they live in registers, while small arrays would be allocated."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+
+Vector = tuple[float, float, float]
+
+
+@compiled
+def row(table: Array, k: int, first: int = 0) -> Vector:
+    """Three numbers of row `k` of an array, from column `first` on."""
+    return table[k, first], table[k, first + 1], table[k, first + 2]
+
+
+@compiled
+def add(a: Vector, b: Vector) -> Vector:
+    """A + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@compiled
+def subtract(a: Vector, b: Vector) -> Vector:
+    """A - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@compiled
+def scale(factor: float, a: Vector) -> Vector:
+    """`factor` times a."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@compiled
+def divide(a: Vector, divisor: float) -> Vector:
+    """A / `divisor`."""
+    return a[0] / divisor, a[1] / divisor, a[2] / divisor
+
+
+@compiled
+def dot(a: Vector, b: Vector) -> float:
+    """The scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def cross(a: Vector, b: Vector) -> Vector:
+    """The vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def norm(a: Vector) -> float:
+    """The length."""
+    return sqrt(dot(a, a))
+
+
+@compiled
+def velocity_at(v: Vector, w: Vector, r: Vector) -> Vector:
+    """V + w x r: velocity of the point of a rigid body at `r` [m] from where it moves at `v` [m/s] and turns at `w` [rad/s]."""
+    return v[0] + w[1] * r[2] - w[2] * r[1], v[1] + w[2] * r[0] - w[0] * r[2], v[2] + w[0] * r[1] - w[1] * r[0]

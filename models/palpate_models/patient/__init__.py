@@ -1,0 +1,1 @@
+"""The patient: body surface, tissue stiffness, breathing, motion and guarding."""

@@ -1,0 +1,189 @@
+"""The natural variation of a person's wall: fields of families that no prior of the assessment has.
+
+A field is a weighted sum of two components. Each has a family, a length, an anisotropy and a direction of its own, and none is
+Gaussian: ridges have crests, patches have borders, hills are log-normal, and waves have heavy-tailed frequencies and weights.
+Fields are functions of position, made from random Fourier features (Rahimi and Recht 2007), and do not depend on the mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.patient.abdomen import bone_share, parametric_surface
+from palpate_models.patient.anatomy import Anatomy, Muscles
+from palpate_models.patient.field import smoothstep
+
+_FEATURES = 96
+_COMPONENTS = 2
+_MOST_ANISOTROPIC = 3.0
+"""Largest ratio of the lengths along and across a component's direction [A]."""
+_MOST = 3.0
+"""A field comes hardly further from its mean than this many standard deviations: one healthy place is not another tissue."""
+
+
+Family = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class _Waves:
+    """sum_k weight_k cos(frequency_k . p + phase_k)."""
+
+    frequency: Array
+    phase: Array
+    weight: Array
+
+    def __call__(self, points: Array) -> Array:
+        return np.asarray(np.cos(points @ self.frequency + self.phase) @ self.weight)
+
+
+def _waves(rng: np.random.Generator, lengths: Array, heavy: bool) -> _Waves:
+    """Waves of unit variance whose correlation falls over `lengths` [m] along three axes, turned about z by a random angle.
+
+    `heavy`: Student frequencies, so the correlation is Matern's of smoothness 3/2, and Student weights: a few waves stand out.
+    """
+    frequency = rng.standard_normal((3, _FEATURES))
+    weight = np.ones(_FEATURES)
+    if heavy:
+        frequency /= np.sqrt(rng.chisquare(3, _FEATURES) / 3)
+        weight = rng.standard_t(3, _FEATURES)
+    angle = rng.uniform(0, np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    phase = rng.uniform(0, 2 * np.pi, _FEATURES)
+    return _Waves(turn @ (frequency / lengths[:, None]), phase, weight * np.sqrt(2 / (weight**2).sum()))
+
+
+def _ridges(g: Array) -> Array:
+    return np.asarray(-np.sqrt(g**2 + 0.01))
+
+
+def _patches(g: Array) -> Array:
+    return np.tanh(3 * g)
+
+
+def _hills(g: Array) -> Array:
+    return np.exp(0.8 * g)
+
+
+def _as_they_are(g: Array) -> Array:
+    return g
+
+
+_FAMILIES: tuple[Family, ...] = (_ridges, _patches, _hills, _as_they_are)
+"""What is made of waves; the last ones are heavy-tailed."""
+
+
+class _Component(NamedTuple):
+    """Waves that are made into what the family has; its mean and deviation over the reference points, and its weight."""
+
+    waves: _Waves
+    family: Family
+    weight: float
+    mean: float = 0.0
+    sd: float = 1.0
+
+    def __call__(self, points: Array) -> Array:
+        return self.family(self.waves(points))
+
+
+def _component(rng: np.random.Generator, length_m: tuple[float, float], share: float, reference: Array) -> _Component:
+    """A component whose family, lengths and direction are drawn, and which has this share of the field's variance."""
+    family = _FAMILIES[int(rng.integers(len(_FAMILIES)))]
+    length = np.exp(rng.uniform(*np.log(length_m)))
+    longer = np.exp(rng.uniform(0, np.log(_MOST_ANISOTROPIC)))
+    lengths = np.array((min(length * longer, length_m[1]), length, length))
+    part = _Component(_waves(rng, lengths, heavy=family is _as_they_are), family, float(np.sqrt(share)))
+    values = part(reference)
+    return part._replace(mean=float(values.mean()), sd=float(values.std()))
+
+
+class NaturalField:
+    """A random field over a body, of mean 0 and standard deviation 1 over reference points on it."""
+
+    def __init__(self, rng: np.random.Generator, length_m: tuple[float, float], reference: Array) -> None:
+        """`length_m`: the shortest and the longest length of a component [m]; `reference` (m, 3) in A [m]."""
+        shares = rng.dirichlet(np.ones(_COMPONENTS))
+        self._parts = [_component(rng, length_m, float(share), reference) for share in shares]
+        total = self._sum(reference)
+        self._middle, self._reach = float(total.mean()), _MOST * float(total.std())
+        bounded = self._bounded(reference)
+        self._mean, self._sd = float(bounded.mean()), float(bounded.std())
+
+    def _sum(self, points: Array) -> Array:
+        total = np.zeros(len(points))
+        for part in self._parts:
+            total += part.weight * (part(points) - part.mean) / part.sd
+        return total
+
+    def _bounded(self, points: Array) -> Array:
+        return np.tanh((self._sum(points) - self._middle) / self._reach)
+
+    def __call__(self, points: Array) -> Array:
+        """At points (n, 3) of A [m], shape (n,)."""
+        return np.asarray((self._bounded(points) - self._mean) / self._sd)
+
+
+_MUSCLE_EDGE_M = 0.010
+"""Width over which one band passes into the next [A]."""
+_LEAST_RANDOM = 0.3
+"""Least part of the variation that muscles do not account for."""
+_COARSE_M = 0.02
+_BELLY_HALF_M = 0.10
+
+
+class HealthyWall(NamedTuple):
+    """A person's wall over the wall's mean, at n points."""
+
+    stiffness: Array
+    """Factor on the foundation modulus [1], shape (n,)."""
+    stiffening: Array
+    """Stiffening [1/m], shape (n,)."""
+
+
+def belly(size_m: tuple[float, float, float], anatomy: Anatomy) -> Array:
+    """Places that stand for the belly of a body [m], shape (m, 3): its front within 0.1 m of the umbilicus, bones excepted."""
+    shape = parametric_surface(size_m, _COARSE_M, anatomy)
+    x, y, _ = shape.vertices.T
+    near = (np.abs(x) <= _BELLY_HALF_M) & (np.abs(y) <= _BELLY_HALF_M) & (shape.normals[:, 2] > 0.5)
+    return np.asarray(shape.vertices[near & (bone_share(x, y, anatomy.skeleton) < 0.01)])
+
+
+def muscle_factor(x: Array, y: Array, muscles: Muscles) -> Array:
+    """Stiffness over that at the sides, shape as the points' [m]; the linea alba narrows below the umbilicus."""
+    middle = muscles.linea_alba_m / 2 * (0.75 + 0.25 * np.tanh(y / 0.03))
+    away = np.abs(x)
+    alba = smoothstep(0.5 - (away - middle) / _MUSCLE_EDGE_M)
+    within = smoothstep(0.5 - (away - middle - muscles.rectus_m) / _MUSCLE_EDGE_M)
+    return np.asarray(1 + (muscles.linea_alba - 1) * alba + (muscles.rectus - 1) * (within - alba))
+
+
+def healthy_wall(
+    points: Array, size_m: tuple[float, float, float], anatomy: Anatomy, stiffening: float, seed: int
+) -> HealthyWall:
+    """The wall of a person at points (n, 3) of A [m], whose mean `stiffening` [1/m] is given.
+
+    Over the belly the logarithm of the first has the mean 0, and both have the deviations and the correlation that
+    `anatomy.variation` says: what the muscles do not account for is a random field. The wall over bone comes on top.
+    """
+    variation = anatomy.variation
+    reference = belly(size_m, anatomy)
+    rng = generator(seed, "variation")
+    level, other = (NaturalField(rng, variation.length_m, reference) for _ in range(2))
+    at_belly = np.log(muscle_factor(reference[:, 0], reference[:, 1], anatomy.muscles))
+    random = np.sqrt(max(variation.stiffness**2 - at_belly.var(), (_LEAST_RANDOM * variation.stiffness) ** 2))
+    x, y = points[:, 0], points[:, 1]
+    log_level = np.log(muscle_factor(x, y, anatomy.muscles)) - at_belly.mean() + random * level(points)
+    total = np.sqrt(random**2 + at_belly.var())
+    rho = variation.correlation
+    shared = rho * log_level / total if total > 0 else 0.0
+    local = np.maximum(stiffening + variation.stiffening_per_m * (shared + np.sqrt(1 - rho**2) * other(points)), 0.0)
+    bone = bone_share(x, y, anatomy.skeleton)
+    return HealthyWall(
+        np.exp(log_level) * (1 + (anatomy.bone - 1) * bone),
+        (1 - bone) * local + bone * anatomy.bone_stiffening_per_m,
+    )

@@ -1,0 +1,259 @@
+"""Triangle meshes from files: checked, oriented, refined where examined. Errors say what is wrong and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from palpate_models.numerics.frames import Array
+
+IntArray = NDArray[np.int32]
+
+SUFFIXES = (".obj", ".stl", ".ply")
+LARGEST_M = 3.0
+SMALLEST_M = 0.05
+MOST_VERTICES = 20_000
+_REGION_HALF_M = 0.112
+"""Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
+_NEAR_UMBILICUS_M = 0.03
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be a phantom. The message names the file, what is wrong, where, and what to do."""
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Vertices (n, 3) [m] in A and triangles (m, 3), counter-clockwise seen from outside."""
+
+    vertices: Array
+    triangles: IntArray
+
+
+def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
+    """The surface in an OBJ, STL or PLY file (metres, abdomen frame), with edges up to `edge_m` [m] where examined.
+
+    Raises MeshError if the file is missing, unreadable, empty, not in metres, not at the origin, degenerate,
+    non-manifold, in several pieces, not orientable or too fine.
+    """
+    import trimesh  # noqa: PLC0415 - only user meshes need it, and it takes 0.3 s to import
+
+    if path.suffix.lower() not in SUFFIXES:
+        raise MeshError(f"phantom.mesh = {path}: want a file in {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise MeshError(f"phantom.mesh = {path}: no such file")
+    try:
+        loaded = trimesh.load(path, force="mesh", process=False)
+        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        triangles = np.array(loaded.faces, dtype=np.int32).reshape(-1, 3)
+    except Exception as error:
+        raise MeshError(f"phantom.mesh = {path}: cannot be read as {path.suffix.lower()}: {error}") from error
+    try:
+        vertices, triangles = weld(vertices, triangles)
+        check(vertices, triangles)
+        triangles = orient(vertices, triangles)
+    except MeshError as error:
+        raise MeshError(f"phantom.mesh = {path}: {error}") from None
+    surface = refine(vertices, triangles, edge_m)
+    if len(surface.vertices) > MOST_VERTICES:
+        raise MeshError(
+            f"phantom.mesh = {path}: {len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most "
+            f"{MOST_VERTICES} are simulated: decimate the mesh or raise phantom.edge_m"
+        )
+    return surface
+
+
+def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
+    """The mesh with equal vertices joined (STL repeats them) and unused ones dropped."""
+    if not len(triangles):
+        raise MeshError("it has no triangles")
+    if not np.isfinite(vertices).all():
+        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise MeshError(f"vertex {bad} is not finite: {vertices[bad]}")
+    scale = float(np.ptp(vertices, axis=0).max()) or 1.0
+    _, first, inverse = np.unique(np.round(vertices / (scale * 1e-7)), axis=0, return_index=True, return_inverse=True)
+    triangles = inverse.reshape(-1)[triangles].astype(np.int32)
+    used, inverse = np.unique(triangles, return_inverse=True)
+    return vertices[first][used], inverse.reshape(-1, 3).astype(np.int32)
+
+
+def check(vertices: Array, triangles: IntArray) -> None:
+    """Raises MeshError unless the mesh is a manifold of sound triangles, in metres, through the origin of A."""
+    size = float(np.ptp(vertices, axis=0).max())
+    if size > LARGEST_M:
+        units = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+        likely = [
+            f": is it in {name}? Scale it by {factor:g}" for name, factor in units.items() if 0.15 < size * factor < LARGEST_M
+        ]
+        raise MeshError(f"it is {size:.4g} m large, more than {LARGEST_M} m{''.join(likely[:1])} (want metres)")
+    if size < SMALLEST_M:
+        raise MeshError(f"it is {size:.4g} m large, less than {SMALLEST_M} m: want metres")
+    corners = vertices[triangles]
+    double_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    flat = np.flatnonzero(double_areas <= 1e-6 * longest**2)
+    if len(flat):
+        raise MeshError(f"{len(flat)} degenerate triangles (no area), the first at {_place(corners[flat[0]])}: remove them")
+    edges = np.sort(_half_edges(triangles), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    crowded = np.flatnonzero(count > 2)
+    if len(crowded):
+        where = _place(vertices[unique[crowded[0]]])
+        raise MeshError(f"non-manifold: {len(crowded)} edges with more than two triangles, the first at {where}")
+    joined = sparse.coo_array((np.ones(len(unique)), (unique[:, 0], unique[:, 1])), shape=(len(vertices),) * 2)
+    pieces, _ = connected_components(joined, directed=False)
+    border = unique[count == 1]
+    rim = sparse.coo_array((np.ones(len(border)), border.T), shape=(len(vertices),) * 2)
+    rims, _ = connected_components(rim, directed=False)
+    rims -= len(vertices) - len(np.unique(border))
+    if rims > 1:
+        raise MeshError(
+            f"it has {rims} borders, the first at {_place(vertices[border[0]])}: fill its holes; one border is allowed"
+        )
+    if pieces > 1:
+        raise MeshError(f"it is in {pieces} separate pieces: keep the one surface that is to be palpated")
+    _check_fans(vertices, triangles)
+    at = np.argmin(np.linalg.norm(vertices, axis=1))
+    nearest = vertices[at]
+    reach = max(_NEAR_UMBILICUS_M, float(longest[(triangles == at).any(axis=1)].max()))
+    if np.linalg.norm(nearest) > reach:
+        raise MeshError(
+            f"the umbilicus must be at the origin (abdomen frame: x to the patient's left, y to the head, z outward), "
+            f"but the nearest vertex is {_place(nearest[None])}"
+        )
+
+
+def orient(vertices: Array, triangles: IntArray) -> IntArray:
+    """The triangles, counter-clockwise seen from outside: of positive volume when closed, else facing +z about the umbilicus.
+
+    Raises MeshError if the surface is not orientable.
+    """
+    m = len(triangles)
+    half = _half_edges(triangles)
+    face = np.tile(np.arange(m), 3)
+    order = np.lexsort((half.max(axis=1), half.min(axis=1)))
+    low, high = half.min(axis=1)[order], half.max(axis=1)[order]
+    twin = np.flatnonzero((low[1:] == low[:-1]) & (high[1:] == high[:-1]))
+    f, g = order[twin], order[twin + 1]
+    flip = half[f, 0] == half[g, 0]  # neighbours that run along their edge the same way disagree
+    rows = np.concatenate((face[f], face[f] + m))
+    columns = np.concatenate((face[g] + m * flip, face[g] + m * ~flip))
+    graph = sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
+    _, side = connected_components(graph, directed=False)
+    if (side[:m] == side[m:]).any():
+        raise MeshError("it is not orientable (a Moebius strip): it has no outside")
+    turned = side[:m] != side[0]
+    out = np.where(turned[:, None], triangles[:, ::-1], triangles)
+    cross = _cross(vertices, out)
+    closed = len(twin) * 2 == len(half)
+    middle = vertices[out].mean(axis=1)
+    away = np.linalg.norm(middle, axis=1)
+    near = away <= away.min() + _NEAR_UMBILICUS_M
+    outward = float((cross * middle).sum()) if closed else float(cross[near, 2].sum())
+    return np.ascontiguousarray(out if outward > 0 else out[:, ::-1], dtype=np.int32)
+
+
+def refine(vertices: Array, triangles: IntArray, edge_m: float) -> TriangleMesh:
+    """The mesh with edges of at most `edge_m` [m] on the front of the examined region, without hanging vertices."""
+    for _ in range(16):
+        pairs, inverse = np.unique(np.sort(_half_edges(triangles), axis=1), axis=0, return_inverse=True)
+        of_face = inverse.reshape(3, -1).T  # edges (0 1), (1 2), (2 0) of each triangle
+        length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+        corners = vertices[triangles]
+        near = (corners[:, :, :2].min(axis=1) < _REGION_HALF_M).all(axis=1)
+        near &= (corners[:, :, :2].max(axis=1) > -_REGION_HALF_M).all(axis=1)
+        near &= _cross(vertices, triangles)[:, 2] > 0
+        wanted = np.zeros(len(pairs), dtype=np.bool_)
+        wanted[of_face[near]] = True
+        split = wanted & (length > edge_m)
+        if not split.any() or len(vertices) > MOST_VERTICES:
+            break
+        # Split only the longest edges of a neighbourhood at a time: bisection of longest edges keeps angles sound.
+        longest_of_face = length[of_face].max(axis=1)
+        keep = np.zeros(len(pairs), dtype=np.bool_)
+        for k in range(3):
+            is_longest = length[of_face[:, k]] >= 0.7 * longest_of_face
+            keep[of_face[is_longest, k]] = True
+        split &= keep
+        middle = np.full(len(pairs), -1, dtype=np.int32)
+        middle[split] = len(vertices) + np.arange(int(split.sum()))
+        vertices = np.concatenate((vertices, vertices[pairs[split]].mean(axis=1)))
+        triangles = _split_triangles(triangles, middle[of_face])
+    return TriangleMesh(vertices, triangles)
+
+
+def _split_triangles(triangles: IntArray, middle: IntArray) -> IntArray:
+    """Triangles cut at the given edge midpoints, shape (m, 3), -1 where an edge is whole."""
+    out = [triangles[(middle < 0).all(axis=1)]]
+    for k in range(3):
+        turned, m = np.roll(triangles, -k, axis=1), np.roll(middle, -k, axis=1)
+        a, b, c = turned.T
+        ab, bc, ca = m.T
+        one = (ab >= 0) & (bc < 0) & (ca < 0)
+        out += [np.column_stack((a, ab, c))[one], np.column_stack((ab, b, c))[one]]
+        two = (ab >= 0) & (bc >= 0) & (ca < 0)
+        out += [np.column_stack(t)[two] for t in ((ab, b, bc), (a, ab, bc), (a, bc, c))]
+    a, b, c = triangles.T
+    ab, bc, ca = middle.T
+    three = (middle >= 0).all(axis=1)
+    out += [np.column_stack(t)[three] for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    return np.concatenate(out).astype(np.int32)
+
+
+def boundary_vertices(n: int, triangles: IntArray) -> NDArray[np.bool_]:
+    """Which of `n` vertices lie on an open border, shape (n,)."""
+    unique, count = np.unique(np.sort(_half_edges(triangles), axis=1), axis=0, return_counts=True)
+    border = np.zeros(n, dtype=np.bool_)
+    border[unique[count == 1].ravel()] = True
+    return border
+
+
+def vertex_normals(vertices: Array, triangles: IntArray) -> Array:
+    """Outward unit vertex normals, shape (n, 3): the mean of the triangles' normals weighted by area."""
+    cross = _cross(vertices, triangles)
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, triangles[:, k], cross)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)))
+
+
+def _check_fans(vertices: Array, triangles: IntArray) -> None:
+    """Raises MeshError where surfaces touch in a single vertex: a vertex's triangles must form one fan."""
+    m = len(triangles)
+    half = np.sort(_half_edges(triangles), axis=1)
+    face = np.tile(np.arange(m), 3)
+    order = np.lexsort((half[:, 1], half[:, 0]))
+    same = np.flatnonzero((half[order][1:] == half[order][:-1]).all(axis=1))
+    f, g, edge = face[order[same]], face[order[same + 1]], half[order[same]]
+    rows, columns = [], []
+    for vertex in edge.T:  # corner k of face f is node 3 f + k; corners at the same vertex are joined across the edge
+        rows.append(3 * f + np.argmax(triangles[f] == vertex[:, None], axis=1))
+        columns.append(3 * g + np.argmax(triangles[g] == vertex[:, None], axis=1))
+    graph = sparse.coo_array((np.ones(2 * len(f)), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * m, 3 * m))
+    _, fan = connected_components(graph, directed=False)
+    fans = np.unique(np.column_stack((triangles.ravel(), fan)), axis=0)
+    touched, count = np.unique(fans[:, 0], return_counts=True)
+    if (count > 1).any():
+        where = _place(vertices[touched[count > 1][:1]])
+        raise MeshError(f"non-manifold: surfaces touch in {int((count > 1).sum())} single vertices, the first at {where}")
+
+
+def _half_edges(triangles: IntArray) -> IntArray:
+    """Directed edges, shape (3 m, 2): all first edges, then all second, then all third."""
+    return np.concatenate((triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]))
+
+
+def _cross(vertices: Array, triangles: IntArray) -> Array:
+    """Twice the area vectors of triangles, shape (m, 3)."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _place(points: Array) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in points.mean(axis=0)) + ") m"

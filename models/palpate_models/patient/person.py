@@ -1,0 +1,213 @@
+"""How the wall differs between people and between places, from the walls fitted to what was measured on living people."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.patient.anatomy import Anatomy, Muscles, Skeleton, Variation
+from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.guarding import Guarding
+from palpate_models.patient.lumps import drawn_lumps
+from palpate_models.patient.remus2024 import fitted
+from palpate_models.patient.schema import Background, Build, Draw, Phantom, Stiffness
+
+
+@dataclass(frozen=True)
+class WallStatistics:
+    """Moments of a place's ln k_w [N/m^3], ln length [m] and stiffening [1/m], in this order.
+
+    Some of the fitted places do not stiffen at all, so the stiffening has no logarithm.
+    """
+
+    mean: Array
+    """Over people, shape (3,)."""
+    between: Array
+    """Covariance between people, of each one's mean over places, shape (3, 3)."""
+    places: Array
+    """Covariance between the places of one person, of k_w and stiffening at one and the same length, shape (2, 2)."""
+
+
+@cache
+def wall_statistics() -> WallStatistics:
+    """The statistics of the measured places, `fitted.csv`."""
+    walls = [fit.wall for fit in fitted().values()]
+    values = np.array([(np.log(wall.k_w_n_per_m3), np.log(wall.length_m), wall.stiffening_per_m) for wall in walls])
+    return moments(values, np.array([person for _, person in fitted()]))
+
+
+def moments(values: Array, person: NDArray[np.str_]) -> WallStatistics:
+    """Moments of `values` (n, 3), each a place of a `person` (n,), by the analysis of variance.
+
+    The covariance of the means over a person's places holds a part of that between places, which is taken away. A person's wall
+    has one length; what the other two vary by at that length is their covariance given the length.
+    """
+    people = [values[person == one] for one in np.unique(person)]
+    means = np.array([rows.mean(axis=0) for rows in people])
+    scatter = [(rows - mean).T @ (rows - mean) for rows, mean in zip(people, means, strict=True)]
+    within = np.sum(scatter, axis=0) / (len(values) - len(people))
+    repeats = float(np.mean([1 / len(rows) for rows in people]))
+    variances, axes = np.linalg.eigh(np.cov(means.T) - repeats * within)
+    between = (axes * np.maximum(variances, 0)) @ axes.T
+    rest, length = [0, 2], 1
+    places = within[np.ix_(rest, rest)] - np.outer(within[rest, length], within[rest, length]) / within[length, length]
+    return WallStatistics(means.mean(axis=0), between, places)
+
+
+Interval = tuple[float, float]
+
+MEASURED_FAT_M = 0.015
+"""Up to this thickness the fat is within what was measured: young men of body mass index 19.5 to 24.6 [A]."""
+FAT_YOUNG_PA = 3000.0
+"""Young's modulus of fat [M: 1.6 to 3.3 kPa excised]."""
+BUILDS = (Build.SLIM, Build.MEDIAN, Build.OBESE)
+SHARES = (0.2, 0.5, 0.3)
+"""How many are of each build [A]."""
+BREATHS_PER_MIN = (12.0, 14.0, 20.0)
+"""Least, most frequent and largest mean rate of a person's quiet breaths. Most frequent: Ragnarsdottir 2006 [V]; ends [A]."""
+BREATH_M: Interval = (0.005, 0.012)
+"""Mean depth of a person's quiet breaths at the navel, evenly drawn [A]."""
+
+
+class Figure(NamedTuple):
+    """Ranges of a build's body, evenly drawn [A]."""
+
+    width_m: Interval
+    length_m: Interval
+    height_m: Interval
+    dome_m: Interval
+    exponent: Interval
+    fat_m: Interval
+
+
+FIGURES = {
+    Build.SLIM: Figure((0.28, 0.32), (0.42, 0.46), (0.16, 0.19), (-0.012, 0.004), (2.4, 2.8), (0.004, 0.009)),
+    Build.MEDIAN: Figure((0.33, 0.38), (0.44, 0.48), (0.18, 0.22), (0.008, 0.018), (2.3, 2.6), (0.009, 0.015)),
+    Build.OBESE: Figure((0.42, 0.48), (0.46, 0.52), (0.25, 0.31), (0.025, 0.045), (2.0, 2.3), (0.030, 0.060)),
+}
+
+
+def drawn(phantom: Phantom, seed: int) -> Phantom:
+    """The phantom with everything that `kind: person` leaves to the seed; any other, and a drawn person, as it is.
+
+    Equal settings and seeds give equal persons, and `draw` and `build` change nothing but what they say.
+    """
+    if phantom.kind != "person" or phantom.anatomy is not None:
+        return phantom
+    rng = generator(seed, "person")
+    build = phantom.build
+    chosen = BUILDS[int(rng.choice(len(BUILDS), p=SHARES))]
+    figure = FIGURES[chosen if build is Build.DRAWN else build]
+    width, length, height, dome, exponent, fat = rng.uniform(*np.transpose(figure)).tolist()
+    statistics = wall_statistics()
+    people = rng.multivariate_normal(statistics.mean, statistics.between)
+    wall = under_fat(_stiffness(people, rng), fat)
+    anatomy = Anatomy(
+        fat_m=fat,
+        dome_m=dome,
+        exponent=exponent,
+        skeleton=_skeleton(rng, length),
+        muscles=_muscles(rng),
+        variation=_variation(statistics),
+    )
+    lumps = drawn_lumps(phantom.draw, generator(seed, "lumps"))
+    return phantom.model_copy(
+        update={
+            "size_m": (width, length, height),
+            "stiffness": wall,
+            "background": Background(cv=0, margins=1),
+            "anatomy": anatomy,
+            "breathing": _breathing(phantom.breathing, generator(seed, "breath")),
+            "lesions": phantom.lesions + lumps,
+            "guarding": phantom.guarding + _guarding(phantom.draw, generator(seed, "guarding")),
+        }
+    )
+
+
+def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
+    """The wall of a person whose ln k_w, ln length and stiffening are given; relaxation and friction vary [A]."""
+    usual = Stiffness()
+    k_w, length = np.exp(people[:2]).tolist()
+    relaxing = np.array(usual.prony_g) * np.exp(0.2 * rng.standard_normal(len(usual.prony_g)))
+    relaxing *= min(1.0, 0.8 / relaxing.sum())
+    times = np.array(usual.prony_tau_s) * np.exp(0.3 * rng.standard_normal(len(usual.prony_tau_s)))
+    return Stiffness(
+        k_w_n_per_m3=k_w,
+        length_m=length,
+        stiffening_per_m=max(float(people[2]), 0.0),
+        prony_g=tuple(relaxing.tolist()),
+        prony_tau_s=tuple(times.tolist()),
+        dashpot_s=usual.dashpot_s,
+        friction=float(rng.uniform(0.2, 0.5)),
+    )
+
+
+def under_fat(wall: Stiffness, fat_m: float) -> Stiffness:
+    """The wall under more fat than was measured: two springs in series, k_w and the fat's k_f = E / t [C, of an assumed model].
+
+    Both carry the pressure p, so with the shares phi = k_s / k of the displacement and p = k (u + beta^2 u^3 / 3) of each,
+    to third order  1 / k_s = 1 / k_w + 1 / k_f,  beta_s^2 = beta_w^2 phi_w^3 + beta_f^2 phi_f^3:  a softer start. The fat itself
+    stiffens as it is flattened, beta_f = 1 / t. The wall's shear G = k_w l^2 stays, so the length grows to l (k_w / k_s)^(1/2).
+    """
+    extra = fat_m - MEASURED_FAT_M
+    if extra <= 0:
+        return wall
+    k_f = FAT_YOUNG_PA / extra
+    of_wall = k_f / (wall.k_w_n_per_m3 + k_f)
+    stiffening = np.sqrt(wall.stiffening_per_m**2 * of_wall**3 + (1 / extra) ** 2 * (1 - of_wall) ** 3)
+    return wall.model_copy(
+        update={
+            "k_w_n_per_m3": wall.k_w_n_per_m3 * of_wall,
+            "length_m": min(wall.length_m / float(np.sqrt(of_wall)), 0.1),
+            "stiffening_per_m": float(stiffening),
+        }
+    )
+
+
+def _breathing(breathing: Breathing, rng: np.random.Generator) -> Breathing:
+    """A person's own mean rate and depth of breath, where the scenario gives none; a deep breather has the deep ones."""
+    own = {"rate_per_min": rng.triangular(*BREATHS_PER_MIN), "peak_to_peak_m": rng.uniform(*BREATH_M)}
+    return breathing.model_copy(update={name: value for name, value in own.items() if name not in breathing.model_fields_set})
+
+
+def _skeleton(rng: np.random.Generator, length: float) -> Skeleton:
+    """Ribs and iliac crests about a body of this length [m]: the lowest ribs lie little above the umbilicus [M, ranges A]."""
+    scale = length / 0.46
+    return Skeleton(
+        costal_arch_m=scale * rng.uniform(0.16, 0.20),
+        costal_slope=rng.uniform(0.5, 0.9),
+        iliac_crest_m=(scale * rng.uniform(0.125, 0.145), -scale * rng.uniform(0.10, 0.14)),
+    )
+
+
+def _muscles(rng: np.random.Generator) -> Muscles:
+    """Rectus and linea alba: at rest as stiff as the sides or up to half stiffer [A, within what the measured places allow]."""
+    return Muscles(
+        linea_alba_m=rng.uniform(0.012, 0.022),
+        rectus_m=rng.uniform(0.055, 0.075),
+        linea_alba=rng.uniform(0.9, 1.4),
+        rectus=rng.uniform(1.0, 1.4),
+    )
+
+
+def _guarding(draw: Draw, rng: np.random.Generator) -> tuple[Guarding, ...]:
+    """A contracted area with the ratio of force tensed to force at rest of a measured place [C], place and size [A]."""
+    if draw.guarding == "none":
+        return ()
+    ratios = [fit.activated_ratio for fit in fitted().values()]
+    x, y = (rng.uniform(-0.3, 0.3, 2) * np.array(draw.region_m)).tolist()
+    a, b = rng.uniform(0.045, 0.08, 2).tolist()
+    ratio = float(np.quantile(ratios, rng.random()))
+    return (Guarding(centre_m=(x, y), radii_m=(a, b), ratio=ratio, kind=draw.guarding),)
+
+
+def _variation(statistics: WallStatistics) -> Variation:
+    stiffness, stiffening = np.sqrt(np.diag(statistics.places)).tolist()
+    correlation = statistics.places[0, 1] / (stiffness * stiffening)
+    return Variation(stiffness=stiffness, stiffening_per_m=stiffening, correlation=float(np.clip(correlation, -1, 1)))

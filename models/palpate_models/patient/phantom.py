@@ -1,0 +1,152 @@
+"""The phantom as arrays: rest surface, discrete Laplacian, stiffness with and without lesions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import robust_laplacian
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import Delaunay
+
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.abdomen import lattice, parametric_surface
+from palpate_models.patient.field import background_factor, lesion_field
+from palpate_models.patient.healthy import healthy_wall
+from palpate_models.patient.mesh import MeshError, boundary_vertices, load_mesh, vertex_normals
+from palpate_models.patient.person import drawn
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.patient.tension import tension_field
+
+IntArray = NDArray[np.int32]
+
+_POSTERIOR_M = 0.010
+"""Vertices of a user's mesh this close to its lowest point lie on the table and do not move."""
+
+
+@dataclass(frozen=True)
+class PhantomModel:
+    """A phantom at rest, in the abdomen frame A: origin at the umbilicus, x to the patient's left, y to the head, z outward."""
+
+    vertices: Array
+    """Vertex positions at rest [m], shape (n, 3), in A."""
+    triangles: IntArray
+    """Vertex indices, shape (m, 3), counter-clockwise seen from outside."""
+    normals: Array
+    """Outward unit vertex normals, shape (n, 3), in A."""
+    areas: Array
+    """Area that belongs to each vertex [m^2], shape (n,)."""
+    laplacian: sparse.csr_array
+    """Cotangent Laplacian [1] of the intrinsic Delaunay triangulation, shape (n, n): every edge weight is >= 0."""
+    stiffness: Array
+    """Instantaneous foundation modulus k_w [N/m^3], shape (n,), with lesions."""
+    background: Array
+    """The same without lesions, shape (n,)."""
+    stiffening: Array
+    """How fast the modulus rises with depth [1/m], shape (n,): see `Stiffness.stiffening_per_m`."""
+    tension: Array
+    """What a contracted muscle adds to the modulus, over k_w [1], shape (n,); 0 where nothing is guarded."""
+    lesion: IntArray
+    """Index of the lesion in whose half-contrast outline the vertex lies, -1 elsewhere, shape (n,)."""
+    fixed: NDArray[np.bool_]
+    """Vertices that do not move: the border of the examined body, and its back on the table; shape (n,)."""
+    breathing: Array
+    """Part of the breathing excursion at each vertex, 1 about the umbilicus, 0 where fixed; shape (n,)."""
+    voluntary: bool = False
+    """Whether the tension fades under gentle pressure: see `palpate_models.patient.guarding.Activation`."""
+
+
+def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
+    """The phantom of a scenario, a person drawn if need be. The same seed gives the same wall, whatever the mesh's resolution.
+
+    Raises MeshError if a user's mesh or a lesion cannot be used.
+    """
+    phantom = drawn(phantom, seed)
+    if phantom.mesh is not None:
+        surface = load_mesh(Path(phantom.mesh), phantom.edge_m)
+        vertices, triangles = surface.vertices, surface.triangles
+        normals = vertex_normals(vertices, triangles)
+        fixed = boundary_vertices(len(vertices), triangles)
+        if not fixed.any():  # closed: its back lies on the table
+            fixed |= vertices[:, 2] < vertices[:, 2].min() + _POSTERIOR_M
+        if fixed.all():
+            raise MeshError(f"phantom.mesh = {phantom.mesh}: all of its vertices are on its border or its back, none can move")
+    else:
+        shape = parametric_surface(phantom.size_m, phantom.edge_m, phantom.anatomy)
+        vertices, triangles, normals, fixed = shape.vertices, shape.triangles, shape.normals, shape.fixed
+    laplacian, mass = robust_laplacian.mesh_laplacian(vertices, triangles)
+    laplacian = sparse.csr_array(laplacian)
+    laplacian.sort_indices()
+    half_length = float(np.ptp(vertices[:, 1])) / 2
+    background = phantom.stiffness.k_w_n_per_m3 * background_factor(vertices, phantom.background, half_length, seed)
+    stiffening = np.full(len(vertices), phantom.stiffness.stiffening_per_m)
+    if phantom.anatomy is not None:
+        wall = healthy_wall(vertices, phantom.size_m, phantom.anatomy, phantom.stiffness.stiffening_per_m, seed)
+        background, stiffening = background * wall.stiffness, wall.stiffening
+    contrast, lesion = lesion_field(vertices[:, :2], phantom.lesions, front=normals[:, 2] > 0)
+    for index in sorted(set(range(len(phantom.lesions))) - set(lesion.tolist())):
+        centre, radii = phantom.lesions[index].centre_m, phantom.lesions[index].radii_m
+        raise MeshError(
+            f"phantom.lesions[{index}]: centre_m {centre}, radii_m {radii}: no point of the abdomen's front belongs to it "
+            "(want metres from the umbilicus; a stiffer lesion may cover it; where it was drawn, a smaller phantom.draw.region_m)"
+        )
+    tension = tension_field(vertices[:, :2], phantom.guarding, phantom.stiffness, front=normals[:, 2] > 0)
+    return PhantomModel(
+        vertices=vertices,
+        triangles=triangles,
+        normals=normals,
+        areas=np.asarray(mass.diagonal(), dtype=np.float64),
+        laplacian=laplacian,
+        stiffness=background * contrast,
+        background=background,
+        stiffening=stiffening,
+        tension=tension,
+        lesion=lesion,
+        fixed=fixed,
+        breathing=_breathing_profile(vertices, normals, half_length, fixed),
+        voluntary=any(area.kind == "voluntary" for area in phantom.guarding),
+    )
+
+
+def _breathing_profile(vertices: Array, normals: Array, half_length: float, fixed: NDArray[np.bool_]) -> Array:
+    """Share of the excursion, shape (n,): greatest about the umbilicus, none at the ends, the flanks and the back."""
+    along = np.cos(np.clip(vertices[:, 1] / half_length, -1, 1) * np.pi / 2) ** 2
+    profile = along * np.clip(normals[:, 2], 0, 1) ** 2
+    return np.where(fixed, 0.0, profile)
+
+
+def flat_phantom(
+    half_m: float = 0.13, edge_m: float = 0.005, k_w_n_per_m3: float = 1.7e5, lesions: Sequence[Lesion] = ()
+) -> PhantomModel:
+    """A square of half width `half_m` [m] in z = 0 on a hexagonal lattice of `edge_m` [m]; its border is fixed.
+
+    A vertex is at the origin. The breathing profile is 1 everywhere inside.
+    """
+    points = lattice(half_m, half_m, edge_m)
+    triangles = Delaunay(points).simplices
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    double_area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    flat = np.abs(double_area) < 1e-3 * edge_m**2  # Qhull's slivers along the border
+    triangles = np.where((double_area > 0)[:, None], triangles, triangles[:, ::-1])[~flat].astype(np.int32)
+    n = len(points)
+    vertices = np.column_stack((points, np.zeros(n)))
+    laplacian, mass = robust_laplacian.mesh_laplacian(vertices, triangles)
+    contrast, lesion = lesion_field(points, lesions)
+    fixed = boundary_vertices(n, triangles)
+    return PhantomModel(
+        vertices=vertices,
+        triangles=triangles,
+        normals=np.tile((0.0, 0.0, 1.0), (n, 1)),
+        areas=np.asarray(mass.diagonal(), dtype=np.float64),
+        laplacian=sparse.csr_array(laplacian),
+        stiffness=k_w_n_per_m3 * contrast,
+        background=np.full(n, k_w_n_per_m3),
+        stiffening=np.zeros(n),
+        tension=np.zeros(n),
+        lesion=lesion,
+        fixed=fixed,
+        breathing=np.where(fixed, 0.0, 1.0),
+    )

@@ -1,0 +1,1 @@
+"""The arm: kinematics, inertias, shape and table."""

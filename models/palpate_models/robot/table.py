@@ -1,0 +1,55 @@
+"""The operating table and the robot's cubic base, as boxes in world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from palpate_models.numerics.frames import Array, matrix
+from palpate_models.scenario.schema import Robot
+from palpate_models.section import Pose, Vec3
+
+TABLE_TOP_M: Final = 0.73
+"""Height of the table's top face [A]."""
+TABLE_X_M: Final = (0.285, 0.835)
+TABLE_Y_M: Final = (-1.0, 1.0)
+TABLE_THICKNESS_M: Final = 0.10
+COLUMN_M: Final = (0.30, 0.60)
+"""Footprint of the table's column, x and y [A]."""
+BASE_SIDE_M: Final = 0.40
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box B, aligned with its own frame at its centre."""
+
+    name: str
+    X_WB: Array
+    """Homogeneous pose of the centre in world, shape (4, 4)."""
+    size: Vec3
+    """Full edge lengths along B's axes [m]."""
+
+
+def _aligned(name: str, low: Vec3, high: Vec3) -> Box:
+    X_WB = np.eye(4)
+    X_WB[:3, 3] = (np.array(low) + np.array(high)) / 2
+    return Box(name, X_WB, (high[0] - low[0], high[1] - low[1], high[2] - low[2]))
+
+
+def boxes(robot: Robot) -> tuple[Box, ...]:
+    """Table top, table column and robot base, in world. The base reaches from the floor to `robot.base_height_m`."""
+    under = TABLE_TOP_M - TABLE_THICKNESS_M
+    x, y = sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2
+    height = robot.base_height_m
+    base = Pose(xyz_m=(*robot.base_xy_m, height / 2), rpy_rad=(0.0, 0.0, robot.base_yaw_rad))
+    return (
+        _aligned("table_top", (TABLE_X_M[0], TABLE_Y_M[0], under), (TABLE_X_M[1], TABLE_Y_M[1], TABLE_TOP_M)),
+        _aligned(
+            "table_column",
+            (x - COLUMN_M[0] / 2, y - COLUMN_M[1] / 2, 0.0),
+            (x + COLUMN_M[0] / 2, y + COLUMN_M[1] / 2, under),
+        ),
+        Box("robot_base", matrix(base), (BASE_SIDE_M, BASE_SIDE_M, height)),
+    )

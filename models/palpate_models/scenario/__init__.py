@@ -1,0 +1,1 @@
+"""Scenarios: schema, loading, equipment errors and scan patterns."""

@@ -1,0 +1,135 @@
+"""What a scan pattern is: a function from what is to be examined, and the surface as it is seen, to lines of points to feel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.named_function import PATTERN, PatternError
+from palpate_models.scenario.schema import Exam
+
+Surface = Callable[[Array], tuple[Array, Array]]
+"""The surface as it is seen: of xy in A [m], shape (n, 2), the points [m] and the outward unit normals, both (n, 3), in A."""
+LARGEST: Final = 20_000
+"""More targets than this take hours."""
+OUTSIDE_M: Final = 0.001
+"""Targets may lie so far outside of the region, which alone the camera is asked to see."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The lines of a scan, in their order."""
+
+    lines: Sequence[Array]
+    """Targets of each line in the abdomen frame A [m], shape (k, 2), in the order in which they are visited. The indenter slides
+    along a smooth curve through them, at depth, and lifts at the end; in mode `point` each target is pressed by itself."""
+    joined: bool = False
+    """Whether it stays in contact from the end of a line to the beginning of the next, where these are near each other."""
+
+    @property
+    def targets(self) -> Array:
+        """All targets in their order [m], shape (n, 2)."""
+        return np.concatenate(self.lines)
+
+    @property
+    def line_of_target(self) -> NDArray[np.int64]:
+        """The line of each target, shape (n,)."""
+        return np.repeat(np.arange(len(self.lines)), [len(line) for line in self.lines])
+
+
+def scan_of(exam: Exam, surface: Surface) -> Scan:
+    """The scan that the examination's pattern makes. Raises PatternError for one that cannot be used, with what is wrong."""
+    function = PATTERN.load(exam.pattern)
+    try:
+        made = function(exam, surface)
+    except Exception as error:
+        raise PatternError(PATTERN.told(exam.pattern, error)) from error
+    if not isinstance(made, Scan):
+        raise PatternError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan of {__name__}")
+    lines = [np.asarray(line, dtype=np.float64) for line in made.lines]
+    for k, line in enumerate(lines):
+        if line.ndim != 2 or line.shape[1] != 2 or not len(line) or not np.isfinite(line).all():
+            raise PatternError(f"exam.pattern = {exam.pattern!r}: line {k} has the shape {line.shape}, want finite (k, 2), k > 0")
+    count = sum(map(len, lines))
+    if not 0 < count <= LARGEST:
+        raise PatternError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LARGEST}")
+    scan = Scan(lines, made.joined)
+    off = np.abs(scan.targets - exam.centre_m) - np.array(exam.region_m) / 2
+    if off.max() > OUTSIDE_M:
+        raise PatternError(
+            f"exam.pattern = {exam.pattern!r}: targets lie up to {1e3 * off.max():.0f} mm outside of exam.region_m"
+        )
+    return scan
+
+
+TOUCHES_M: Final = 0.07
+"""Largest distance of these touches: they fix offset, tilt and field of the perceived surface."""
+
+
+def touch_centres(targets: Array) -> Array:
+    """The centres of the cells for targets in frame A [m], shape (n, 2): shape (k, 2), in the order in which they are touched.
+
+    They go to and fro, and end near the first target.
+    """
+    low, high = targets.min(axis=0), targets.max(axis=0)
+    counts = np.maximum(1, np.ceil((high - low) / TOUCHES_M - 1e-9)).astype(int)
+    columns, rows = (low[k] + (high[k] - low[k]) * (np.arange(counts[k]) + 0.5) / counts[k] for k in (0, 1))
+    centres = np.array([(x, y) for j, y in enumerate(rows) for x in columns[:: -1 if j % 2 else 1]])
+    if np.linalg.norm(centres[-1] - targets[0]) > np.linalg.norm(centres[0] - targets[0]):
+        centres = centres[::-1]
+    return centres
+
+
+def lines(exam: Exam, surface: Surface) -> Scan:
+    """Lines there and back, every second one first; the tool lifts at their ends, so that each has a touch and a tare of its own.
+
+    Skin that was pressed takes a while to come back, and a touch beside it would find it too deep: what lies between two lines is
+    pressed a minute after them.
+    """
+    del surface
+    along = _upward(exam)
+    return Scan(_there_and_back(along[::2] + along[1::2]))
+
+
+def raster(exam: Exam, surface: Surface) -> Scan:
+    """All lines from the feet to the head; the tool lifts at their ends."""
+    del surface
+    return Scan(_upward(exam))
+
+
+def snake(exam: Exam, surface: Surface) -> Scan:
+    """Lines there and back, joined in contact by arcs."""
+    del surface
+    return Scan(_there_and_back(_upward(exam)), joined=True)
+
+
+def search(exam: Exam, surface: Surface) -> Scan:
+    """The places that a search may ask for."""
+    del surface
+    return Scan(_there_and_back(_upward(exam)))
+
+
+def stations(centre: float, length: float, spacing: float) -> Array:
+    """Evenly spread coordinates [m] over `length` about `centre`, both ends included, at most `spacing` apart."""
+    count = int(np.ceil(length / spacing - 1e-9)) + 1
+    return np.linspace(centre - length / 2, centre + length / 2, count)
+
+
+def lattice(exam: Exam) -> tuple[Array, Array]:
+    """Stations of the region in A: x of the lines, y on a line [m]."""
+    (cx, cy), (width, height) = exam.centre_m, exam.region_m
+    return stations(cx, width, exam.spacing_m), stations(cy, height, exam.spacing_m)
+
+
+def _upward(exam: Exam) -> list[Array]:
+    x, y = lattice(exam)
+    return list(np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
+
+
+def _there_and_back(along: list[Array]) -> list[Array]:
+    return [line[::-1] if k % 2 else line for k, line in enumerate(along)]

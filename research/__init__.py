@@ -1,0 +1,1 @@
+"""Studies that were run by hand, calibrations and comparisons; not part of the distribution."""

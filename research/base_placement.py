@@ -1,0 +1,165 @@
+"""Where the robot's base should stand: x, y, height and yaw, found together with a posture for each of a grid of targets.
+
+The targets cover the examined region of the abdomen and a border about it, in contact and raised along their normals, so
+that approach and retreat, other patients and registration errors are served too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate_models.numerics.frames import Array, apply, matrix
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.robot.lbr import HOME, POSITION_LIMIT
+from palpate_models.robot.table import BASE_SIDE_M, TABLE_X_M
+from palpate_models.scenario.load import true_pose
+from palpate_models.scenario.schema import Exam, Robot, Scenario
+from palpate_planning.placement.inverse_kinematics import Mask
+from palpate_planning.placement.redundancy import PRESSING_FORCE_N, PostureSequence, plan_redundancy
+from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
+
+BORDER_M = 0.005
+"""Border about the examined region that is served too: turns between scan lines bulge over it."""
+RAISED_M = 0.035
+"""Rise of the indenter from its depth along the normal that is served too: 25 mm above the surface."""
+CLEARANCE_M = 0.05
+"""Between base and table [A]."""
+BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
+"""Least and largest x, y and height [m] and yaw [rad] of the base."""
+STARTS: tuple[tuple[float, float, float, float], ...] = (
+    (0.0, 0.0, 0.6, 0.0),
+    (0.0, 0.0, 1.1, 0.0),
+    (0.0, 0.1, 1.1, 0.0),
+)
+"""Placements to start from; the best result counts, as the problem is not convex."""
+MEAN_WEIGHT = 0.3
+"""Weight of the mean cost next to the worst target's."""
+_MARGIN_RAD = 0.05
+_IPOPT_STEPS = 300
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A base placement and what it achieves."""
+
+    robot: Robot
+    """The robot there, rounded to centimetres and hundredths of a radian."""
+    cost: float
+    """Objective before rounding [1]."""
+    postures: PostureSequence
+    """Postures at the grid's targets, in contact first, then raised."""
+
+
+def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised: float = 0.0) -> tuple[Array, Array]:
+    """Origins of the indenter [m] at `exam.depth_m` below the surface and outward normals, in world, shapes (n, 3).
+
+    They lie in snake order on a grid of at most `spacing` over the examined region widened by `border`; `raised` lifts
+    them along their normals. Normals are averaged over the indenter's footprint.
+    """
+    exam: Exam = scenario.exam
+    model = build_phantom(scenario.phantom, scenario.seed)
+    X_WA = matrix(true_pose(scenario))
+    front = model.normals[:, 2] > 0.2
+    vertices, normals = model.vertices[front], model.normals[front]
+    half = np.asarray(exam.region_m) / 2 + border
+    x, y = (np.linspace(c - h, c + h, int(np.ceil(2 * h / spacing)) + 1) for c, h in zip(exam.centre_m, half, strict=True))
+    xy = np.array([(a, b) for i, b in enumerate(y) for a in (x if i % 2 == 0 else x[::-1])])
+    distance = np.linalg.norm(vertices[None, :, :2] - xy[:, None], axis=2)
+    weight = np.exp(-0.5 * (distance / (scenario.robot.indenter_radius_m / 2)) ** 2)
+    n = weight @ normals
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    z = (weight @ vertices[:, 2]) / weight.sum(axis=1)
+    offset = scenario.robot.indenter_radius_m - exam.depth_m + raised
+    return apply(X_WA, np.column_stack((xy, z)) + offset * n), n @ X_WA[:3, :3].T
+
+
+def best_placement(scenario: Scenario, spacing: float = 0.06) -> Placement:
+    """The base placement with the least cost over the scenario's region. Raises RuntimeError if no start converges."""
+    contact = scan_targets(scenario, spacing, BORDER_M)
+    raised = scan_targets(scenario, spacing, BORDER_M, RAISED_M)
+    positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
+    found = [_optimise(scenario.robot, positions, normals, np.array(start)) for start in STARTS]
+    placements = [placement for placement in found if placement is not None]
+    if not placements:
+        raise RuntimeError("no base placement found from any start")
+    return min(placements, key=lambda placement: placement.cost)
+
+
+def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> Placement | None:
+    """Base placement and postures from one start by Ipopt; None if it does not converge."""
+    ca = casadi()
+    count = len(positions)
+    functions = arm(robot)
+    guess = plan_redundancy(_standing(robot, start), positions, normals, HOME, joint_margin_rad=2 * _MARGIN_RAD).q
+
+    base, Q, worst = ca.MX.sym("base", 4), ca.MX.sym("q", 7, count), ca.MX.sym("worst")
+    bases = ca.repmat(base, 1, count)
+    costs = functions.cost.map(count)(Q, bases, PRESSING_FORCE_N)[0]
+    objective = worst + MEAN_WEIGHT * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3]))
+    first = functions.cost.map(count)(guess.T, np.tile(start[:, None], (1, count)), PRESSING_FORCE_N)[0]
+    residual = functions.task.map(count)(Q, bases, positions.T, np.hstack(list(surface_frames(normals))))[0]
+    corner = base[0] + BASE_SIDE_M / 2 * (ca.cos(base[3]) + ca.sqrt(ca.sin(base[3]) ** 2 + 1e-6))
+    problem = {
+        "x": ca.vertcat(base, ca.vec(Q), worst),
+        "f": objective,
+        "g": ca.vertcat(ca.vec(residual), corner, costs.T - worst),
+    }
+    options = {
+        "ipopt": {"max_iter": _IPOPT_STEPS, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6},
+        "print_time": False,
+    }
+    solver = ca.nlpsol("placement", "ipopt", problem, options)
+    bound = np.tile(np.asarray(POSITION_LIMIT) - _MARGIN_RAD, count)
+    zeros = np.zeros(5 * count)
+    result = solver(
+        x0=np.concatenate((start, guess.ravel(), [float(np.array(first).max())])),
+        lbx=np.concatenate((BOUNDS[0], -bound, [-np.inf])),
+        ubx=np.concatenate((BOUNDS[1], bound, [np.inf])),
+        lbg=np.concatenate((zeros, np.full(1 + count, -np.inf))),
+        ubg=np.concatenate((zeros, [TABLE_X_M[0] - CLEARANCE_M], np.zeros(count))),
+    )
+    if not solver.stats()["success"]:
+        return None
+    solution = np.array(result["x"])[:, 0]
+    placed = _standing(robot, np.round(solution[:4], 2))
+    return Placement(placed, float(result["f"]), plan_redundancy(placed, positions, normals, HOME))
+
+
+def _standing(robot: Robot, base: Array) -> Robot:
+    """`robot` on the base placement `base`, shape (4,)."""
+    x, y, height, yaw = (float(value) + 0.0 for value in base)  # + 0.0 makes no -0.0 of a zero
+    return robot.model_copy(update={"base_xy_m": (x, y), "base_height_m": height, "base_yaw_rad": yaw})
+
+
+def describe(robot: Robot, postures: PostureSequence) -> str:
+    """One line on a placement: how much of the targets it reaches, and the worst margins."""
+    reached: Mask = postures.reachable
+    x, y, height, yaw = base_of(robot)
+    head = f"x {x:6.2f} m  y {y:5.2f} m  height {height:4.2f} m  yaw {yaw:5.2f} rad"
+    if not reached.any():
+        return f"{head}: reaches none of {len(reached)} targets"
+    return (
+        f"{head}: reaches {reached.sum()} of {len(reached)} targets; "
+        f"least joint margin {np.rad2deg(postures.margin[reached].min()):.1f} deg, "
+        f"largest torque {100 * postures.torque_fraction[reached].max():.0f} % of its limit, "
+        f"least dexterity {postures.dexterity[reached].min():.2f}"
+    )
+
+
+def report() -> str:
+    """The best placement for the default scenario next to the present one, judged on the whole scan and on its approach."""
+    scenario = Scenario()
+    best = best_placement(scenario)
+    lines = []
+    for label, robot in (("best", best.robot), ("scenario", scenario.robot)):
+        for height, raised in (("at depth", 0.0), ("raised", RAISED_M)):
+            targets = scan_targets(scenario, scenario.exam.spacing_m, raised=raised)
+            postures = plan_redundancy(robot, *targets, np.asarray(HOME))
+            lines.append(f"{label:8} {height:8}  {describe(robot, postures)}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(report())

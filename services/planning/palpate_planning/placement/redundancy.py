@@ -1,0 +1,225 @@
+"""Redundancy and base placement: which postures of the arm carry out a whole scan with the most margin.
+
+    postures = plan_redundancy(robot, positions_W, normals_W, q_seed)
+
+Position and tool axis take five of seven joints; what is left (elbow swivel and spin about the tool) is chosen by
+optimisation: far from joint limits, little torque at the pressing force, far from singularities, elbow high, smooth
+along the path. `python -m research.base_placement` finds the base placement by the same costs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial import cKDTree
+
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.lbr import POSITION_LIMIT, TORQUE_LIMIT
+from palpate_models.scenario.schema import Robot
+from palpate_planning.placement.inverse_kinematics import PROJECTION_STEPS, Batch, Mask
+from palpate_planning.placement.symbolic import arm, casadi
+
+KNOTS = 32
+"""Targets at most that the optimisation moves; postures between them are interpolated and put back on their targets."""
+SMOOTHNESS = 2.0
+"""Weight of squared joint travel [1/rad^2] between knots of mean spacing [A]."""
+PRESSING_FORCE_N = 15.0
+"""Normal force that postures are judged at: the working force limit."""
+_IPOPT_STEPS, _SAMPLES = 80, 16
+
+
+@dataclass(frozen=True, slots=True)
+class PostureSequence:
+    """A posture for each target, in the targets' order."""
+
+    q: Array
+    """Joint positions [rad], shape (n, 7); where not reachable, the posture that comes nearest."""
+    reachable: Mask
+    """Whether the target is reached within joint limits less the margin, shape (n,)."""
+    margin: Array
+    """Distance to the nearest joint limit [rad], shape (n,)."""
+    torque_fraction: Array
+    """Largest joint torque over its limit, gravity and pressing force together [1], shape (n,)."""
+    dexterity: Array
+    """Distance from singularity, sqrt(det(J J^T)) of the length-scaled Jacobian [1], shape (n,)."""
+    residual: Array
+    """What is missing to the target: norm over position [m] and axis [rad], shape (n,)."""
+    refined: bool
+    """Whether the optimisation converged; else these are inverse kinematics with a null-space gradient."""
+
+
+def plan_redundancy(
+    robot: Robot,
+    positions_W: Array,
+    normals_W: Array,
+    q_seed: Array,
+    *,
+    joint_margin_rad: float = 0.05,
+    force_n: float = PRESSING_FORCE_N,
+) -> PostureSequence:
+    """Postures that take the indenter along targets with the tool's z axis opposite to the surface normals.
+
+    Args:
+        robot: the robot with its base placement and tool.
+        positions_W: origins of the indenter frame (the sphere's centre) in world, in path order [m], shape (n, 3).
+        normals_W: outward unit surface normals in world, shape (n, 3).
+        q_seed: a posture to start from, e.g. the present one [rad], shape (7,); it decides between branches
+            that are equally good.
+        joint_margin_rad: kept from every joint limit.
+        force_n: normal force that the postures must press with.
+
+    Targets that cannot be reached are flagged, not dropped. The result depends on the arguments alone.
+    Raises ValueError on arrays of other shapes or values that are not finite.
+    """
+    positions, normals = np.asarray(positions_W, dtype=float), np.asarray(normals_W, dtype=float)
+    seed = np.asarray(q_seed, dtype=float)
+    if positions.ndim != 2 or positions.shape[1] != 3 or normals.shape != positions.shape or seed.shape != (7,):
+        raise ValueError(
+            f"want positions_W (n, 3), normals_W (n, 3), q_seed (7,), not {positions.shape}, {normals.shape}, {seed.shape}"
+        )
+    for name, value in (("positions_W", positions), ("normals_W", normals), ("q_seed", seed)):
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name}: must be finite")
+    if len(positions) == 0:
+        empty = np.zeros(0)
+        return PostureSequence(np.zeros((0, 7)), np.zeros(0, dtype=bool), empty, empty, empty, empty, True)
+
+    limit = np.asarray(POSITION_LIMIT) - joint_margin_rad
+    batch = Batch(robot, positions, normals, limit, force_n)
+    q = _inverse_kinematics(batch, seed)
+    refined = False
+    reachable = batch.reached(q)[1]
+    if reachable.sum() >= 2:
+        better, refined = _refine(robot, batch, q, reachable)
+        if refined:
+            q = _keep_best(batch, q, better)
+    return _judge(batch, q, refined)
+
+
+def prepare(robot: Robot, force_n: float = PRESSING_FORCE_N) -> None:
+    """Makes what `plan_redundancy` needs whatever the targets are, CasADi's functions and the solver, ahead of it."""
+    arm(robot)
+    _program(_at_origin(robot), KNOTS, force_n)
+
+
+def _at_origin(robot: Robot) -> Robot:
+    """The robot as the solver has it: where it stands is a parameter."""
+    return robot.model_copy(update={"base_xy_m": (0.0, 0.0)})
+
+
+def _seeds(batch: Batch, seed: Array) -> list[Array]:
+    """Postures to start inverse kinematics from: the caller's, and elbow-up ones that face the targets' centre."""
+    x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
+    azimuth = np.arctan2(y, x) - batch.base[3]
+    azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
+    fan = [np.array([azimuth, tilt, 0.0, -bend, 0.0, 1.2, 0.0]) for tilt in (0.3, 0.8) for bend in (1.6, 1.0)]
+    return [seed, *fan]
+
+
+def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
+    """A posture for each target, shape (n, 7), from the best seed, then from the nearest neighbour that was reached."""
+    sample = batch.part(np.unique(np.linspace(0, batch.count - 1, min(_SAMPLES, batch.count)).round().astype(int)))
+    best = min(_seeds(batch, seed), key=lambda start: sample.verdict(sample.from_one(start)))
+    q = batch.from_one(best)
+    missing, reached = batch.reached(q)
+    if reached.any() and not reached.all():
+        _, nearest = cKDTree(batch.positions[reached]).query(batch.positions)
+        trial = batch.search(q[np.flatnonzero(reached)[nearest]])
+        residual, good = batch.reached(trial)
+        better = ~reached & (good | (residual < missing))
+        q = np.where(better[:, None], trial, q)
+    return q
+
+
+def _path_length(positions: Array) -> Array:
+    """Length along the path at each point [m], strictly increasing, shape (n,)."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-6))))
+
+
+def _knots(batch: Batch, reachable: Mask) -> NDArray[np.intp]:
+    """Indices of the reachable targets that the optimisation moves: evenly along the path, ends included."""
+    candidates = np.flatnonzero(reachable)
+    s = _path_length(batch.positions)[candidates]
+    wanted = np.linspace(s[0], s[-1], min(KNOTS, len(candidates)))
+    nearest = np.unique(np.abs(s[None, :] - wanted[:, None]).argmin(axis=1))
+    return np.asarray(candidates[nearest])
+
+
+@lru_cache(maxsize=4)
+def _program(robot: Robot, count: int, force: float) -> Any:
+    """Ipopt on `count` knots. Parameters: base, positions, frames, and the weight of each step between knots."""
+    ca = casadi()
+    functions = arm(robot)
+    Q = ca.MX.sym("q", 7, count)
+    base, P = ca.MX.sym("base", 4), ca.MX.sym("P", 3, count)
+    frames, weights = ca.MX.sym("frames", 3, 3 * count), ca.MX.sym("weights", count - 1)
+    bases = ca.repmat(base, 1, count)
+    travel = Q[:, 1:] - Q[:, :-1]
+    cost = ca.sum2(functions.cost.map(count)(Q, bases, force)[0])
+    cost += SMOOTHNESS * ca.dot(weights, ca.sum1(travel**2).T)
+    residual = functions.task.map(count)(Q, bases, P, frames)[0]
+    problem = {
+        "x": ca.vec(Q),
+        "p": ca.vertcat(base, ca.vec(P), ca.vec(frames), weights),
+        "f": cost,
+        "g": ca.vec(residual),
+    }
+    options = {
+        "ipopt": {"max_iter": _IPOPT_STEPS, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6},
+        "print_time": False,
+    }
+    return ca.nlpsol("redundancy", "ipopt", problem, options)
+
+
+def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Array, bool]:
+    """Optimal postures at the knots, interpolated, put back on the targets; and whether Ipopt converged."""
+    knots = _knots(batch, reachable)
+    if len(knots) < 2:
+        return q, False
+    solver = _program(_at_origin(robot), len(knots), batch.force)
+    s = _path_length(batch.positions)
+    spacing = np.diff(s[knots])
+    weights = spacing.mean() / spacing
+    parameters = np.concatenate(
+        (
+            batch.base,
+            batch.positions[knots].ravel(),
+            np.hstack(list(batch.frames[knots])).ravel(order="F"),
+            weights,
+        )
+    )
+    bound = np.tile(batch.limit, len(knots))
+    result = solver(x0=q[knots].ravel(), p=parameters, lbx=-bound, ubx=bound, lbg=0, ubg=0)
+    if not solver.stats()["success"]:
+        return q, False
+    optimal = np.array(result["x"]).reshape(len(knots), 7)
+    within = np.clip(s, s[knots[0]], s[knots[-1]])
+    between = PchipInterpolator(s[knots], optimal)(within)
+    return batch.solve(between, PROJECTION_STEPS, 0.0), True
+
+
+def _keep_best(batch: Batch, before: Array, after: Array) -> Array:
+    """The refined postures, but for targets that only inverse kinematics reached."""
+    lost = batch.reached(before)[1] & ~batch.reached(after)[1]
+    return np.where(lost[:, None], before, after)
+
+
+def _judge(batch: Batch, q: Array, refined: bool) -> PostureSequence:
+    residual, reachable = batch.reached(q)
+    bases = np.tile(batch.base[:, None], (1, batch.count))
+    torque = np.array(batch.functions.torque.map(batch.count)(q.T, bases, batch.force)).T
+    return PostureSequence(
+        q=q,
+        reachable=reachable,
+        margin=(np.asarray(POSITION_LIMIT) - np.abs(q)).min(axis=1),
+        torque_fraction=(np.abs(torque) / TORQUE_LIMIT).max(axis=1),
+        dexterity=np.array(batch.functions.dexterity.map(batch.count)(q.T, bases))[0],
+        residual=residual,
+        refined=refined,
+    )

@@ -1,0 +1,163 @@
+"""The arm in CasADi, from the same tables as its URDF: kinematics, gravity torques and what a posture costs.
+
+A task is a position of the indenter's origin and the direction of its z axis: five equations. The spin about that axis
+and the elbow's swivel are free. A base placement is (x [m], y [m], height [m], yaw [rad]) in world, shape (4,).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from palpate_models.numerics.frames import Array
+from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.robot.lbr import (
+    FLANGE_TO_FT_M,
+    FT_TO_INDENTER_M,
+    JOINT_AXIS,
+    JOINT_ORIGIN,
+    LINK_7_TO_FLANGE_M,
+    LINK_NAMES,
+    POSITION_LIMIT,
+    TORQUE_LIMIT,
+    inertias,
+)
+from palpate_models.scenario.schema import Robot
+
+ELBOW_CLEARANCE_M = 0.15
+"""The elbow stays at least this far above the indenter, so that upper arm and forearm keep off abdomen and table."""
+REACH_LENGTH_M = 0.4
+"""Length that makes linear and angular rows of the Jacobian comparable: upper arm and forearm of the LBR iiwa 7."""
+_RIDGE = 1e-12
+"""Added to the Gram matrix of the Jacobian [1]: no pivot is zero where the arm is singular."""
+WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.0
+"""What counts in a posture, each term of order one [A]."""
+
+
+class MissingCasadiError(ImportError):
+    """CasADi is not installed."""
+
+
+def casadi() -> Any:
+    """The CasADi module, imported when first used. Raises MissingCasadiError with what to install."""
+    try:
+        return import_module("casadi")
+    except ImportError as error:
+        raise MissingCasadiError("posture planning needs CasADi: install palpate[planning]") from error
+
+
+class ArmFunctions(NamedTuple):
+    """CasADi functions of the arm.
+
+    `q` (7,) [rad], `base` (4,), `p` (3,) [m], `frame` (3, 3): columns t1, t2 (tangents), n (outward surface normal).
+    `force` [N] is pressed along the tool's z axis.
+    """
+
+    task: Any
+    """(q, base, p, frame) -> residual (5,) [m, 1], its Jacobian by q (5, 7): zero residual at the task's solutions."""
+    facing: Any
+    """(q, base, frame) -> cosine between the tool's z axis and -n [1]."""
+    cost: Any
+    """(q, base, force) -> cost of a posture [1], its gradient by q (7,)."""
+    torque: Any
+    """(q, base, force) -> joint torques that hold gravity and press with `force` [N m], shape (7,)."""
+    dexterity: Any
+    """(q, base) -> sqrt(det(J J^T)) of the length-scaled Jacobian [1]: zero where singular."""
+    pose: Any
+    """(q, base) -> rotation (3, 3) and origin (3,) [m] of the indenter frame in world."""
+    elbow: Any
+    """(q, base) -> position of the elbow in world [m], shape (3,)."""
+
+
+def _axis_rotation(ca: Any, axis: tuple[float, float, float], angle: Any) -> Any:
+    """Rotation matrix about a unit vector (Rodrigues)."""
+    K = ca.skew(ca.DM(axis))
+    return ca.DM.eye(3) + ca.sin(angle) * K + (1 - ca.cos(angle)) * ca.mtimes(K, K)
+
+
+def _determinant(ca: Any, A: Any) -> Any:
+    """Determinant of a positive semi-definite matrix by A = L D L': `ca.det`, by cofactors, takes many times the operations."""
+    pivots, _, _ = ca.ldl(A + _RIDGE * ca.DM.eye(A.shape[0]), False)
+    determinant = 1
+    for pivot in ca.vertsplit(pivots):
+        determinant *= pivot
+    return determinant
+
+
+@lru_cache(maxsize=8)
+def arm(robot: Robot) -> ArmFunctions:
+    """The functions of an arm with this robot's tool. Its base fields are not used: base is an argument."""
+    ca = casadi()
+    q, base = ca.SX.sym("q", 7), ca.SX.sym("base", 4)
+    target, frame, force = ca.SX.sym("p", 3), ca.SX.sym("frame", 3, 3), ca.SX.sym("force")
+    loads = inertias(robot)
+
+    R = _axis_rotation(ca, (0.0, 0.0, 1.0), base[3])
+    p = base[:3]
+    origins, axes = [], []
+    energy = ca.SX(0)
+    for i in range(7):
+        p = p + ca.mtimes(R, ca.DM(JOINT_ORIGIN[i]))
+        R = ca.mtimes(R, _axis_rotation(ca, JOINT_AXIS[i], q[i]))
+        origins.append(p)
+        axes.append(ca.mtimes(R, ca.DM(JOINT_AXIS[i])))
+        link = loads[LINK_NAMES[i + 1]]
+        energy += link.mass * GRAVITY * (p + ca.mtimes(R, ca.DM(link.com)))[2]
+    for name, offset in (
+        ("lbr_link_ee", LINK_7_TO_FLANGE_M),
+        ("ft_sensor", FLANGE_TO_FT_M),
+        ("indenter", FT_TO_INDENTER_M),
+    ):
+        p = p + R[:, 2] * offset
+        load = loads[name]
+        energy += load.mass * GRAVITY * (p + ca.mtimes(R, ca.DM(load.com)))[2]
+
+    tool_axis = R[:, 2]
+    linear = ca.horzcat(*(ca.cross(axis, p - origin) for axis, origin in zip(axes, origins, strict=True)))
+    jacobian = ca.vertcat(linear / REACH_LENGTH_M, ca.horzcat(*axes))
+    gram = _determinant(ca, ca.mtimes(jacobian, jacobian.T))
+    torque = ca.gradient(energy, q) + ca.mtimes(linear.T, tool_axis * force)
+    residual = ca.vertcat(p - target, ca.mtimes(frame[:, :2].T, tool_axis))
+    elbow = origins[3]
+
+    relative = q / ca.DM(np.array(POSITION_LIMIT))
+    low = (p[2] + ELBOW_CLEARANCE_M - elbow[2]) / 0.03
+    cost = (
+        WEIGHT_LIMITS * ca.sum1(-ca.log(1 - relative**2))
+        + WEIGHT_TORQUE * ca.sumsqr(torque / ca.DM(np.array(TORQUE_LIMIT)))
+        - WEIGHT_DEXTERITY * ca.log(gram + 1e-9)
+        + WEIGHT_ELBOW * ca.log1p(ca.exp(ca.fmin(low, 50)))
+    )
+    return ArmFunctions(
+        ca.Function("task", [q, base, target, frame], [residual, ca.jacobian(residual, q)]),
+        ca.Function("facing", [q, base, frame], [-ca.dot(frame[:, 2], tool_axis)]),
+        ca.Function("cost", [q, base, force], [cost, ca.gradient(cost, q)]),
+        ca.Function("torque", [q, base, force], [torque]),
+        ca.Function("dexterity", [q, base], [ca.sqrt(ca.fmax(gram, 0))]),
+        ca.Function("pose", [q, base], [R, p]),
+        ca.Function("elbow", [q, base], [elbow]),
+    )
+
+
+def surface_frames(normals: Array) -> Array:
+    """Frames with columns t1, t2 (tangents) and n for outward unit normals of shape (n, 3); shape (n, 3, 3).
+
+    Raises ValueError if a normal is not of unit length.
+    """
+    length = np.linalg.norm(normals, axis=1)
+    if normals.ndim != 2 or normals.shape[1] != 3 or not (np.abs(length - 1) < 1e-3).all():
+        raise ValueError(f"normals: want unit vectors of shape (n, 3), not {normals.shape} with lengths {length}")
+    n = normals / length[:, None]
+    helper = np.zeros_like(n)
+    helper[np.arange(len(n)), np.abs(n).argmin(axis=1)] = 1.0
+    t1 = np.cross(helper, n)
+    t1 /= np.linalg.norm(t1, axis=1)[:, None]
+    return np.stack((t1, np.cross(n, t1), n), axis=2)
+
+
+def base_of(robot: Robot) -> Array:
+    """The robot's base placement, shape (4,)."""
+    return np.array([*robot.base_xy_m, robot.base_height_m, robot.base_yaw_rad])

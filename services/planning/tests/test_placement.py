@@ -1,0 +1,205 @@
+"""Kinematics in CasADi, postures along a scan, and where the base stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
+from palpate_models.scenario.schema import Robot, Scenario
+from palpate_planning.placement import redundancy as placement
+from palpate_planning.placement.inverse_kinematics import TASK_TOLERANCE
+from palpate_planning.placement.redundancy import PostureSequence, plan_redundancy, prepare
+from palpate_planning.placement.symbolic import REACH_LENGTH_M, arm, base_of, surface_frames
+
+ROBOT = Robot()
+
+
+def dome(spacing: float = 0.02, half: float = 0.1, centre: tuple[float, float] = (0.56, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+    """A snake over a dome of 0.45 m radius about (x, y) with its crown at 0.93 m: positions and normals, shapes (n, 3)."""
+    axis = np.linspace(-half, half, round(2 * half / spacing) + 1)
+    xy = np.array([(x, y) for i, y in enumerate(axis) for x in (axis if i % 2 == 0 else axis[::-1])])
+    normals = np.column_stack((xy, np.sqrt(0.45**2 - (xy**2).sum(axis=1)))) / 0.45
+    return np.array([*centre, 0.93 - 0.45]) + 0.455 * normals, normals
+
+
+@pytest.fixture(scope="module")
+def scan() -> tuple[np.ndarray, np.ndarray, PostureSequence]:
+    positions, normals = dome()
+    return positions, normals, plan_redundancy(ROBOT, positions, normals, np.array(HOME))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_functions_agree_with_the_urdf(seed: int) -> None:
+    """Pose, Jacobian's rank measure and torque against pinocchio, for a base anywhere."""
+    rng = np.random.default_rng(seed)
+    robot = Robot(base_xy_m=tuple(rng.normal(size=2)), base_height_m=0.9, base_yaw_rad=float(rng.normal()), tool_mass_kg=0.6)
+    model = pin.buildModelFromXML(urdf(robot))
+    data = model.createData()
+    q = rng.uniform(-1, 1, 7) * POSITION_LIMIT
+    frame = model.getFrameId("indenter")
+    J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+    pose = pin.updateFramePlacement(model, data, frame)
+    functions, base = arm(robot), base_of(robot)
+    R, p = (np.array(value) for value in functions.pose(q, base))
+    np.testing.assert_allclose(R, pose.rotation, atol=1e-12)
+    np.testing.assert_allclose(p[:, 0], pose.translation, atol=1e-12)
+    press = J[:3].T @ (12.0 * pose.rotation[:, 2])
+    torque = pin.computeGeneralizedGravity(model, data, q) + press
+    np.testing.assert_allclose(np.array(functions.torque(q, base, 12.0))[:, 0], torque, atol=1e-9)
+    scaled = J / np.array([[REACH_LENGTH_M]] * 3 + [[1.0]] * 3)
+    assert float(functions.dexterity(q, base)) == pytest.approx(float(np.sqrt(np.linalg.det(scaled @ scaled.T))), abs=1e-9)
+
+
+def test_a_stretched_arm_has_no_dexterity_and_a_finite_cost() -> None:
+    functions, base = arm(ROBOT), base_of(ROBOT)
+    cost, gradient = functions.cost(np.zeros(7), base, 15.0)
+    assert float(functions.dexterity(np.zeros(7), base)) < 1e-6
+    assert np.isfinite(float(cost))
+    assert np.isfinite(np.array(gradient)).all()
+
+
+def test_planning_uses_what_was_prepared(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
+    positions, normals, _ = scan
+    robot = Robot(tool_mass_kg=0.41)
+    prepare(robot, 9.0)
+    made = placement._program.cache_info().misses
+    assert plan_redundancy(robot, positions, normals, np.array(HOME), force_n=9.0).refined
+    assert placement._program.cache_info().misses == made
+
+
+def test_task_and_cost_have_their_derivatives() -> None:
+    functions, base = arm(ROBOT), base_of(ROBOT)
+    q = np.array(HOME) + 0.1
+    frame, p = surface_frames(np.array([[0.0, 0.6, 0.8]]))[0], np.array([0.5, 0.0, 1.0])
+    residual, J = functions.task(q, base, p, frame)
+    cost, gradient = functions.cost(q, base, 15.0)
+    for i, dq in enumerate(1e-6 * np.eye(7)):
+        slope = (np.array(functions.task(q + dq, base, p, frame)[0]) - np.array(residual)) / 1e-6
+        np.testing.assert_allclose(slope[:, 0], np.array(J)[:, i], atol=1e-5)
+        assert float(functions.cost(q + dq, base, 15.0)[0] - cost) / 1e-6 == pytest.approx(float(gradient[i]), abs=1e-3)
+
+
+def test_frames_are_right_handed_with_the_normal_last() -> None:
+    normals = np.random.default_rng(0).normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    frames = surface_frames(normals)
+    np.testing.assert_allclose(frames[:, :, 2], normals, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
+    np.testing.assert_allclose(frames.transpose(0, 2, 1) @ frames, np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-12)
+
+
+def test_every_target_is_met_within_limits(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
+    positions, normals, postures = scan
+    assert postures.reachable.all() and postures.refined
+    assert postures.residual.max() < TASK_TOLERANCE
+    model = pin.buildModelFromXML(urdf(ROBOT))
+    data = model.createData()
+    for q, p, n in zip(postures.q, positions, normals, strict=True):
+        pin.framesForwardKinematics(model, data, q)
+        pose = data.oMf[model.getFrameId("indenter")]
+        np.testing.assert_allclose(pose.translation, p, atol=1e-5)
+        np.testing.assert_allclose(pose.rotation[:, 2], -n, atol=1e-5)
+    np.testing.assert_allclose(postures.margin, (POSITION_LIMIT - np.abs(postures.q)).min(axis=1))
+    assert postures.margin.min() > np.deg2rad(5)
+    assert postures.torque_fraction.max() < 0.5
+
+
+def test_postures_follow_the_path_smoothly(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
+    """No change of branch: over the 20 mm between targets a joint turns by less than 0.5 rad (the elbow, nearly straight)."""
+    assert np.abs(np.diff(scan[2].q, axis=0)).max() < 0.5
+
+
+def test_optimisation_earns_its_keep(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
+    """Swivelling the elbow at any target by null-space motion finds no cheaper posture there of any consequence."""
+    positions, normals, postures = scan
+    functions, base = arm(ROBOT), base_of(ROBOT)
+    frames = surface_frames(normals)
+    gains = []
+    for q, p, frame in zip(postures.q[::10], positions[::10], frames[::10], strict=True):
+        gradient = np.array(functions.cost(q, base, 15.0)[1])[:, 0]
+        J = np.array(functions.task(q, base, p, frame)[1])
+        free = gradient - J.T @ np.linalg.solve(J @ J.T, J @ gradient)
+        gains.append(np.linalg.norm(free))
+    assert np.median(gains) < 1.0
+
+
+def test_what_is_out_of_reach_is_flagged_and_the_rest_is_served() -> None:
+    positions, normals = dome(0.04)
+    positions[7] += [0.8, 0.0, 0.0]
+    positions[20] += [0.0, 0.0, 1.5]
+    postures = plan_redundancy(ROBOT, positions, normals, np.array(HOME))
+    assert np.flatnonzero(~postures.reachable).tolist() == [7, 20]
+    assert postures.q.shape == (len(positions), 7)
+    assert (np.abs(postures.q) <= POSITION_LIMIT).all()
+    assert postures.residual[7] > 0.1
+
+
+def test_nothing_in_reach_is_no_error() -> None:
+    positions, normals = dome(0.1)
+    postures = plan_redundancy(ROBOT, positions + 5.0, normals, np.array(HOME))
+    assert not postures.reachable.any() and not postures.refined
+
+
+def test_same_arguments_same_postures() -> None:
+    positions, normals = dome(0.05)
+    first, second = (plan_redundancy(ROBOT, positions, normals, np.array(HOME)) for _ in range(2))
+    np.testing.assert_array_equal(first.q, second.q)
+
+
+def test_seed_does_not_matter_for_reach() -> None:
+    positions, normals = dome(0.05)
+    for seed in (np.zeros(7), np.array([1.5, 0.5, -1.0, 1.0, 0.5, -1.0, 2.0]), POSITION_LIMIT * 1.5):
+        assert plan_redundancy(ROBOT, positions, normals, np.array(seed)).reachable.all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_targets(count: int) -> None:
+    positions, normals = dome(0.05)
+    postures = plan_redundancy(ROBOT, positions[:count], normals[:count], np.array(HOME))
+    assert postures.q.shape == (count, 7)
+    assert postures.reachable.shape == (count,) and postures.reachable.all()
+
+
+def test_joint_margin_is_kept() -> None:
+    positions, normals = dome(0.05)
+    postures = plan_redundancy(ROBOT, positions, normals, np.array(HOME), joint_margin_rad=0.15)
+    assert postures.margin.min() >= 0.15 - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"normals_W": np.ones((4, 3))}, "unit vectors"),
+        ({"positions_W": np.zeros((3, 3))}, "positions_W"),
+        ({"positions_W": np.full((4, 3), np.nan)}, "positions_W"),
+        ({"q_seed": np.zeros(6)}, "q_seed"),
+    ],
+)
+def test_bad_arguments_are_named(changes: dict[str, np.ndarray], named: str) -> None:
+    arguments = {"positions_W": np.zeros((4, 3)), "normals_W": np.tile([0.0, 0.0, 1.0], (4, 1)), "q_seed": np.zeros(7)}
+    with pytest.raises(ValueError, match=named):
+        plan_redundancy(ROBOT, **(arguments | changes))
+
+
+def test_default_base_serves_the_default_scan() -> None:
+    from research.base_placement import RAISED_M, scan_targets
+
+    scenario = Scenario()
+    for raised in (0.0, RAISED_M):
+        positions, normals = scan_targets(scenario, scenario.exam.spacing_m, raised=raised)
+        postures = plan_redundancy(scenario.robot, positions, normals, np.array(HOME))
+        assert postures.reachable.all()
+        assert np.rad2deg(postures.margin.min()) > 8
+        assert postures.torque_fraction.max() < 0.4
+        assert (np.abs(postures.torque_fraction * TORQUE_LIMIT.max()) < TORQUE_LIMIT.max()).all()
+
+
+@pytest.mark.slow
+def test_default_base_is_what_the_optimisation_finds() -> None:
+    from research.base_placement import best_placement
+
+    best = best_placement(Scenario())
+    np.testing.assert_allclose(base_of(best.robot), base_of(ROBOT), atol=0.011)
+    assert best.postures.reachable.all()
