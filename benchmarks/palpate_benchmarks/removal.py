@@ -41,8 +41,12 @@ MODULES: dict[str, tuple[str, ...]] = {
     "arm's kinematics": ("palpate_robot.backends.dart.kinematics",),
     "tissue's step": ("palpate_tissue.backends.winkler.kernel", "palpate_tissue.friction"),
     "rest point's triangles": ("palpate_tissue.surface",),
-    "path and its splines": ("palpate_planning.path", "palpate_planning.poses", "palpate_planning.compiled_splines"),
-    "perceived surface": ("palpate_planning.surface", "palpate_planning.compiled_splines"),
+    "path and its splines": (
+        "palpate_planning.strokes.path",
+        "palpate_planning.strokes.path",
+        "palpate_planning.wall.surface",
+    ),
+    "perceived surface": ("palpate_planning.wall.surface", "palpate_planning.wall.surface"),
     "nearest vertex": ("palpate_models.numerics.nearest",),
 }
 """The modules whose compiled functions call each other: taken away together."""

@@ -29,9 +29,9 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.errors import ArmErrors, Errors
 from palpate_models.scenario.load import plant_input, true_pose
 from palpate_models.scenario.schema import Scenario
-from palpate_planning.kinematics import ArmKinematics
-from palpate_planning.poses import least_twist, pose
+from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint
+from palpate_planning.strokes.path import least_twist, pose
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.service import RobotService
 from palpate_tissue.backends.winkler.service import create as create_tissue

@@ -16,9 +16,9 @@ from palpate_models.robot.lbr import HOME
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import Scan
 from palpate_models.scenario.schema import Exam, Mode, Scenario
-from palpate_planning.exam_planner import ExamPlanner, PerceivedAbdomen
-from palpate_planning.motion_planning import NoPathError
-from palpate_planning.surface import PerceivedSurface
+from palpate_planning.motion.planner import NoPathError
+from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
+from palpate_planning.wall.surface import PerceivedSurface
 
 PERIOD_S = 0.010
 """Of the planner's trajectories."""

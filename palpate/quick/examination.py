@@ -22,9 +22,7 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import Following, Mode, Scenario
-from palpate_planning.breath import Breath
 from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
-from palpate_planning.coverage import strokes, transfer
 from palpate_planning.descent import ALLOWANCE_M, DESCEND_MPS, PROBE_MPS, REST_S, SIGMAS, TARE_S
 from palpate_planning.palpation import (
     HOLD_S,
@@ -36,13 +34,15 @@ from palpate_planning.palpation import (
     STEADY_FRACTION,
     STOPPED,
 )
-from palpate_planning.path import Ints, SurfacePath, lay
-from palpate_planning.segments import Segment
 from palpate_planning.stages import AT_DEPTH, PUSHING, StrokeStage
 from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
-from palpate_planning.surface import Foot, PerceivedSurface
-from palpate_planning.touch import FELT_N
-from palpate_planning.wall import Wall, WallPlace
+from palpate_planning.strokes.coverage import strokes, transfer
+from palpate_planning.strokes.path import Ints, SurfacePath, lay
+from palpate_planning.strokes.segments import Segment
+from palpate_planning.wall.breath import Breath
+from palpate_planning.wall.surface import Foot, PerceivedSurface
+from palpate_planning.wall.touch import FELT_N
+from palpate_planning.wall.wall import Wall, WallPlace
 from palpate_planning.wall_watch import GATE_M
 
 _DENSE_M: Final = 0.0003

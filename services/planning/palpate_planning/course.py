@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.exam_planner import ExamPlan, PerceivedAbdomen
 from palpate_planning.free_motion import FreeMotion
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import SECOND
 from palpate_planning.status import OVER, ExamStatus, Observation, Phase
+from palpate_planning.strokes.plan import ExamPlan, PerceivedAbdomen
 
 END_AFTER = SECOND
 """The run goes on for this long after the examination has ended [ns]."""

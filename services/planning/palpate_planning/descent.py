@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
-from palpate_planning.touch import FELT_N, Onset
-from palpate_planning.wall import TouchedSkin
+from palpate_planning.wall.touch import FELT_N, Onset
+from palpate_planning.wall.wall import TouchedSkin
 
 DESCEND_MPS = 0.08
 PROBE_MPS = 0.014

@@ -11,26 +11,24 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot import lbr
 from palpate_models.scenario.checkpoint import Checkpoint
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.background import WORKER, BackgroundTask
-from palpate_planning.contact import ContactSensing
+from palpate_planning.contact import ContactSensing, ToolWeight
 from palpate_planning.course import ExamCourse
-from palpate_planning.exam_planner import ExamPlan, ExamPlanner, PerceivedAbdomen
-from palpate_planning.free_motion import FreeMotion, TrajectoryFollower
-from palpate_planning.kinematics import STRAIGHT_RAD, ArmKinematics
+from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, TrajectoryFollower
 from palpate_planning.look import look_postures
-from palpate_planning.motion_planning import NoPathError
+from palpate_planning.motion.kinematics import STRAIGHT_RAD, ArmKinematics
+from palpate_planning.motion.planner import NoPathError
+from palpate_planning.motion.timing import RestartRamp
 from palpate_planning.palpation import HIDES, Palpation
-from palpate_planning.path import compile_ahead
 from palpate_planning.periods import MS, SECOND, Periods
-from palpate_planning.requests import PLANNING_TIME, PressRequest
-from palpate_planning.segments import STRETCHED, Segment
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.stages import PalpationStep, StrokeStage
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import Stops
-from palpate_planning.timing import RestartRamp
-from palpate_planning.tool_weight import ToolWeight
-from palpate_planning.wall import TouchedSkin, Wall, plane
+from palpate_planning.strokes.path import compile_ahead
+from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen
+from palpate_planning.strokes.requests import PLANNING_TIME, PressRequest
+from palpate_planning.strokes.segments import STRETCHED, Segment
+from palpate_planning.wall.wall import TouchedSkin, Wall, plane
 
 LOOKS_MAX = 3
 MOVES_MAX = 2

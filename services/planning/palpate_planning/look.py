@@ -7,8 +7,8 @@ import numpy as np
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.kinematics import ArmKinematics
-from palpate_planning.scene import CollisionScene, ViewPyramid, region_corners
+from palpate_planning.motion.kinematics import ArmKinematics
+from palpate_planning.motion.scene import CollisionScene, ViewPyramid, region_corners
 
 VIEW_MARGIN_M = 0.03
 """The view is kept free about the region, too: perception wants a margin of surface."""

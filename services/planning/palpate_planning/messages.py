@@ -9,10 +9,10 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.numerics.frames import Array
-from palpate_planning.breath import HIDDEN_M, BreathObservation
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.status import ExamStatus
-from palpate_planning.wall import TouchedSkin
+from palpate_planning.wall.breath import HIDDEN_M, BreathObservation
+from palpate_planning.wall.wall import TouchedSkin
 
 
 def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None) -> Message:

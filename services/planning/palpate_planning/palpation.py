@@ -9,10 +9,10 @@ from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.descent import ALLOWANCE_M, SIGMAS, Descent
 from palpate_planning.recovery import MOVED_M, Recovery
-from palpate_planning.segments import HOVER_M, STRETCHED, Segment
 from palpate_planning.stages import AT_DEPTH, PRESSING, PUSHING, PalpationStep, StrokeStage
 from palpate_planning.stroke_motion import ENDED_M, StrokeMotion
-from palpate_planning.wall import Wall
+from palpate_planning.strokes.segments import HOVER_M, STRETCHED, Segment
+from palpate_planning.wall.wall import Wall
 from palpate_planning.wall_watch import WallWatch
 
 HOP_M = 0.010

@@ -10,11 +10,10 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.coverage import Bools
-from palpate_planning.path import PathPoint
-from palpate_planning.poses import centre
-from palpate_planning.segments import Segment
-from palpate_planning.timing import JerkLimitedAxis
+from palpate_planning.motion.timing import JerkLimitedAxis
+from palpate_planning.strokes.coverage import Bools
+from palpate_planning.strokes.path import PathPoint, centre
+from palpate_planning.strokes.segments import Segment
 
 SOFT_STOPS_MAX = 3
 """With this many soft stops the examination is given up."""

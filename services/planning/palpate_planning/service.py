@@ -22,16 +22,16 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Following, Scenario
-from palpate_planning.background import WORKER
-from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import SensorReading
-from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.exam_sequence import ExamSequence
+from palpate_planning.free_motion import WORKER
 from palpate_planning.messages import correction_message, motion_of, path_message, state_message, touch_message
 from palpate_planning.periods import Periods
-from palpate_planning.requests import PressRequest
 from palpate_planning.status import Observation, PerceptionFailure, Phase
-from palpate_planning.surface import PerceivedSurface
+from palpate_planning.strokes.plan import PerceivedAbdomen
+from palpate_planning.strokes.requests import PressRequest
+from palpate_planning.wall.breath import BreathObservation
+from palpate_planning.wall.surface import PerceivedSurface
 
 NEEDED = ("robot", "assessment", "supervisor", "conductor")
 """Roles whose loss ends the exam, whatever its phase. Without the conductor no operator could stop it."""

@@ -6,7 +6,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from palpate_bus.setpoint import Setpoint
-from palpate_planning.wall import TouchedSkin
+from palpate_planning.wall.wall import TouchedSkin
 
 
 class StrokeStage(Enum):

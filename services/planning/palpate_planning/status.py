@@ -8,12 +8,12 @@ from typing import Final, NamedTuple
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_planning.breath import BreathObservation
 from palpate_planning.contact import ContactMeasurement, SensorReading
-from palpate_planning.exam_planner import PerceivedAbdomen
-from palpate_planning.requests import PressRequest
 from palpate_planning.stages import StrokeStage
-from palpate_planning.wall import TouchedSkin
+from palpate_planning.strokes.plan import PerceivedAbdomen
+from palpate_planning.strokes.requests import PressRequest
+from palpate_planning.wall.breath import BreathObservation
+from palpate_planning.wall.wall import TouchedSkin
 
 
 class Phase(IntEnum):

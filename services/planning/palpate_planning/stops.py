@@ -5,7 +5,7 @@ from __future__ import annotations
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.course import ExamCourse
-from palpate_planning.motion_planning import NoPathError
+from palpate_planning.motion.planner import NoPathError
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import SECOND
 from palpate_planning.status import OVER, PALPATING, Observation, Phase

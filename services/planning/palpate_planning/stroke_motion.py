@@ -9,13 +9,13 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
-from palpate_planning.kinematics import ELBOW, TOO_STRAIGHT_RAD
-from palpate_planning.path import ACCELERATION, PathPoint
+from palpate_planning.motion.kinematics import ELBOW, TOO_STRAIGHT_RAD
+from palpate_planning.motion.timing import JerkLimitedAxis
 from palpate_planning.periods import SECOND
-from palpate_planning.segments import HOVER_M, Segment
 from palpate_planning.setpoints import NORMAL_STIFFNESS, cartesian_setpoint, joint_setpoint
-from palpate_planning.timing import JerkLimitedAxis
-from palpate_planning.wall import Wall
+from palpate_planning.strokes.path import ACCELERATION, PathPoint
+from palpate_planning.strokes.segments import HOVER_M, Segment
+from palpate_planning.wall.wall import Wall
 
 DEPTH_ACCELERATION = 0.5
 """[m/s^2]"""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from palpate_models.scenario.schema import Following
-from palpate_planning.breath import Breath
+from palpate_planning.wall.breath import Breath
 
 CALM_S = 1.0
 """After a cough or a deep breath the skin is left alone until the wall has been followed well for so long."""

@@ -14,16 +14,15 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
-from palpate_planning.breath import FORECAST_STEP, BreathObservation
-from palpate_planning.contact import SensorReading
-from palpate_planning.exam_planner import PerceivedAbdomen
+from palpate_planning.contact import SensorReading, ToolWeight
 from palpate_planning.exam_sequence import ExamSequence
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
 from palpate_planning.status import ExamStep, Observation, PerceptionFailure, Phase
-from palpate_planning.surface import PerceivedSurface
-from palpate_planning.tool_weight import ToolWeight
+from palpate_planning.strokes.plan import PerceivedAbdomen
+from palpate_planning.wall.breath import FORECAST_STEP, BreathObservation
+from palpate_planning.wall.surface import PerceivedSurface
 
 PERIODS = Periods(contract().roles["planning"].period, contract().roles["camera"].period)
 PERIOD_S = PERIODS.step_s

@@ -6,7 +6,7 @@ from threading import Event
 
 import pytest
 
-from palpate_planning.background import BackgroundTask
+from palpate_planning.free_motion import BackgroundTask
 
 
 def test_in_lockstep_the_result_is_due_at_its_time_whether_it_is_there_or_not() -> None:

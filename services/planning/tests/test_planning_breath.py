@@ -11,11 +11,11 @@ from planning_fakes import World, known
 from palpate_bus.messages import SurfaceMotion
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Following
-from palpate_planning.breath import FORECAST_STEP, JOIN_S, Breath, BreathObservation
-from palpate_planning.exam_planner import PerceivedAbdomen
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.recovery import REPEATS_MAX
 from palpate_planning.status import PerceptionFailure, Phase
+from palpate_planning.strokes.plan import PerceivedAbdomen
+from palpate_planning.wall.breath import FORECAST_STEP, JOIN_S, Breath, BreathObservation
 from palpate_planning.wall_watch import CALM_S, HIDDEN_MAX_S, LOST_MAX, LOST_S, WallWatch
 
 DT = 0.01

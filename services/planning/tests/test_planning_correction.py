@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_planning.surface_correction import FIELD_LENGTH_M, FIELD_M, OFFSET_M, TILT_RAD, FeltHeight, SurfaceCorrection
+from palpate_planning.wall.correction import FIELD_LENGTH_M, FIELD_M, OFFSET_M, TILT_RAD, FeltHeight, SurfaceCorrection
 
 PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
 BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from palpate_models.scenario.patterns import TOUCHES_M
 from palpate_models.scenario.schema import Mode
-from palpate_planning.coverage import SAMPLE_M, strokes, touches, transfer
+from palpate_planning.strokes.coverage import SAMPLE_M, strokes, touches, transfer
 
 SPACING = 0.0125
 

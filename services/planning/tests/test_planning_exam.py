@@ -10,10 +10,10 @@ from planning_fakes import PERIOD_S, World, hertz, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Mode, Robot
-from palpate_planning.kinematics import ELBOW, TOO_STRAIGHT_RAD
+from palpate_planning.motion.kinematics import ELBOW, TOO_STRAIGHT_RAD
 from palpate_planning.palpation import HIDES
-from palpate_planning.segments import STRETCHED
 from palpate_planning.status import Observation, PerceptionFailure, Phase
+from palpate_planning.strokes.segments import STRETCHED
 
 
 @pytest.fixture(scope="module")

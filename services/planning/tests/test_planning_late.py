@@ -13,16 +13,23 @@ from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import TrajectoryFollower
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.motion.kinematics import ArmKinematics
+from palpate_planning.motion.timing import (
+    BRAKED_NS,
+    JOINT_ACCELERATION,
+    RESTART_NS,
+    JointTrajectory,
+    RestartRamp,
+    joint_trajectory,
+)
 from palpate_planning.palpation import Palpation
-from palpate_planning.path import SurfacePath
 from palpate_planning.periods import MS
-from palpate_planning.segments import Segment
 from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
-from palpate_planning.surface import Foot
-from palpate_planning.timing import BRAKED_NS, JOINT_ACCELERATION, RESTART_NS, JointTrajectory, RestartRamp, joint_trajectory
-from palpate_planning.wall import WallPlace, plane
+from palpate_planning.strokes.path import SurfacePath
+from palpate_planning.strokes.segments import Segment
+from palpate_planning.wall.surface import Foot
+from palpate_planning.wall.wall import WallPlace, plane
 
 KINEMATICS = ArmKinematics(BASE, Limits())
 START = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.0, 0.0])

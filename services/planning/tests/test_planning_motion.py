@@ -10,14 +10,14 @@ from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits, Robot
-from palpate_planning.exam_planner import ExamPlanner
-from palpate_planning.kinematics import ELBOW, STRAIGHT_RAD, ArmKinematics
 from palpate_planning.look import look_postures
-from palpate_planning.motion_planning import NoPathError, plan
-from palpate_planning.poses import centre, least_twist, pose
-from palpate_planning.scene import CollisionScene, with_skirt
-from palpate_planning.segments import REACH, STRETCHED
-from palpate_planning.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
+from palpate_planning.motion.kinematics import ELBOW, STRAIGHT_RAD, ArmKinematics
+from palpate_planning.motion.planner import NoPathError, plan
+from palpate_planning.motion.scene import CollisionScene, with_skirt
+from palpate_planning.motion.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
+from palpate_planning.strokes.path import centre, least_twist, pose
+from palpate_planning.strokes.plan import ExamPlanner
+from palpate_planning.strokes.segments import REACH, STRETCHED
 
 LIMITS = Limits()
 KINEMATICS = ArmKinematics(BASE, LIMITS)
@@ -164,7 +164,7 @@ def test_what_only_a_stretched_arm_reaches_is_skipped() -> None:
 
 def test_paths_are_laid_where_the_elbow_is_bent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Between targets, too: they are not left out beforehand here."""
-    monkeypatch.setattr("palpate_planning.exam_planner.stretched", lambda q, bend: False)
+    monkeypatch.setattr("palpate_planning.strokes.plan.stretched", lambda q, bend: False)
     far, bend = known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), 0.5
     examination = ExamPlanner(far, PERIOD_S).examination(seen_dome(far), np.array(lbr.HOME), bend=bend)
     assert STRETCHED in examination.skipped.values()

@@ -5,11 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.setpoint import ControlMode
-from palpate_planning.path import SurfacePath, lay
-from palpate_planning.poses import centre
 from palpate_planning.recovery import Displacement
 from palpate_planning.stroke_motion import stroke_setpoint
-from palpate_planning.surface import PerceivedSurface
+from palpate_planning.strokes.path import SurfacePath, centre, lay
+from palpate_planning.wall.surface import PerceivedSurface
 
 DOWN = np.diag((1.0, -1.0, -1.0))
 

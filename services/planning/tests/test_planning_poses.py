@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from palpate_planning.poses import angular_velocity, centre, frame, least_twist, pose
+from palpate_planning.strokes.path import angular_velocity, centre, frame, least_twist, pose
 
 coordinate = st.floats(-1.0, 1.0)
 vectors = st.tuples(coordinate, coordinate, coordinate).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.05)

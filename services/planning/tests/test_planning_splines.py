@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from palpate_planning.compiled_splines import CubicPieces, bicubic_at, cubic_at
-from palpate_planning.surface import BicubicField
+from palpate_planning.wall.surface import BicubicField, CubicPieces, bicubic_at, cubic_at
 
 RNG = np.random.default_rng(5)
 KNOTS = np.cumsum(RNG.uniform(0.1, 1.0, 12))

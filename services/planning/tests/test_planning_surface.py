@@ -10,7 +10,7 @@ from planning_fakes import grid_mesh
 
 from palpate_models.numerics.frames import apply, matrix
 from palpate_models.section import Pose
-from palpate_planning.surface import PerceivedSurface
+from palpate_planning.wall.surface import PerceivedSurface
 
 X_WA = matrix(Pose(xyz_m=(0.56, 0.05, 0.93), rpy_rad=(0.05, -0.08, 0.3)))
 VERTICES, TRIANGLES = grid_mesh((0.14, 0.14))

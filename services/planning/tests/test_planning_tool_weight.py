@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.gravity import GRAVITY
 from palpate_models.scenario.schema import Robot
-from palpate_planning.tool_weight import ToolWeight
+from palpate_planning.contact import ToolWeight
 
 
 def reading(R_WS: np.ndarray, force_W: np.ndarray, bias: np.ndarray, mass: float, com: np.ndarray) -> np.ndarray:

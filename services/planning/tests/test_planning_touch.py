@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_planning.touch import FELT_N, UNFITTED_M, Onset, find_touch
+from palpate_planning.wall.touch import FELT_N, UNFITTED_M, Onset, find_touch
 
 
 def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:

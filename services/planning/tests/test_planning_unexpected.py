@@ -8,12 +8,12 @@ import numpy as np
 from planning_fakes import World, known
 
 from palpate_models.scenario.schema import Following
-from palpate_planning.breath import Breath, BreathObservation
+from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.palpation import WAIT_MAX_S
-from palpate_planning.requests import PressRequest
 from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
-from palpate_planning.timing import JointTrajectory
+from palpate_planning.strokes.requests import PressRequest
+from palpate_planning.wall.breath import Breath, BreathObservation
 from palpate_planning.wall_watch import CALM_PATIENCE_S, CALM_S, SHUT_MAX_S, WallWatch
 
 SMALL = {"region_m": (0.025, 0.0125)}

@@ -17,11 +17,11 @@ import numpy as np
 from scipy.interpolate import NearestNDInterpolator
 
 from palpate_models.numerics.frames import Array
-from palpate_planning.breath import Breath
 from palpate_planning.periods import SECOND
-from palpate_planning.surface import Foot, PerceivedSurface
-from palpate_planning.surface_correction import FeltHeight, SurfaceCorrection
-from palpate_planning.touch import Onset, SkinDepth
+from palpate_planning.wall.breath import Breath
+from palpate_planning.wall.correction import FeltHeight, SurfaceCorrection
+from palpate_planning.wall.surface import Foot, PerceivedSurface
+from palpate_planning.wall.touch import Onset, SkinDepth
 
 
 class TouchedSkin(NamedTuple):

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.coverage import strokes, touches
-from palpate_planning.kinematics import STRAIGHT_RAD, ArmKinematics, stretched
-from palpate_planning.motion_planning import NoPathError, timed_motion
+from palpate_planning.motion.kinematics import STRAIGHT_RAD, ArmKinematics, stretched
+from palpate_planning.motion.planner import NoPathError, timed_motion
+from palpate_planning.motion.scene import CollisionScene
+from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.placement.redundancy import plan_redundancy, prepare
-from palpate_planning.poses import centre, pose
-from palpate_planning.requests import PressPlanner
-from palpate_planning.scene import CollisionScene
-from palpate_planning.segments import REACH, STRETCHED, Segment, SegmentPlanner
-from palpate_planning.surface import PerceivedSurface
-from palpate_planning.timing import JointTrajectory
+from palpate_planning.strokes.coverage import strokes, touches
+from palpate_planning.strokes.path import centre, pose
+from palpate_planning.strokes.requests import PressPlanner
+from palpate_planning.strokes.segments import REACH, STRETCHED, Segment, SegmentPlanner
+from palpate_planning.wall.surface import PerceivedSurface
 
 Ints = NDArray[np.int64]
 

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 
 from palpate_models.numerics.frames import Array
-from palpate_planning.coverage import Stroke
 from palpate_planning.periods import MS
-from palpate_planning.segments import Segment, SegmentPlanner
+from palpate_planning.strokes.coverage import Stroke
+from palpate_planning.strokes.segments import Segment, SegmentPlanner
 
 PLANNING_TIME: Final = 200 * MS
 """Simulated time that laying a press takes [ns]."""

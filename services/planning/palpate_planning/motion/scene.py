@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import lbr, table
 from palpate_models.scenario.schema import Robot
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.motion.kinematics import ArmKinematics
 
 MARGIN_M = 0.010
 """Distance that free motion keeps. More than half of what any point of the arm moves between two checks."""

@@ -14,7 +14,7 @@ import ruckig
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits
-from palpate_planning.kinematics import ArmKinematics
+from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS
 
 JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])

@@ -9,14 +9,13 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from palpate_models.numerics.frames import Array
-from palpate_planning.coverage import Stroke, transfer
-from palpate_planning.kinematics import ArmKinematics, stretched
-from palpate_planning.motion_planning import NoPathError
-from palpate_planning.path import SurfacePath, lay
-from palpate_planning.poses import centre, least_twist, pose
-from palpate_planning.scene import CollisionScene
-from palpate_planning.surface import PerceivedSurface
-from palpate_planning.timing import JointTrajectory
+from palpate_planning.motion.kinematics import ArmKinematics, stretched
+from palpate_planning.motion.planner import NoPathError
+from palpate_planning.motion.scene import CollisionScene
+from palpate_planning.motion.timing import JointTrajectory
+from palpate_planning.strokes.coverage import Stroke, transfer
+from palpate_planning.strokes.path import SurfacePath, centre, lay, least_twist, pose
+from palpate_planning.wall.surface import PerceivedSurface
 
 HOVER_M = 0.025
 """Height of the sphere's deepest point above the surface before, between and after strokes: twice what the perceived surface is

@@ -14,9 +14,9 @@ from ompl import base, geometric, util
 
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Limits
-from palpate_planning.kinematics import ArmKinematics
-from palpate_planning.scene import STEP_RAD, CollisionScene
-from palpate_planning.timing import JointTrajectory, joint_trajectory, rounded
+from palpate_planning.motion.kinematics import ArmKinematics
+from palpate_planning.motion.scene import STEP_RAD, CollisionScene
+from palpate_planning.motion.timing import JointTrajectory, joint_trajectory, rounded
 
 ITERATIONS = 6000
 """Iterations of RRT-Connect after which a motion counts as impossible."""

@@ -1,0 +1,1 @@
+"""Arm motion: kinematics, collision scene, collision-free planning and time parametrisation."""
