@@ -1,11 +1,19 @@
-"""Poses, twists and wrenches of messages to arrays and back; rotations against scipy's."""
+"""Geometry of messages to arrays and back: rotations against scipy, depth images in either unit and byte order."""
+
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from palpate_bus.messages import Quaternion
+from palpate_bus.messages import Image, Quaternion
 from palpate_bus.messages.geometry import (
+    cloud_message,
+    depth_in_metres,
+    depth_message,
+    mesh_arrays,
+    mesh_message,
+    point_message,
     pose_matrix,
     pose_message,
     quaternion,
@@ -14,13 +22,16 @@ from palpate_bus.messages.geometry import (
     transform_message,
     twist,
     twist_message,
+    vector_message,
+    vectors,
     wrench,
     wrench_message,
 )
+from palpate_bus.messages.stamps import header
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 5e-4, 2e-3, 0.3, 2.0, 3.1])
-def test_rotations_are_as_scipy_has_them(size: float) -> None:
+def test_rotations_match_scipy(size: float) -> None:
     for direction in np.random.default_rng(1).normal(size=(50, 3)):
         expected = Rotation.from_rotvec(size * direction / np.linalg.norm(direction))
         given = quaternion(expected.as_matrix())
@@ -28,7 +39,7 @@ def test_rotations_are_as_scipy_has_them(size: float) -> None:
         np.testing.assert_allclose(rotation(Quaternion(*given)), expected.as_matrix(), rtol=0, atol=1e-15)
 
 
-def test_messages_come_back_as_the_same_arrays() -> None:
+def test_arrays_survive_a_round_trip() -> None:
     X = np.eye(4)
     X[:3, :3] = Rotation.from_rotvec((0.3, -0.8, 1.9)).as_matrix()
     X[:3, 3] = 1.0, 2.0, 3.0
@@ -37,9 +48,75 @@ def test_messages_come_back_as_the_same_arrays() -> None:
     np.testing.assert_allclose(pose_matrix(pose_message(X[:3, :3], X[:3, 3])), X, atol=1e-15)
     assert np.array_equal(twist(twist_message(six)), six)
     assert np.array_equal(wrench(wrench_message(six)), six)
+    points = np.arange(6.0).reshape(2, 3)
+    assert np.array_equal(vectors([point_message(points[0]), vector_message(points[1])]), points)
+    assert vectors([]).shape == (0, 3)
+
+
+def test_meshes_survive_a_round_trip_and_missing_arrays_are_empty() -> None:
+    vertices = np.arange(9.0).reshape(3, 3)
+    mesh = mesh_message(header(5, "world"), vertices, -vertices, [[0, 1, 2]], [0.0, 0.5, 1.0])
+    found = mesh_arrays(mesh)
+    assert np.array_equal(found.vertices, vertices)
+    assert np.array_equal(found.normals, -vertices)
+    assert found.triangles.tolist() == [[0, 1, 2]]
+    assert found.breathing.tolist() == [0.0, 0.5, 1.0]
+    bare = mesh_arrays(mesh_message(header(5), vertices))
+    assert [array.shape for array in bare] == [(3, 3), (0, 3), (0, 3), (0,)]
+
+
+def test_clouds_are_packed_points() -> None:
+    points = np.arange(6.0).reshape(2, 3)
+    cloud = cloud_message(header(0, "world"), points)
+    assert (cloud.height, cloud.width, cloud.point_step, [field.offset for field in cloud.fields]) == (1, 2, 12, [0, 4, 8])
+    assert np.array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 3), points)
 
 
 @pytest.mark.parametrize("orientation", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.02), (float("nan"), 0.0, 0.0, 1.0)])
-def test_an_orientation_that_is_no_rotation_is_refused(orientation: tuple[float, float, float, float]) -> None:
+def test_rotation_rejects_a_quaternion_that_is_not_a_unit(orientation: tuple[float, float, float, float]) -> None:
     with pytest.raises(ValueError, match="must be 1"):
         rotation(Quaternion(*orientation))
+
+
+METRES = np.array([[1.0, np.nan, 0.731], [0.5, 2.25, np.nan]], np.float32)
+
+
+def image(encoding: str, pixels: np.ndarray, big_endian: bool, padding: int) -> Any:
+    rows = np.zeros((2, 3 * pixels.itemsize + padding), np.uint8)
+    rows[:, : 3 * pixels.itemsize] = pixels.view(np.uint8).reshape(2, -1)
+    return Image(header(0, "c"), 2, 3, encoding, int(big_endian), rows.shape[1], rows.ravel())
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize("big_endian", [False, True])
+@pytest.mark.parametrize("encoding", ["32FC1", "16UC1", "mono16"])
+def test_depth_is_in_metres_and_nan_where_invalid(encoding: str, big_endian: bool, padding: int) -> None:
+    order = ">" if big_endian else "<"
+    millimetres = np.nan_to_num(1000 * METRES).round().astype(f"{order}u2")
+    pixels = METRES.astype(f"{order}f4") if encoding == "32FC1" else millimetres
+    found = depth_in_metres("camera", image(encoding, pixels, big_endian, padding))
+    np.testing.assert_allclose(found, METRES, rtol=1e-6)
+
+
+def test_depth_survives_a_round_trip() -> None:
+    np.testing.assert_array_equal(depth_in_metres("camera", depth_message(header(0), METRES)), METRES)
+
+
+@pytest.mark.parametrize("invalid", [0.0, -1.0, np.inf])
+def test_invalid_distances_are_nan(invalid: float) -> None:
+    pixels = METRES.copy()
+    pixels[0, 0] = invalid
+    assert np.isnan(depth_in_metres("camera", image("32FC1", pixels, False, 0))[0, 0])
+
+
+def test_malformed_depth_images_are_rejected() -> None:
+    with pytest.raises(ValueError, match="camera: encoding = 'rgb8', want one of 32FC1"):
+        depth_in_metres("camera", image("rgb8", np.zeros((2, 3), np.uint8), False, 0))
+    short = image("32FC1", METRES, False, 0)
+    short.data = short.data[:-1]
+    with pytest.raises(ValueError, match="camera: 23 bytes for 2 rows of 12, 3 pixels each"):
+        depth_in_metres("camera", short)
+    narrow = image("16UC1", np.zeros((2, 3), "<u2"), False, 0)
+    narrow.step = 4
+    with pytest.raises(ValueError, match="12 bytes for 2 rows of 4"):
+        depth_in_metres("camera", narrow)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import pose_matrix, transform_matrix
-from palpate_bus.messages.images import depth_in_metres
+from palpate_bus.messages.geometry import depth_in_metres, pose_matrix, transform_matrix
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.run_name import run_of
 from palpate_bus.service import Inbox, Outbox, Service

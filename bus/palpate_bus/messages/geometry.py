@@ -1,19 +1,53 @@
-"""Poses, twists and wrenches of messages as arrays, and back. Rotations are matrices here and unit quaternions in messages."""
+"""Geometry in messages as arrays, and back: poses, twists, wrenches, points, surface meshes, point clouds and depth images.
+
+Rotations are matrices in arrays and unit quaternions in messages.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import sqrt
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from palpate_bus.messages import Point, Pose, Quaternion, Transform, Twist, Vector3, Wrench
+from palpate_bus.messages import (
+    Header,
+    Image,
+    Point,
+    PointCloud2,
+    PointField,
+    Pose,
+    Quaternion,
+    SurfaceMesh,
+    Transform,
+    Twist,
+    Vector3,
+    Wrench,
+)
 
 Array = NDArray[np.float64]
 
+DEPTH_ENCODINGS: Final = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3)}
+"""Depth encodings of ROS (REP 118): pixel type and unit [m]. Invalid pixels are NaN or 0."""
+
+
+class MeshArrays(NamedTuple):
+    """The arrays of a `SurfaceMesh`."""
+
+    vertices: Array
+    """[m], shape (n, 3), in the frame of the header."""
+    normals: Array
+    """Outward unit normals, shape (n, 3), or (0, 3) if the message has none."""
+    triangles: NDArray[np.int64]
+    """Vertex indices, shape (m, 3), counter-clockwise seen from outside."""
+    breathing: Array
+    """Relative breathing motion of each vertex [1], shape (n,), or (0,) if the message has none."""
+
 
 def quaternion(R: Array) -> tuple[float, float, float, float]:
-    """Unit quaternion (x, y, z, w) with w >= 0 of a rotation matrix, shape (3, 3). Shepperd's method (1978)."""
+    """Return the unit quaternion (x, y, z, w) with w >= 0 of a rotation matrix, shape (3, 3). Shepperd's method (1978)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
     trace = xx + yy + zz
     largest = max(xx, yy, zz, trace)
@@ -32,10 +66,10 @@ def quaternion(R: Array) -> tuple[float, float, float, float]:
 
 
 def rotation(orientation: Quaternion) -> Array:
-    """Rotation matrix, shape (3, 3), of a `geometry_msgs/Quaternion`. Raises ValueError if its norm is off by 1 % or more."""
+    """Return the rotation matrix, shape (3, 3). Raises ValueError if the quaternion's norm is off by 1 % or more."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     norm = sqrt(x * x + y * y + z * z + w * w)
-    if not abs(norm - 1.0) < 0.01:  # so it is, too, where one is NaN
+    if not abs(norm - 1.0) < 0.01:  # also true for NaN
         raise ValueError(f"orientation = ({x}, {y}, {z}, {w}) has norm {norm}: must be 1")
     x, y, z, w = x / norm, y / norm, z / norm, w / norm
     return np.array(
@@ -48,12 +82,12 @@ def rotation(orientation: Quaternion) -> Array:
 
 
 def pose_matrix(message: Pose) -> Array:
-    """Homogeneous matrix, shape (4, 4), of a `geometry_msgs/Pose`. Raises ValueError as `rotation` does."""
+    """Return the homogeneous matrix, shape (4, 4). Raises ValueError as `rotation` does."""
     return _homogeneous(rotation(message.orientation), vector(message.position))
 
 
 def transform_matrix(message: Transform) -> Array:
-    """Homogeneous matrix, shape (4, 4), of a `geometry_msgs/Transform`. Raises ValueError as `rotation` does."""
+    """Return the homogeneous matrix, shape (4, 4). Raises ValueError as `rotation` does."""
     return _homogeneous(rotation(message.rotation), vector(message.translation))
 
 
@@ -65,37 +99,109 @@ def _homogeneous(R: Array, p: Array) -> Array:
 
 
 def pose_message(R: Array, p: Array) -> Pose:
-    """`geometry_msgs/Pose` of a rotation matrix, shape (3, 3), and an origin [m], shape (3,)."""
+    """Return the `Pose` of a rotation matrix, shape (3, 3), and an origin [m], shape (3,)."""
     return Pose(Point(*p.tolist()), Quaternion(*quaternion(R)))
 
 
 def transform_message(X: Array) -> Transform:
-    """`geometry_msgs/Transform` of a homogeneous matrix, shape (4, 4)."""
+    """Return the `Transform` of a homogeneous matrix, shape (4, 4)."""
     return Transform(Vector3(*X[:3, 3].tolist()), Quaternion(*quaternion(X[:3, :3])))
 
 
 def twist_message(V: Array) -> Twist:
-    """`geometry_msgs/Twist` of a twist, linear [m/s] then angular [rad/s], shape (6,)."""
+    """Return the `Twist` of an array, linear [m/s] then angular [rad/s], shape (6,)."""
     return Twist(Vector3(*V[:3].tolist()), Vector3(*V[3:].tolist()))
 
 
 def wrench_message(F: Array) -> Wrench:
-    """`geometry_msgs/Wrench` of a wrench, force [N] then torque [N m], shape (6,)."""
+    """Return the `Wrench` of an array, force [N] then torque [N m], shape (6,)."""
     return Wrench(Vector3(*F[:3].tolist()), Vector3(*F[3:].tolist()))
 
 
 def vector(message: Point | Vector3) -> Array:
-    """The x, y and z of a `geometry_msgs/Point` or `geometry_msgs/Vector3`, shape (3,)."""
+    """Return x, y and z, shape (3,)."""
     return np.array((message.x, message.y, message.z))
 
 
+def vectors(messages: Iterable[Point | Vector3]) -> Array:
+    """Return x, y and z of each message, shape (n, 3)."""
+    return np.array([(message.x, message.y, message.z) for message in messages], dtype=np.float64).reshape(-1, 3)
+
+
+def point_message(p: ArrayLike) -> Point:
+    """Return the `Point` of an array, shape (3,)."""
+    return Point(*np.asarray(p, dtype=np.float64).tolist())
+
+
+def vector_message(v: ArrayLike) -> Vector3:
+    """Return the `Vector3` of an array, shape (3,)."""
+    return Vector3(*np.asarray(v, dtype=np.float64).tolist())
+
+
 def twist(message: Twist) -> Array:
-    """Linear [m/s] then angular [rad/s], shape (6,), of a `geometry_msgs/Twist`."""
+    """Return linear [m/s] then angular [rad/s], shape (6,)."""
     v, w = message.linear, message.angular
     return np.array((v.x, v.y, v.z, w.x, w.y, w.z))
 
 
 def wrench(message: Wrench) -> Array:
-    """Force [N] then torque [N m], shape (6,), of a `geometry_msgs/Wrench`."""
+    """Return force [N] then torque [N m], shape (6,)."""
     f, m = message.force, message.torque
     return np.array((f.x, f.y, f.z, m.x, m.y, m.z))
+
+
+def mesh_arrays(message: Any) -> MeshArrays:
+    """Return the arrays of a message with the fields of `SurfaceMesh`; fields that it lacks are empty."""
+    empty = np.empty(0)
+    return MeshArrays(
+        np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3),
+        np.asarray(getattr(message, "normals", empty), dtype=np.float64).reshape(-1, 3),
+        np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3),
+        np.asarray(getattr(message, "breathing", empty), dtype=np.float64),
+    )
+
+
+def mesh_message(
+    header: Header, vertices: ArrayLike, normals: ArrayLike = (), triangles: ArrayLike = (), breathing: ArrayLike = ()
+) -> SurfaceMesh:
+    """Return the `SurfaceMesh` of arrays, shaped as in `MeshArrays`; arrays that are left out are empty in the message."""
+    return SurfaceMesh(
+        header,
+        np.ascontiguousarray(vertices, dtype=np.float32).reshape(-1),
+        np.ascontiguousarray(normals, dtype=np.float32).reshape(-1),
+        np.ascontiguousarray(triangles, dtype=np.uint32).reshape(-1),
+        np.ascontiguousarray(breathing, dtype=np.float32),
+    )
+
+
+def cloud_message(header: Header, points: Array) -> PointCloud2:
+    """Return the `PointCloud2` of points [m], shape (n, 3): x y z as float32."""
+    fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
+    data = np.ascontiguousarray(points, "<f4").view(np.uint8).reshape(-1)
+    return PointCloud2(header, 1, len(points), fields, False, 12, 12 * len(points), data, True)
+
+
+def depth_message(header: Header, depth: NDArray[np.float32]) -> Image:
+    """Return the `Image` of a depth image [m], shape (height, width), NaN where invalid: 32FC1, little-endian."""
+    height, width = depth.shape
+    data = np.ascontiguousarray(depth, "<f4").view(np.uint8).reshape(-1)
+    return Image(header, height, width, "32FC1", 0, 4 * width, data)
+
+
+def depth_in_metres(name: str, message: Image) -> NDArray[np.float32]:
+    """Return depth [m], shape (height, width), NaN where invalid. Rows of the `Image` may be padded.
+
+    Raises ValueError for an encoding that is not in `DEPTH_ENCODINGS`, or too little data. Its text begins with `name`.
+    """
+    if message.encoding not in DEPTH_ENCODINGS:
+        raise ValueError(f"{name}: encoding = {message.encoding!r}, want one of {', '.join(DEPTH_ENCODINGS)}")
+    pixel, unit = DEPTH_ENCODINGS[message.encoding]
+    kind = np.dtype((">" if message.is_bigendian else "<") + pixel)
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(message.data, np.uint8)
+    if step < width * kind.itemsize or data.size < height * step:
+        raise ValueError(f"{name}: {data.size} bytes for {height} rows of {step}, {width} pixels each")
+    rows = data[: height * step].reshape(height, step)[:, : width * kind.itemsize]
+    depth = np.ascontiguousarray(rows).view(kind).astype(np.float32) * np.float32(unit)
+    depth[~((depth > 0) & np.isfinite(depth))] = np.nan
+    return depth

@@ -10,7 +10,7 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.messages import PalpationTargets, Point, PointCloud2, PointField, SurfaceMesh, Vector3
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.images import depth_in_metres
+from palpate_bus.messages.geometry import depth_in_metres
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import Array, apply, inverse

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message, decode
-from palpate_bus.messages.images import depth_in_metres
+from palpate_bus.messages.geometry import depth_in_metres
 from palpate_bus.messages.stamps import nanoseconds, time_message
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
-from palpate_bus.messages.images import depth_in_metres
+from palpate_bus.messages.geometry import depth_in_metres
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
