@@ -26,6 +26,7 @@ AT_REST: Final[dict[str, Any]] = {
     "wall_displacement": 0.0,
     "stroke": 0,
     "patient_moved": False,
+    "reason": ExamState.REASON_NONE,
 }
 """Fields of an arm that touches nothing."""
 

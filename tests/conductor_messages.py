@@ -130,6 +130,7 @@ def exam_states(measured_error: float) -> list[Any]:
             wall_displacement=0.0,
             stroke=1,
             patient_moved=False,
+            reason=0,
         )
         for k in range(100)
     ]

@@ -167,6 +167,7 @@ class Planning(Service):
                 0.0,
                 0,
                 False,
+                0,
             ),
         }
         if t % (500 * MS) == 0:

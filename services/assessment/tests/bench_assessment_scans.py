@@ -194,6 +194,7 @@ def _state(
         wall_displacement=0.0,
         stroke=stroke,
         patient_moved=False,
+        reason=0,
     )
 
 

@@ -41,6 +41,7 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
         wall_displacement=0.0 if contact is None else contact.wall.displacement,
         stroke=status.stroke,
         patient_moved=status.patient_moved,
+        reason=int(status.reason),
     )
 
 

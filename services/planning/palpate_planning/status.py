@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement, SensorReading
+from palpate_planning.reasons import Reason
 from palpate_planning.stages import StrokeStage
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.strokes.requests import PressRequest
@@ -91,6 +92,7 @@ class ExamStatus:
 
     phase: Phase = Phase.HOME
     message: str = "waiting for the robot"
+    reason: Reason = Reason.NONE
     target_index: int = 0
     target_count: int = 0
     targets_skipped: int = 0

@@ -1,0 +1,56 @@
+"""Why an examination deviates from its plan: a code that programs read, and a text that people read."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+
+class Reason(IntEnum):
+    """Codes of `palpation_msgs/ExamState.reason`."""
+
+    NONE = 0
+    VIEW_BLOCKED = 1
+    VIEW_FAILED = 2
+    VIEW_TIMEOUT = 3
+    VIEW_UNREACHABLE = 4
+    NO_PATH = 5
+    OUT_OF_REACH = 6
+    ARM_STRETCHED = 7
+    COLLISION = 8
+    FORCE = 9
+    NO_TISSUE = 10
+    UNEXPECTED_CONTACT = 11
+    WALL_NOT_TRACKED = 12
+    WALL_HIDDEN = 13
+    CONTACT_LOST = 14
+    PATIENT_MOVED = 15
+    ARM_DISPLACED = 16
+    NO_REQUEST = 17
+    OPERATOR_STOP = 18
+    OPERATOR_END = 19
+    ROBOT_HOLD = 20
+    ROBOT_NOT_READY = 21
+    SOFT_STOP = 22
+    EMERGENCY_STOP = 23
+    NOT_RELEASED = 24
+    SERVICE_LOST = 25
+    OTHER_PATIENT = 26
+    NO_FINDINGS = 27
+
+
+class Cause(NamedTuple):
+    """A reason and its text. False if there is none."""
+
+    reason: Reason = Reason.NONE
+    text: str = ""
+
+    def __bool__(self) -> bool:
+        return self.reason is not Reason.NONE
+
+    def within(self, text: str) -> Cause:
+        """Return this reason with a longer text; `{}` in `text` stands for the present one."""
+        return Cause(self.reason, text.format(self.text))
+
+
+NO_CAUSE: Final = Cause()
