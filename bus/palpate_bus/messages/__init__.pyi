@@ -141,6 +141,34 @@ class ExamState:
     PHASE_DONE: ClassVar[int]
     PHASE_ABORTED: ClassVar[int]
     PHASE_HELD: ClassVar[int]
+    REASON_NONE: ClassVar[int]
+    REASON_VIEW_BLOCKED: ClassVar[int]
+    REASON_VIEW_FAILED: ClassVar[int]
+    REASON_VIEW_TIMEOUT: ClassVar[int]
+    REASON_VIEW_UNREACHABLE: ClassVar[int]
+    REASON_NO_PATH: ClassVar[int]
+    REASON_OUT_OF_REACH: ClassVar[int]
+    REASON_ARM_STRETCHED: ClassVar[int]
+    REASON_COLLISION: ClassVar[int]
+    REASON_FORCE: ClassVar[int]
+    REASON_NO_TISSUE: ClassVar[int]
+    REASON_UNEXPECTED_CONTACT: ClassVar[int]
+    REASON_WALL_NOT_TRACKED: ClassVar[int]
+    REASON_WALL_HIDDEN: ClassVar[int]
+    REASON_CONTACT_LOST: ClassVar[int]
+    REASON_PATIENT_MOVED: ClassVar[int]
+    REASON_ARM_DISPLACED: ClassVar[int]
+    REASON_NO_REQUEST: ClassVar[int]
+    REASON_OPERATOR_STOP: ClassVar[int]
+    REASON_OPERATOR_END: ClassVar[int]
+    REASON_ROBOT_HOLD: ClassVar[int]
+    REASON_ROBOT_NOT_READY: ClassVar[int]
+    REASON_SOFT_STOP: ClassVar[int]
+    REASON_EMERGENCY_STOP: ClassVar[int]
+    REASON_NOT_RELEASED: ClassVar[int]
+    REASON_SERVICE_LOST: ClassVar[int]
+    REASON_OTHER_PATIENT: ClassVar[int]
+    REASON_NO_FINDINGS: ClassVar[int]
     header: Header
     phase: int
     message: str
@@ -161,6 +189,7 @@ class ExamState:
     wall_displacement: float
     stroke: int
     patient_moved: bool
+    reason: int
 
 @dataclass
 class Finding:
