@@ -41,8 +41,8 @@ GROUPS = {
     },
     "Replace a part, or run in several places": {
         "check": "palpate.check.command:check_command",
-        "join": "palpate.run.places_command:join",
-        "takeover": "palpate.run.places_command:takeover",
+        "join": "palpate.run.places:join",
+        "takeover": "palpate.run.places:takeover",
         "fmu": "palpate.fmu:app",
         "keys": "palpate.security.keys_command:app",
         "router": "palpate.security.router_command:router",

@@ -12,8 +12,7 @@ from rich.markup import escape
 
 from palpate.case_display import CaseDisplay
 from palpate.command_line import EXIT_FAILED, output_file, refuse
-from palpate.report.files import write_text
-from palpate.report.marked import docs_option, write_part
+from palpate.report.files import docs_option, write_part, write_text
 from palpate_benchmarks.fault_kinds import KINDS
 
 if TYPE_CHECKING:

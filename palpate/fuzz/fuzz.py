@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from time import perf_counter, thread_time
 
-from palpate.fuzz import bus_targets, scenario_targets
-from palpate.fuzz.bus_targets import FuzzTarget
+from palpate.fuzz.targets import FuzzTarget, bus_targets, scenario_targets
 
 SLOW_S = 1.0
 """An input that takes more processor time [s] is a find too, since it would hold up a service."""
@@ -122,7 +121,7 @@ def campaign(
 
 def all_targets() -> list[FuzzTarget]:
     """The readers of the bus and of scenarios."""
-    return [*bus_targets.targets(), *scenario_targets.targets()]
+    return [*bus_targets(), *scenario_targets()]
 
 
 def choose(patterns: Sequence[str]) -> list[FuzzTarget]:

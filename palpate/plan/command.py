@@ -34,8 +34,7 @@ def plan(
     from rich.console import Console
 
     from palpate.command_line import refuse
-    from palpate.plan.drawing import draw
-    from palpate.plan.prospect import NoPathError, prospect, summary
+    from palpate.plan.prospect import NoPathError, draw, prospect, summary
     from palpate.run.inputs import usable
     from palpate_models.patient.phantom import build_phantom
     from palpate_models.scenario.named_function import PatternError

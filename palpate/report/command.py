@@ -1,8 +1,11 @@
-"""`palpate report`: the page of a run, made again from its folder; as PDF too."""
+"""A page printed to PDF, by a browser that is installed."""
 
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import tempfile
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +14,33 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import refuse
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+PRINT_TIMEOUT_S = 120
+
+
+class PrintError(RuntimeError):
+    """A page that no browser could print. Says what to do."""
+
+
+def write_pdf(page: Path) -> Path:
+    """Prints report.html to report.pdf beside it, with a Chromium browser. Raises PrintError."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise PrintError(f"--pdf needs a Chromium browser ({', '.join(BROWSERS)}): none is on the PATH; {page} prints as well")
+    target = page.with_suffix(".pdf")
+    target.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory(prefix="palpate-print-") as profile:
+        command = [browser, "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        command += [f"--user-data-dir={profile}", "--no-pdf-header-footer", "--virtual-time-budget=5000"]
+        command += [f"--print-to-pdf={target}", page.resolve().as_uri()]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=PRINT_TIMEOUT_S, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise PrintError(f"{browser} did not print {page} within {PRINT_TIMEOUT_S} s") from error
+    if done.returncode or not target.is_file():
+        raise PrintError(f"{browser} could not print {page} (status {done.returncode}): {done.stderr.strip()[-300:]}")
+    return target
 
 
 def report(
@@ -24,7 +54,6 @@ def report(
 ) -> None:
     """Rebuild report.html of a run: one self-contained page for a clinician or an engineer."""
     from palpate.report.archive import EvidenceError
-    from palpate.report.printing import PrintError, write_pdf
     from palpate.report.recover import recovered
     from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
 

@@ -17,7 +17,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 from matplotlib.tri import Triangulation
 
-from palpate.report import words
+from palpate.report import rows
 from palpate.report.evidence import Samples, map_of
 from palpate.report.scoring import Map, Truth
 from palpate_models.numerics.band import half_width
@@ -275,6 +275,6 @@ def _summary(drawing: Drawing) -> str:
         return "no finding"
     return "; ".join(
         f"{f.quadrant}, {f.ratio:.1f} times as stiff "
-        f"({f.ratio_lower:.1f} to {f.ratio_upper:.1f}), confidence {words.confidence(f)}"
+        f"({f.ratio_lower:.1f} to {f.ratio_upper:.1f}), confidence {rows.confidence(f)}"
         for f in drawing.findings
     )

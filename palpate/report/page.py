@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from pydantic import ValidationError
 
-from palpate.report import page_figures, page_surface, words
+from palpate.report import page_figures, rows
 from palpate.report.archive import FILE as EVIDENCE
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
 from palpate.report.evidence import body_of, felt_truth
@@ -85,14 +85,14 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
     environment.filters["plus_mm"] = lambda metres: f"{1e3 * metres:+.0f}"
     skipped = _skipped(scenario, report, evidence)
     places = np.array([row["place"] for row in skipped if row["place"] is not None], dtype=np.float64).reshape(-1, 2)
-    solid = None if evidence.stiffness_map is None else page_surface.surface(evidence.stiffness_map)
+    solid = None if evidence.stiffness_map is None else page_figures.surface(evidence.stiffness_map)
     template = environment.get_template("report.html.j2")
     return template.render(
         scenario=scenario,
         report=report,
         evidence=evidence,
         verdict=verdict(report),
-        confidence=words.confidence,
+        confidence=rows.confidence,
         quadrants=QUADRANTS,
         skipped=skipped,
         safety=_safety(report, evidence),
@@ -123,7 +123,7 @@ def verdict(report: Report) -> str:
         return f"The examination did not complete: {report.failure}."
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
-    muscles = words.tensed(report.candidates)
+    muscles = rows.tensed(report.candidates)
     if not report.findings:
         return f"{unassessed(report)}No lump was found{_unreached(report)}. {muscles}".rstrip()
     return f"{unassessed(report)}{' '.join(map(_in_words, report.findings))} {muscles}".rstrip()
@@ -146,7 +146,7 @@ def _in_words(f: FindingRow) -> str:
     where, kind = QUADRANTS.get(f.quadrant, f.quadrant), "stiff" if f.ratio > 1 else "soft"
     return (
         f"A {kind} area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
-        f"(90 % band {low:.1f} to {high:.1f}), confidence {words.confidence(f)}."
+        f"(90 % band {low:.1f} to {high:.1f}), confidence {rows.confidence(f)}."
     )
 
 

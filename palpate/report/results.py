@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from palpate.report import archive, scoring, words
+from palpate.report import archive, rows, scoring
 from palpate.report.evidence import (
     ContactRecord,
     Samples,
@@ -221,14 +221,14 @@ def print_findings(console: Console, report: Report) -> None:
                 f"{f.area_m2 * 1e4:.1f} cm²",
                 f"{f.ratio:.1f} x",
                 f"{f.ratio_90[0]:.1f} to {f.ratio_90[1]:.1f}",
-                words.confidence(f),
+                rows.confidence(f),
             )
         console.print(table)
     elif report.assessed:
         console.print("no finding" if report.failure is None else "no finding in what was scanned")
     else:
         console.print(f"not assessed: {report.samples} samples are too few for a map")
-    if muscles := words.tensed(report.candidates):
+    if muscles := rows.tensed(report.candidates):
         console.print(muscles.rstrip(), highlight=False, soft_wrap=True)
     if searched := report.services.get("search", {}).get("facts"):
         console.print(

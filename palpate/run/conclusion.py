@@ -15,8 +15,8 @@ from palpate.command_line import EXIT_FAILED, SteadyConsole, say
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
+from palpate.run.folder import another_folder, megabytes_of
 from palpate.run.roles import write_scenario_files
-from palpate.run.space import another_folder, megabytes_of
 from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import violations
 from palpate_bus.messages import RobotStatus

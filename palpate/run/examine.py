@@ -21,7 +21,7 @@ from palpate.run.composed import run_composed
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import FolderError, results_folder, unless_begun, usual_folder
+from palpate.run.folder import FolderError, WatchedRoom, check_room, results_folder, unless_begun, usual_folder, what_it_takes
 from palpate.run.interrupts import results_first
 from palpate.run.options import Record
 from palpate.run.placement import Groups, PlacementError, placement
@@ -32,7 +32,6 @@ from palpate.run.repeat import repeat, run_to_its_end
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
-from palpate.run.space import WatchedRoom, check_room, what_it_takes
 from palpate_bus.implementations import ChoiceError, check_libraries
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError, Settings

@@ -1,18 +1,53 @@
-"""What several commands are given, looked at before anything starts."""
+"""The scan of a scenario laid over the body as it truly is: before an examination starts, it is looked at here."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
 
 from palpate.command_line import refuse
-from palpate.run.region import scan_over, with_whole_path
 from palpate.run.roles import NONE, checked, settings_of
+from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_bus.implementations import ChoiceError
 from palpate_models.patient.mesh import MeshError
-from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.load import ScenarioError, load_scenario
-from palpate_models.scenario.named_function import PatternError
+from palpate_models.scenario.named_function import PatternError, is_file
+from palpate_models.scenario.patterns import Scan, scan_of
 from palpate_models.scenario.schema import Scenario
+
+
+def surface_of(phantom: PhantomModel) -> TrueSurface:
+    """The front of a body at rest, in its own frame A."""
+    return TrueSurface(TrueBody(phantom.vertices, phantom.triangles, np.eye(4)))
+
+
+def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
+    """The scan of the scenario's pattern. Raises PatternError for one that cannot be used, and for a region off the body."""
+    surface = surface_of(phantom)
+    scan = scan_of(scenario.exam, surface.points)
+    off = ~np.isfinite(surface.height(scan.targets))
+    if off.any():
+        exam = scenario.exam
+        (left, feet), (right, head) = (edge(phantom.vertices[:, :2], axis=0) for edge in (np.min, np.max))
+        x, y = scan.targets[off][0]
+        raise PatternError(
+            f"{scenario.name}: exam.region_m = {exam.region_m}, exam.centre_m = {exam.centre_m}: {off.sum()} of {len(off)} "
+            f"targets lie off the body, the first at ({x:.3f}, {y:.3f}) m; the body reaches from x = {left:.2f} to {right:.2f} m "
+            f"and from y = {feet:.2f} to {head:.2f} m"
+        )
+    return scan
+
+
+def with_whole_path(scenario: Scenario) -> Scenario:
+    """The scenario with a pattern's file by its absolute path: services have other working directories."""
+    pattern = scenario.exam.pattern
+    if not is_file(pattern):
+        return scenario
+    exam = scenario.exam.model_copy(update={"pattern": str(Path(pattern).resolve())})
+    return scenario.model_copy(update={"exam": exam})
 
 
 def usable(

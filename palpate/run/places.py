@@ -13,7 +13,9 @@ import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Annotated, NamedTuple, NoReturn
+
+import typer
 
 from palpate.command_line import refuse
 from palpate_bus import implementations
@@ -144,3 +146,28 @@ def enter(find: Callable[[str, Run], ServicePlace], role: str, service: str | No
     except (NoBus, PlaceError, ChoiceError) as error:
         refuse(error)
     become(command, place.environment)
+
+
+NameOrFile = Annotated[
+    str | None,
+    typer.Option("--service", metavar="NAME_OR_FILE", help="An installed implementation or a Python file; else the run's own."),
+]
+RunName = Annotated[str | None, typer.Option(help="The run: its process id, or part of its name; by default the newest.")]
+
+
+def join(
+    role: Annotated[str, typer.Argument(help="The role that the run was started without.")],
+    service: NameOrFile = None,
+    run: RunName = None,
+) -> NoReturn:
+    """Join a run that was started with --without ROLE; becomes that service."""
+    enter(place_to_join, role, service, run)
+
+
+def takeover(
+    role: Annotated[str, typer.Argument(help=f"One of {', '.join(sorted(ROLES))}.")],
+    service: NameOrFile = None,
+    run: RunName = None,
+) -> NoReturn:
+    """Take the place of a service that was stopped, in a run with --wallclock --handover SECONDS; becomes that service."""
+    enter(place_to_take, role, service, run)

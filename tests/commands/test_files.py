@@ -9,8 +9,7 @@ import typer
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
-from palpate.report.files import write_text
-from palpate.report.marked import write_part
+from palpate.report.files import write_part, write_text
 
 BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 

@@ -8,9 +8,8 @@ import pytest
 from rich.console import Console
 
 from palpate.exam_state import exam_state
-from palpate.run.narration import PHASES, USUAL, Narration
 from palpate.run.outlook import Outlook
-from palpate.run.progress import RunDisplay
+from palpate.run.progress import PHASES, USUAL, Narration, RunDisplay
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
-from palpate.run.region import scan_over
+from palpate.run.inputs import scan_over
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import load_scenario, scenario_names
 from palpate_models.scenario.named_function import PatternError

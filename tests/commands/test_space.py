@@ -14,9 +14,8 @@ from rich.console import Console
 
 from palpate.command_line import EXIT_FAILED
 from palpate.run.conclusion import conclude
-from palpate.run.folder import FolderError
+from palpate.run.folder import FolderError, WatchedRoom, another_folder, check_room, what_it_takes
 from palpate.run.outlook import Outlook
-from palpate.run.space import WatchedRoom, another_folder, check_room, what_it_takes
 from palpate_conductor.collector import Collected
 from palpate_conductor.result import RunProgress
 from palpate_models.scenario.load import load_scenario
