@@ -19,6 +19,7 @@ from traceback import extract_tb
 from typing import Any
 
 from palpate_bus.service import Service
+from palpate_errors import UserError
 
 OWN = "palpate_own_"
 """How the module of a user's own file is called, before the role."""
@@ -26,7 +27,7 @@ Create = Callable[[Any], Service]
 """Makes a service from a scenario."""
 
 
-class ChoiceError(ValueError):
+class ChoiceError(UserError):
     """An implementation that cannot be used. Names the role, the choice, and what is allowed or has to be installed."""
 
 

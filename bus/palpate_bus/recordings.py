@@ -19,6 +19,7 @@ from zstandard import ZstdError
 
 from palpate_bus.contract import Contract
 from palpate_bus.settings import RECORDING
+from palpate_errors import UserError
 
 KEPT_EVERY = "kept_every_ms"
 """In the metadata of a channel: the time in which one message was kept."""
@@ -26,7 +27,7 @@ SCENARIO = "scenario.yaml"
 """Name of the attachment that a reference has its scenario in."""
 
 
-class RecordingError(ValueError):
+class RecordingError(UserError):
     """A recording that cannot be used. Names file, topic, what was found and what is needed."""
 
 

@@ -21,6 +21,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from palpate_errors import UserError
+
 PREFIX = "PALPATE_"
 PAGE = Path("docs/settings.md")
 DOMAIN_MAX = 232
@@ -45,7 +47,7 @@ RECORDING = "recording_mcap"
 """The recording within a results folder: a rosbag2 folder."""
 
 
-class BusConfigError(ValueError):
+class BusConfigError(UserError):
     """A setting that cannot work, or a bus that cannot be joined. Names the variable or field, its value and what is allowed."""
 
 

@@ -21,6 +21,7 @@ from PIL import Image
 from palpate_dashboard.replay import draw, messages, recording_of
 from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live, address
+from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -43,7 +44,7 @@ Page = Any
 Pixels = NDArray[np.uint8]
 
 
-class NoPicture(RuntimeError):
+class NoPicture(UserError):
     """No browser, or nothing came. Says what is missing."""
 
 

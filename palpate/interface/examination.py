@@ -27,13 +27,14 @@ from palpate.report.rows import Report
 from palpate.run.folder import usual_folder
 from palpate.run.options import DEFAULT_SCENARIO
 from palpate_bus.settings import RECORDING
+from palpate_errors import RunError
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
 
 _SEEN_FRAMES: Final = ("time", "phase", "depth", "setpoint", "force", "in_contact", "steady", "force_limited")
 
 
-class ExaminationError(RuntimeError):
+class ExaminationError(RunError):
     """An examination that left no results. Says why, in the words of the command line."""
 
 

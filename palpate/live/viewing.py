@@ -20,10 +20,11 @@ from palpate_dashboard import replay
 from palpate_dashboard.follow import follow
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import MEMORY_LIMIT, Live, address
+from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 
 
-class NothingToShow(RuntimeError):
+class NothingToShow(UserError):
     """Nothing that can be shown. Says what to do."""
 
 

@@ -28,6 +28,7 @@ from scipy.signal import lfilter
 from palpate.quick.patient import PERIOD_S
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.robot import lbr
@@ -50,7 +51,7 @@ LEAST_EXAMINATIONS: Final = 10
 Breath = Literal["none", "quiet", "deep", "held"]
 
 
-class UnknownLoopError(ValueError):
+class UnknownLoopError(UserError):
     """A scenario for which there is no loop. Names what is asked for and what there is."""
 
 

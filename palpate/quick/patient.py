@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.tissue import true_tissue
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, inverse, matrix
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import seen, true_pose, whole_scenario
@@ -37,7 +38,7 @@ _LIFT_MPS: Final = 0.12
 _LONGEST_HOLD_S: Final = 60.0
 
 
-class NoTissueError(ValueError):
+class NoTissueError(UserError):
     """A scenario of whose tissue there is no copy. Names the field and what is allowed."""
 
 

@@ -16,6 +16,7 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch
 from palpate_bus.wire.transport import Sender
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
+from palpate_errors import UserError
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 """Where a replay is to be found when the environment names no endpoint: where ROS 2's rmw_zenoh looks for its router."""
@@ -25,7 +26,7 @@ CLOCK = "clock"
 CLOCK_PERIOD = 10 * MS
 
 
-class PlayError(ValueError):
+class PlayError(UserError):
     """A recording that must not or cannot be played on this bus."""
 
 

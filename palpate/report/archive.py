@@ -28,6 +28,7 @@ from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 
 FILE: Final = "evidence.npz"
@@ -41,7 +42,7 @@ _MESSAGES: Final = {
 Mask = NDArray[np.bool_]
 
 
-class EvidenceError(ValueError):
+class EvidenceError(UserError):
     """A folder without readable evidence. Names the file and what to do."""
 
 

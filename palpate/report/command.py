@@ -14,12 +14,13 @@ import typer
 from rich.console import Console
 
 from palpate.command_line import refuse
+from palpate_errors import UserError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PRINT_TIMEOUT_S = 120
 
 
-class PrintError(RuntimeError):
+class PrintError(UserError):
     """A page that no browser could print. Says what to do."""
 
 

@@ -19,6 +19,7 @@ from palpate.run.outlook import Outlook, in_words
 from palpate_bus.runs.run_name import FILE, LOCK, in_use, run_of
 from palpate_bus.settings import RECORDING
 from palpate_conductor.result import RunProgress, Tell
+from palpate_errors import UserError
 from palpate_models.scenario.schema import Exam
 
 OF_A_RUN: Final = (
@@ -28,7 +29,7 @@ OF_A_RUN: Final = (
 """What a run leaves in its folder."""
 
 
-class FolderError(ValueError):
+class FolderError(UserError):
     """The folder cannot take the results of this run. Says why and what to do."""
 
 

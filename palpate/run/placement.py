@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate_bus.contract import contract
+from palpate_errors import UserError
 
 Groups = tuple[tuple[str, ...], ...]
 """The roles of each process."""
 
 
-class PlacementError(ValueError):
+class PlacementError(UserError):
     """A placement that cannot be. Names the option, its value and what is allowed."""
 
 

@@ -25,12 +25,13 @@ from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.joining import NoBus, named_runs
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.handover import ROLES
+from palpate_errors import UserError
 
 FILE = "places.json"
 """In the results folder of a run."""
 
 
-class PlaceError(ValueError):
+class PlaceError(UserError):
     """A place that cannot be left out, joined or taken. Says why, and what can be done."""
 
 

@@ -32,6 +32,7 @@ from palpate_bus.settings import Settings, variable
 from palpate_bus.wire.tags import make_key
 from palpate_bus.wire.zenoh_config import mesh
 from palpate_conductor.timing import Timing
+from palpate_errors import UserError
 from palpate_models.scenario.load import view_of
 
 COMPOSE = "docker-compose.yml"
@@ -41,7 +42,7 @@ BARRIER = frozenset(("robot", "control", "tissue"))
 """The roles of the 1 kHz loop: processes of no others talk over the low-latency transport (see palpate_bus.wire.zenoh_config)."""
 
 
-class ProcessListError(ValueError):
+class ProcessListError(UserError):
     """The compose file cannot be used. Names file, service and field."""
 
 

@@ -29,6 +29,7 @@ from palpate.study.manifest import Case
 from palpate.study.outcome import ATTEMPTS, Outcome, case_file, read_outcome, write_outcome
 from palpate.study.spec import StudyError
 from palpate.study.workers import Workers
+from palpate_errors import RunError
 
 BATCH: Final = {"whole": 1, "quick": 8}
 """Most cases a task ..."""
@@ -40,7 +41,7 @@ Tell = Callable[[Outcome], None]
 """Hears of every case that has an outcome now."""
 
 
-class StudyStopped(RuntimeError):
+class StudyStopped(RunError):
     """The workers are gone, or cannot work. What was done is kept. Says why."""
 
 

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from palpate.run.roles import OBSERVERS, WORKERS
+from palpate_errors import UserError
 from palpate_models.patient.schema import MOST_LUMPS, Draw, Range
 from palpate_models.scenario.errors import Errors, Level, table
 from palpate_models.scenario.explain import explain
@@ -38,7 +39,7 @@ Settings = dict[str, Any]
 SUFFIX: Final = ".yaml"
 
 
-class StudyError(ValueError):
+class StudyError(UserError):
     """A study that cannot be used. The message names file, field, value and what is allowed."""
 
 

@@ -13,12 +13,13 @@ from typing import Final
 
 from palpate.environment import FIXED
 from palpate.study.child import kill_all
+from palpate_errors import RunError
 
 CONNECT_S: Final = 30
 """How long a scheduler elsewhere has to answer."""
 
 
-class WorkersError(RuntimeError):
+class WorkersError(RunError):
     """No workers can be had. Says why."""
 
 

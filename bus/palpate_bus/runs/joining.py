@@ -13,9 +13,10 @@ from palpate_bus.runs.announcement import Run, folder, live, matching
 from palpate_bus.security.access import OPERATOR
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_errors import UserError
 
 
-class NoBus(RuntimeError):
+class NoBus(UserError):
     """No bus to join. Says what was looked for and what to do."""
 
 

@@ -10,6 +10,7 @@ import json
 import zenoh
 
 from palpate_bus.messages import OperatorRequest
+from palpate_errors import RunError
 
 CONFIRM_S = 2.0
 """How long a confirmation is waited for, by wall clock."""
@@ -24,7 +25,7 @@ TIME_REQUESTS = ("pause", "resume", "step")
 """What can be asked of the conductor of a lockstep run: to grant no more time, to grant it again, to grant a little."""
 
 
-class NotAnswered(RuntimeError):
+class NotAnswered(RunError):
     """No run answered the request, or it was refused. The message says which."""
 
 

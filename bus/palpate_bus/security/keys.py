@@ -24,6 +24,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from palpate_bus.contract import contract
 from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER
+from palpate_errors import UserError
 
 CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
 CA_KEY = "ca.key"
@@ -36,7 +37,7 @@ _SKEW = timedelta(minutes=5)
 """Clocks may be this far apart."""
 
 
-class KeysError(ValueError):
+class KeysError(UserError):
     """Keys that cannot be made or read. Names the file and what to do."""
 
 

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from palpate_errors import UserError
+
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wno-strict-prototypes")
 """The one exception is for the standard's own headers."""
 OPTIMISE = ("-O3", "-ffp-contract=off", "-fno-sanitize=all", "-g0")
@@ -43,7 +45,7 @@ PLATFORMS: tuple[Platform, ...] = (
 )
 
 
-class CompileError(RuntimeError):
+class CompileError(UserError):
     """The C compiler refused; holds what it said."""
 
 

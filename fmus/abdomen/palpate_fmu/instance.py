@@ -28,6 +28,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from palpate_errors import UserError
+
 _ELEMENT = re.compile(r"^(.*)\[(\d+(?:,\d+)*)\]$")
 _TYPES: dict[str, tuple[str, str | None, type[np.generic]]] = {
     "Float64": ("Float64", None, np.float64),
@@ -47,7 +49,7 @@ _TYPES: dict[str, tuple[str, str | None, type[np.generic]]] = {
 """By the type of a variable: its functions in FMI 3.0 and 2.0, and its NumPy type (FMI 2.0's integers are of 32 bits)."""
 
 
-class FmuError(RuntimeError):
+class FmuError(UserError):
     """An FMU that cannot be loaded, or one of its functions that failed: holds what the FMU said."""
 
 

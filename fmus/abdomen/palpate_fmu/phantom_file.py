@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_errors import UserError
 from palpate_fmu.variables import BRANCHES, LESIONS, Sizes, parameters
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.field import at_skin
@@ -20,7 +21,7 @@ SAMPLED_HALF_M = 0.11
 """Half width of the region about the umbilicus in which they are."""
 
 
-class ExportError(ValueError):
+class ExportError(UserError):
     """A phantom that this FMU cannot hold."""
 
 

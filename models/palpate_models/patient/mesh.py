@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 
 IntArray = NDArray[np.int32]
@@ -23,7 +24,7 @@ _REGION_HALF_M = 0.112
 _NEAR_UMBILICUS_M = 0.03
 
 
-class MeshError(ValueError):
+class MeshError(UserError):
     """A mesh that cannot be a phantom. The message names the file, what is wrong, where, and what to do."""
 
 

@@ -10,10 +10,11 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 
 
-class CheckpointError(ValueError):
+class CheckpointError(UserError):
     """A checkpoint that cannot be used. Names the file and what is wrong."""
 
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import ValidationError
 
+from palpate_errors import UserError
 from palpate_models.numerics.frames import matrix, pose_of
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.explain import did_you_mean, explain
@@ -36,7 +37,7 @@ _VIEWS: Mapping[str, View] = {
 _MERGE = "tag:yaml.org,2002:merge"
 
 
-class ScenarioError(ValueError):
+class ScenarioError(UserError):
     """A scenario that cannot be used. The message names file, field, value and what is allowed."""
 
 

@@ -12,6 +12,8 @@ from runpy import run_path
 from traceback import extract_tb
 from typing import Any, Final
 
+from palpate_errors import UserError
+
 
 def is_file(choice: str) -> bool:
     """Whether a choice is a file rather than a name."""
@@ -90,7 +92,7 @@ SEARCH: Final = "search"
 OURS: Final = ("lines", "raster", "snake", SEARCH)
 
 
-class PatternError(ValueError):
+class PatternError(UserError):
     """A scan pattern that cannot be used. Names the choice, the line where it is a file, and what is allowed."""
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from palpate.study.statistics.estimate import FOLDS, Bootstrap
+from palpate_errors import UserError
 
 COLUMNS: Final = {
     "cases": """case_id study population method split number tier errors status completed palpable not_palpable false_findings
@@ -31,7 +32,7 @@ WORST_ILL, WORST_HEALTHY = -1.0, 2.0
 """Scores of cases that failed, beyond the confidences 0 to 1: of a patient with lumps, of one without."""
 
 
-class TablesError(ValueError):
+class TablesError(UserError):
     """Tables that no statistics can be made of. Names the file and what is wrong."""
 
 

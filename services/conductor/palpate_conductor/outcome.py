@@ -9,6 +9,7 @@ from typing import Any
 
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.lockstep import NEVER, run_hash
+from palpate_errors import RunError
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +60,7 @@ class RunOutcome:
         return None if self.failure else run_hash(self.digests)
 
 
-class RunFailed(RuntimeError):
+class RunFailed(RunError):
     """The run ended early. Names the service and the cause."""
 
 

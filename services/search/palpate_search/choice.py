@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.named_function import NamedFunction, is_file
 from palpate_search.posterior import Posterior
@@ -15,7 +16,7 @@ Policy = Callable[[Posterior, Budget], tuple[Array, float]]
 """`next_press(posterior, budget) -> place, depth`: xy in the abdomen frame [m], shape (2,), and depth [m]."""
 
 
-class PolicyError(ValueError):
+class PolicyError(UserError):
     """A policy that cannot be used. Names the value and what is allowed."""
 
 
