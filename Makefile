@@ -44,13 +44,7 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: install  ## the pages that are made from contract, tables and models; then the site, out/site/index.html
-	$(BIN)/python -m palpate_bus.contract.doc
-	$(BIN)/python -m palpate_bus.settings --doc
-	$(BIN)/python -m palpate_models.errors_page
-	$(BIN)/python -m palpate_models.scenario_page
-	$(BIN)/python -m palpate.study.leaderboard
-	$(BIN)/python -m palpate.reference
+docs: install  ## the site with its generated reference pages: out/site/index.html
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -r requirements-docs.txt
 	$(BIN)/python docs/site.py out/site-pages
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build

@@ -1,11 +1,11 @@
-"""Gathers what the site is made of: every page of the project and its pictures, in a folder that is laid out like the project.
+"""Collects the sources of the site: every page of the project with its pictures, in a folder laid out like the repository.
 
     python docs/site.py out/site-pages && mkdocs build --strict
 
-So links between pages hold as they stand in the repository. A link to a folder leads to its README. A link whose words are the
-name of a page's file gets the page's title for words. A link to a file that the site does not have, such as source code, becomes
-the words alone. The notebooks of docs/notebooks are carried out, and become
-pages with what they printed and drew.
+Reference pages are generated from contract, tables, models and commands. Links between pages stay as they are in the
+repository. A link to a folder becomes a link to its README. A link whose text is a file name gets the title of that page. A
+link to a file that the site does not have, such as source code, becomes plain text. The notebooks of docs/notebooks are
+executed and become pages with their output.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import jupytext
@@ -23,60 +24,74 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert import MarkdownExporter
 from nbconvert.writers import FilesWriter
 
+from palpate import reference
+from palpate_bus import settings
+from palpate_bus.contract import contract, doc
+from palpate_models import errors_page, scenario_page
+
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = Path("docs/notebooks")
-PICTURES = {".png", ".gif", ".svg", ".mp4", ".csv", ".css"}
-"""And what else a page uses or links to."""
+GENERATED: dict[str, Callable[[], str]] = {
+    "docs/topics.md": lambda: doc.page(contract()),
+    "docs/settings.md": settings.page,
+    "docs/errors.md": errors_page.page,
+    "docs/scenario.md": scenario_page.page,
+    "docs/reference/commands.md": reference.commands_page,
+    "docs/reference/messages.md": reference.messages_page,
+}
+ASSETS = {".png", ".gif", ".svg", ".mp4", ".csv", ".css", ".json"}
 DIAGRAM = re.compile(r"```mermaid\n.*?```\n", re.DOTALL)
-"""A diagram that a browser would draw with a library from the network."""
+"""A browser would draw such a diagram with a library from the network."""
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")
 
 
 def gather(into: Path) -> None:
-    """Fills the folder, which is removed before."""
+    """Fills the folder `into`, which is deleted first."""
     shutil.rmtree(into, ignore_errors=True)
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     files = [Path(line) for line in listed.stdout.splitlines() if (ROOT / line).is_file()]
-    pages = {file for file in files if file.suffix == ".md"}
+    pages = {file: (ROOT / file).read_text(encoding="utf-8") for file in files if file.suffix == ".md"}
+    pages |= {Path(name): page() for name, page in GENERATED.items()}
+    for page in pages:
+        target = into / ("index.md" if page == Path("README.md") else page)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(within_the_site(page, pages), encoding="utf-8")
     for file in files:
-        if file.suffix in PICTURES | {".md"}:
-            target = into / ("index.md" if file == Path("README.md") else file)
+        if file.suffix in ASSETS:
+            target = into / file
             target.parent.mkdir(parents=True, exist_ok=True)
-            if file in pages:
-                target.write_text(within_the_site(file, pages), encoding="utf-8")
-            else:
-                shutil.copy(ROOT / file, target)
+            shutil.copy(ROOT / file, target)
         elif file.parent == NOTEBOOKS:
-            carry_out(file, into / NOTEBOOKS)
+            execute(file, into / NOTEBOOKS)
 
 
-def carry_out(notebook: Path, into: Path) -> None:
-    """Carries a notebook out, and writes it into the folder as a page with its pictures. Raises CellExecutionError."""
+def execute(notebook: Path, into: Path) -> None:
+    """Executes a notebook and writes it into the folder as a page with its pictures. Raises CellExecutionError."""
     cells = jupytext.read(ROOT / notebook)
-    with tempfile.TemporaryDirectory(prefix="palpate-notebook-") as place:
+    with tempfile.TemporaryDirectory(prefix="palpate-notebook-") as folder:
         try:
-            NotebookClient(cells, timeout=1800, kernel_name="python3", resources={"metadata": {"path": place}}).execute()
+            NotebookClient(cells, timeout=1800, kernel_name="python3", resources={"metadata": {"path": folder}}).execute()
         except CellExecutionError:
-            said = [
+            errors = [
                 output["text"] for cell in cells.cells for output in cell.get("outputs", ()) if output.get("name") == "stderr"
             ]
-            print(f"{notebook}: before its error it said:", *said, sep="\n", file=sys.stderr)  # such as why an examination failed
+            print(f"{notebook} failed; its standard error:", *errors, sep="\n", file=sys.stderr)
             raise
     pictures = {"unique_key": notebook.stem, "output_files_dir": f"{notebook.stem}_files"}
     text, resources = MarkdownExporter().from_notebook_node(cells, resources=pictures)
     FilesWriter(build_directory=str(into)).write(text, resources, notebook_name=notebook.stem)
 
 
-def title(page: Path) -> str:
+def title(text: str) -> str:
     """The first heading of a page, up to a colon or comma."""
-    heading = next(line for line in (ROOT / page).read_text(encoding="utf-8").splitlines() if line.startswith("# "))
+    heading = next(line for line in text.splitlines() if line.startswith("# "))
     return re.split("[:,]", heading.removeprefix("# "))[0]
 
 
-def within_the_site(page: Path, pages: set[Path]) -> str:
-    """The text of a page, with links to pages only."""
+def within_the_site(page: Path, pages: dict[Path, str]) -> str:
+    """Return the text of a page with links to pages only."""
 
     def link(found: re.Match[str]) -> str:
         words, where, anchor = found[1], found[2], found[3] or ""
@@ -84,7 +99,7 @@ def within_the_site(page: Path, pages: set[Path]) -> str:
             return found[0]
         target = (ROOT / page.parent / where).resolve().relative_to(ROOT)
         if target in pages and words.endswith(".md"):
-            words = title(target)
+            words = title(pages[target])
         if target / "README.md" in pages:
             return f"[{words}]({where.rstrip('/')}/README.md{anchor})"
         if target == Path("README.md"):
@@ -93,7 +108,7 @@ def within_the_site(page: Path, pages: set[Path]) -> str:
             return f"[{words}]({Path(where).with_suffix('.md')}{anchor})"
         return f"[{words}]({where}{anchor})" if target in pages else words
 
-    text = DIAGRAM.sub("*The page in the repository draws this as a diagram.*\n", (ROOT / page).read_text(encoding="utf-8"))
+    text = DIAGRAM.sub("*The page in the repository shows a diagram here.*\n", pages[page])
     return LINK.sub(link, text)
 
 

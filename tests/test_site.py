@@ -25,7 +25,7 @@ def test_the_site_is_whole_and_needs_no_network(tmp_path: Path, monkeypatch: pyt
     assert spec.loader is not None
     site = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(site)
-    monkeypatch.setattr(site, "carry_out", _titled)  # `make docs` carries the notebooks out; tests/test_library.py does, too
+    monkeypatch.setattr(site, "execute", _titled)  # tests/test_library.py executes the notebooks
     site.gather(tmp_path / "pages")
     config = tmp_path / "mkdocs.yml"
     config.write_text(

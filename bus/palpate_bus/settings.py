@@ -5,7 +5,6 @@
     subprocess.Popen(command, env={**os.environ, **child.to_env()})
 
 Nothing else in the project reads a PALPATE_ variable. What is examined, and how, is no setting: it is in the scenario.
-`python -m palpate_bus.settings --doc` writes docs/settings.md from this file.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import os
 import sys
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -24,7 +23,6 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from palpate_errors import UserError
 
 PREFIX = "PALPATE_"
-PAGE = Path("docs/settings.md")
 DOMAIN_MAX = 232
 """The highest ROS domain with DDS's default port range; zenoh itself knows no limit."""
 
@@ -266,9 +264,9 @@ def page() -> str:
     lines = [
         "# Settings",
         "",
-        "Every environment variable that the project reads, made from [`Settings`](../bus/palpate_bus/settings.py) by",
-        "`python -m palpate_bus.settings --doc`. `palpate run` and docker-compose.yml set what a service needs; a user",
-        "seldom sets any. A wrong value is refused with the variable, the value and what is allowed. An empty variable counts as",
+        "Every environment variable that the project reads, generated from [`Settings`](../bus/palpate_bus/settings.py) by",
+        "`make docs`. `palpate run` and docker-compose.yml set what a service needs; a user",
+        "rarely sets any. A wrong value is refused with the variable, the value and what is allowed. An empty variable counts as",
         "not set. What is examined, and how, is in the scenario.",
         "",
         "| variable | allowed | default | meaning |",
@@ -278,11 +276,8 @@ def page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Prints the settings of this environment, or writes the page into the working directory's docs/; returns the exit status."""
-    if "--doc" in arguments:
-        PAGE.write_text(page(), encoding="utf-8")
-        return 0
+def main() -> int:
+    """Print the settings of this environment; return the exit status."""
     try:
         for name, value in Settings.read().to_env().items():
             print(f"{name}={value}")
@@ -293,4 +288,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

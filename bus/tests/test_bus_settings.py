@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate_bus.settings import PAGE, BusConfigError, Settings, page
+from palpate_bus.settings import BusConfigError, Settings
 
 SETTINGS = {
     "PALPATE_LISTEN": "tcp/a:1, tcp/b:2",
@@ -64,7 +64,3 @@ def test_wrong_change_and_missing_setting_are_refused() -> None:
         Settings.read({}).replaced(runtime="fast")
     with pytest.raises(BusConfigError, match="PALPATE_OUT is not set; give it the run's folder"):
         Settings.read({}).required("out", "give it the run's folder")
-
-
-def test_page_is_current() -> None:
-    assert (Path(__file__).parents[2] / PAGE).read_text(encoding="utf-8") == page()

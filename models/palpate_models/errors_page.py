@@ -1,14 +1,12 @@
-"""docs/errors.md, from the fields in `errors.py` and the table in `error_levels.yaml`: `python -m palpate_models.errors_page`."""
+"""docs/errors.md, from the fields in `errors.py` and the table in `error_levels.yaml`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Final
 
 from palpate_models.scenario.errors import LEVEL, Errors, table
 
-PAGE: Final = Path("docs/errors.md")
 _HEAD: Final = f"""# Errors of sensors, calibrations and arm
 
 Made from [`errors.py`](../models/palpate_models/scenario/errors.py) and
@@ -53,7 +51,3 @@ def _sections() -> Iterator[str]:
 
 def _line(text: str) -> str:
     return " ".join(text.split())
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")

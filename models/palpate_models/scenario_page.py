@@ -1,17 +1,15 @@
-"""docs/scenario.md, from the fields of a scenario: `python -m palpate_models.scenario_page`."""
+"""docs/scenario.md, from the fields of a scenario."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from textwrap import fill
 from typing import Any, Final, get_args, get_origin
 
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import UNITS, Section
 
-PAGE: Final = Path("docs/scenario.md")
 _HEAD: Final = """# Fields of a scenario
 
 Made from the models in [`palpate_models`](../models/palpate_models/scenario/schema.py) by `make docs`.
@@ -28,7 +26,7 @@ field that was probably meant. [V] marks a figure that was read in the source na
 """
 _ELSEWHERE: Final = {
     "errors": "All fields with their levels and sources: [errors.md](errors.md).",
-    "phantom.anatomy": "It is not set but drawn from the seed, see [persons.md](persons.md).",
+    "phantom.anatomy": "It is not set but drawn from the seed, see [reality.md](reality.md#randomly-drawn-persons).",
 }
 """Sections that are described on a page of their own."""
 _BOUNDS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
@@ -107,7 +105,3 @@ def _anchor(path: str) -> str:
 
 def _line(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")

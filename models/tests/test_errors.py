@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from palpate_models.errors_page import PAGE, page
 from palpate_models.numerics.frames import matrix
 from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, Errors, draw_errors, levels, table
 from palpate_models.scenario.load import ScenarioError, load_scenario, true_pose
@@ -70,10 +69,6 @@ def test_poor_equipment_is_nowhere_better_than_typical() -> None:
     slower = {"tare_s", "warm_up_s"}
     for rows in table().values():
         assert all(row["poor"] >= row["typical"] for name, row in rows.items() if name not in slower)
-
-
-def test_the_page_is_that_of_the_table() -> None:
-    assert (ROOT / PAGE).read_text(encoding="utf-8") == page()
 
 
 def test_equal_seeds_give_equal_equipment_and_others_do_not() -> None:

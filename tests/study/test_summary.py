@@ -1,4 +1,4 @@
-"""study.json, study.html and the leaderboard of synthetic studies."""
+"""study.json and study.html of synthetic studies."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ import pytest
 import synthetic
 
 from palpate.quick.errors import LEAST_EXAMINATIONS
-from palpate.study.leaderboard import write_leaderboard
-from palpate.study.statistics.reading import TablesError
 from palpate.study.summary import read_summary, summarise
 
 FOLDS = 100
@@ -117,19 +115,6 @@ def test_the_same_tables_give_the_same_bytes(study: Path) -> None:
     assert [(study / name).read_bytes() for name in ("study.json", "study.html")] == before
 
 
-def test_the_leaderboard_has_a_row_a_method(study: Path, tmp_path: Path) -> None:
-    page = tmp_path / "leaderboard.md"
-    write_leaderboard([study / "study.json"], page)
-    summary = read_summary(study / "study.json")
-    rows = [line.split(" | ") for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| ")][2:]
-    assert {row[0].removeprefix("| ") for row in rows} == set(summary.methods)
-    auc = summary.methods["palpate"].auc
-    assert auc is not None
-    row = next(row for row in rows if row[0] == "| palpate")
-    assert row[2].startswith(f"{auc.value:.3f} ({auc.low:.3f} to {auc.high:.3f}; n = {auc.n}")
-    assert COMMAND in page.read_text(encoding="utf-8")
-
-
 def test_a_study_of_healthy_people_alone_has_a_page(tmp_path: Path) -> None:
     frames = synthetic.frames([synthetic.case(i, "healthy") for i in range(3)], [], [])
     for name, frame in zip(("cases", "findings", "lumps"), frames, strict=True):
@@ -141,7 +126,7 @@ def test_a_study_of_healthy_people_alone_has_a_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("behind", [9, 10])
-def test_what_comes_of_an_assumed_loop_says_so_and_is_not_on_the_leaderboard(tmp_path: Path, behind: int) -> None:
+def test_figures_of_an_assumed_loop_are_not_to_be_quoted(tmp_path: Path, behind: int) -> None:
     frames = synthetic.frames(
         [synthetic.case(i, "healthy") | {"tier": "quick", "loop_examinations": behind} for i in range(3)], [], []
     )
@@ -149,15 +134,3 @@ def test_what_comes_of_an_assumed_loop_says_so_and_is_not_on_the_leaderboard(tmp
         frame.to_parquet(tmp_path / f"{name}.parquet")
     summarise(tmp_path, COMMAND)
     assert ("Not to be quoted" in (tmp_path / "study.html").read_text(encoding="utf-8")) == (behind < LEAST_EXAMINATIONS)
-    if behind >= LEAST_EXAMINATIONS:
-        write_leaderboard([tmp_path / "study.json"], tmp_path / "leaderboard.md")
-        return
-    with pytest.raises(TablesError, match=r"study\.json: .*assumed loop; want tier: whole"):
-        write_leaderboard([tmp_path / "study.json"], tmp_path / "leaderboard.md")
-
-
-def test_a_json_of_another_kind_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "study.json"
-    path.write_text("{}", encoding="utf-8")
-    with pytest.raises(TablesError, match=r"study\.json.*methods"):
-        write_leaderboard([path], tmp_path / "leaderboard.md")

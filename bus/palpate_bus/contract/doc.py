@@ -1,20 +1,16 @@
-"""Writes docs/topics.md from the contract: `python -m palpate_bus.contract.doc`; `--check` only says whether it is current."""
+"""The page of topics, docs/topics.md, generated from the contract (docs/site.py writes it)."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Container, Iterable, Sequence
-from pathlib import Path
 
-from palpate_bus.contract.rows import Contract, Edge, Qos, Role, Topic, Visibility, contract
+from palpate_bus.contract.rows import Contract, Edge, Qos, Role, Topic, Visibility
 from palpate_bus.messages import codec
-
-PAGE = Path("docs/topics.md")
 
 _HEAD = """\
 # Topics
 
-Generated from [the contract](../bus/palpate_bus/contract/contract.yaml) by `python -m palpate_bus.contract.doc`; do not edit.
+Generated from [the contract](../bus/palpate_bus/contract/contract.yaml) by `make docs`.
 
 A message goes by the key `<domain>/<topic>/<type>/<hash>`, as rmw_zenoh of ROS 2 Jazzy writes it (the domain is
 `ROS_DOMAIN_ID`, 0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID; where the run
@@ -172,20 +168,3 @@ def _internal(rules: Contract) -> str:
         rows.append((f"`{row.name}`", f"`{row.type}`", row.producer, row.readers, every, deadline, tagged, row.doc))
     head = ("key", "type", "from", "to", "every", "deadline", "tagged", "what for")
     return "## Messages of the runtime\n\n" + _table(head, rows)
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Writes the page into the working directory's docs/, or checks it; returns the exit status."""
-    text = page(contract())
-    if "--check" in arguments:
-        if not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text:
-            print(f"{PAGE} is not what the contract says; run: python -m palpate_bus.contract.doc", file=sys.stderr)
-            return 1
-        return 0
-    PAGE.parent.mkdir(exist_ok=True)
-    PAGE.write_text(text, encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

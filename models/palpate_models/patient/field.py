@@ -12,7 +12,7 @@ is strained less than what is around it, as Eshelby's inclusion is, and the less
 skin shows the cap that is within 6 mm of its top. The constants are fitted to presses of 10 mm with a sphere of 15 mm into the
 elastic tier (a slab of 0.12 m with lumps of 5 to 40 mm, 0 to 40 mm deep, contrasts 0.25 to 12). There the felt ratio of forces
 is reproduced within 8 %, 2.5 % RMS, and within 25 % for lumps that touch the skin, large ones being felt too little:
-`palpate validate --only buried`. S was chosen on one ridge (docs/persons.md).
+`palpate validate --only buried`. S was chosen on one ridge (docs/reality.md).
 """
 
 from __future__ import annotations

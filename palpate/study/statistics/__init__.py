@@ -1,1 +1,1 @@
-"""What a study's tables say. Definitions and their sources are in docs/statistics.md."""
+"""What a study's tables say. Definitions and their sources are in docs/scoring.md."""
