@@ -45,7 +45,6 @@ PARTS = {
     "fmu": "palpate_benchmarks.fmu",
     "tissue": "palpate_benchmarks.tissue",
     "tissue, elastic": "palpate_benchmarks.elastic",
-    "wire": "palpate_benchmarks.wire",
 }
 """The modules that measure the parts; each has a function `measure()`."""
 

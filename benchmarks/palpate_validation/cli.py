@@ -30,9 +30,6 @@ SECTIONS = {
     "energy": "energy",
     "breathing": "breathing",
     "drop": "drop",
-    "dart": "dart_bodies",
-    "mujoco": "flex",
-    "stability": "stability",
 }
 """Name of each section and the module that measures it, in the order of the report."""
 
@@ -53,7 +50,7 @@ def validate(
     ] = None,
     docs: Annotated[Path | None, output_file("Also write this Markdown page, with PNGs next to it.")] = None,
 ) -> None:
-    """Measure the physics against Hertz, DART, MuJoCo and theory. The exit status is 3 if a bound is missed."""
+    """Measure the physics against Hertz, measured people, DART and theory. The exit status is 3 if a bound is missed."""
     from palpate_validation.report import failures, table, write, write_page
 
     console = Console(stderr=True)

@@ -24,6 +24,10 @@ SPACING_M = 1e-4
 """Spacing of the depths at which a force is taken."""
 REACH_M = 0.022
 """How deep a curve goes: 20 mm and the largest zero offset."""
+COMPARED_M = np.arange(1.0, 20.01, 0.5) * 1e-3
+"""Depths at which forces are compared: to 20 mm, and from 1 mm on, where a force is no longer a few hundredths of a newton."""
+RATIO_AT_M = 0.010
+"""Depth at which tensed muscles are compared with relaxed ones."""
 
 
 def wall_tissue(wall: WallParameters, tension: float = 0.0) -> WinklerTissue:
@@ -55,3 +59,8 @@ def force_along(tissue: WinklerTissue, depths: Array, speed: float) -> Array:
 @cache
 def _flat(k_w_n_per_m3: float) -> PhantomModel:
     return flat_phantom(HALF_M, EDGE_M, k_w_n_per_m3)
+
+
+def at_depths(force: Array, zero_offset_m: float, depths: Array = COMPARED_M) -> Array:
+    """A simulated `force` at depths [m] below a zero that is `zero_offset_m` [m] below the untouched skin."""
+    return np.interp(depths + zero_offset_m, np.arange(len(force)) * SPACING_M, force)

@@ -13,8 +13,7 @@ from palpate_models.patient import remus2024
 from palpate_models.patient.remus2024 import Fit, exponent
 from palpate_models.patient.wall import MEDIAN
 from palpate_validation.check import Check, PageSection
-from palpate_validation.indentation import SPACING_M, force_along, press, wall_tissue
-from palpate_validation.people_fit import COMPARED_M, RATIO_AT_M, at_depths
+from palpate_validation.indentation import COMPARED_M, RATIO_AT_M, SPACING_M, at_depths, force_along, press, wall_tissue
 from palpate_validation.plots import COLOURS, INK, QUIET
 
 WITHIN_PERCENT = 5.0

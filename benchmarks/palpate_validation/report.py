@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 
 from palpate_validation.check import Check, PageSection
@@ -83,6 +84,14 @@ def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> Non
             write_figure(section.draw, images / f"{section.name}.png", section.size_in, dpi=90)
             lines += ["", f"![{section.title}]({where}/{section.name}.png)"]
     page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def show(section: PageSection, out: Path = Path("out/research")) -> None:
+    """Prints one section's checks and writes its files: what a study of its own under `research` does with its result."""
+    write([section], out)
+    console = Console()
+    Console(width=max(150, console.width)).print(table([section]))
+    console.print(section.text)
 
 
 def _plain(value: Any) -> Any:

@@ -105,7 +105,7 @@ class Fit:
 
 @cache
 def fitted() -> Mapping[tuple[str, str], Fit]:
-    """`fitted.csv` by region and person; `python -m palpate_validation.people_fit` makes it."""
+    """`fitted.csv` by region and person; `python -m research.people_fit` makes it."""
     with (FOLDER / "fitted.csv").open(encoding="ascii", newline="") as file:
         return {
             (row["region"], row["id"]): Fit(

@@ -1,4 +1,4 @@
-"""What was learned from tuning patients: `calibration.yaml`, made by `python -m palpate_validation.assessment_calibration`."""
+"""What was learned from tuning patients: `calibration.yaml`, made by `python -m research.assessment_calibration`."""
 
 from __future__ import annotations
 

@@ -1,0 +1,249 @@
+"""`palpate validate`: every bound of every section, and the report. Costs are printed, not tested."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from typer.testing import CliRunner
+
+from palpate.command_line import EXIT_BAD_INPUT
+from palpate_models.patient.remus2024 import relaxed_people
+from palpate_models.patient.schema import Stiffness
+from palpate_validation import (
+    buried,
+    drop,
+    elastic,
+    energy,
+    guarding,
+    hertz,
+    lumps,
+    meshes,
+    people,
+    persons,
+    population,
+    relaxation,
+)
+from palpate_validation.check import Check, PageSection
+from palpate_validation.drop import DartScene
+from palpate_validation.foundation import lump, static_force, uniform
+from palpate_validation.population import PopulationSample
+from palpate_validation.report import failures, number, write, write_page
+
+
+def assert_bounds(section: PageSection) -> None:
+    missed = [f"{c.name}: {c.measured} {c.unit}, want {c.bound}" for c in section.checks if c.passed is False and not c.timed]
+    assert not missed
+    assert any(c.passed for c in section.checks)
+
+
+def test_surface_tier_against_hertz() -> None:
+    assert_bounds(hertz.section(hertz.measure((0.020,))))
+
+
+def test_hertz_is_what_the_design_facts_compute() -> None:
+    np.testing.assert_allclose(
+        hertz.hertz_force(np.array((0.002, 0.005, 0.010, 0.015)), 0.020), (0.222, 0.877, 2.481, 4.559), atol=6e-4
+    )
+
+
+def test_where_it_stops_being_right_is_found() -> None:
+    depths = np.array((0.001, 0.005, 0.010, 0.020))
+    curves = hertz.HertzCurves((0.02,), depths, np.array([[1.5, 1.0, 1.0, 0.7]]), np.ones((1, 4)))
+    low, high = curves.within(0.02)
+    assert low == pytest.approx(0.0042, abs=1e-4)  # where the error crosses 10 % on straight lines
+    assert high == pytest.approx(0.01333, abs=1e-4)
+
+
+def test_lumps_against_the_continuum() -> None:
+    assert_bounds(lumps.section())
+
+
+def test_the_continuum_is_winklers_without_shear() -> None:
+    """Without G the force is k_w times the volume of the spherical cap."""
+    depth, radius = 0.006, 0.020
+    cap = np.pi * depth**2 * (3 * radius - depth) / 3
+    assert static_force(depth, radius, uniform(1e5), uniform(1e-9), h=5e-5) == pytest.approx(1e5 * cap, rel=2e-3)
+    assert static_force(depth, radius, lump(1e5, 0.05, 3.0, 0.001), uniform(1e-9), h=5e-5) == pytest.approx(3e5 * cap, rel=2e-3)
+
+
+def test_mesh_halving_and_superposition() -> None:
+    assert_bounds(meshes.section())
+
+
+def test_relaxation_is_read_back_from_the_force() -> None:
+    assert_bounds(relaxation.section())
+
+
+def test_a_sixth_of_the_living_people() -> None:
+    assert_bounds(people.section(people.measure(relaxed_people()[::6])))
+
+
+@pytest.mark.slow
+def test_all_living_people() -> None:
+    assert_bounds(people.section())
+
+
+def test_a_loop_loses_what_does_not_come_back() -> None:
+    depth = np.array((0.0, 1.0, 2.0, 1.0, 0.0)) * 1e-3
+    assert people.HysteresisLoop(0.01, depth, np.array((0.0, 1.0, 2.0, 0.5, 0.0))).lost_percent == pytest.approx(25.0)
+
+
+def test_random_cycles() -> None:
+    assert_bounds(energy.section(energy.measure(8)))
+
+
+WAVES = arrays(float, (3, 3), elements=st.floats(-1, 1))
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@given(WAVES, WAVES.map(lambda w: np.pi * w), st.integers(80, 600), st.sampled_from((0.0, 0.3, 1.5)))
+def test_no_closed_cycle_yields_work(amplitude: np.ndarray, phase: np.ndarray, steps: int, friction: float) -> None:
+    """Fast ones too: 80 ms for 16 mm of depth and 60 mm sideways."""
+    path = energy.closed_path(amplitude, phase, steps)
+    np.testing.assert_allclose(path[0], path[-1], atol=1e-9)
+    cycle = energy.run_cycle(energy.lumpy_phantom(), path, friction)
+    assume(cycle.touched > 20)
+    assert cycle.gained <= 0
+    assert cycle.surplus <= 1e-4
+
+
+def test_a_source_of_energy_would_be_seen() -> None:
+    """Pulling back more strongly than the tissue was pushed: the books must show it."""
+    work = np.array((1.0, 2.0, -0.5))
+    cycle = energy.Cycle(work, np.array((0.5, 2.5, 0.0)), np.zeros(3), 100)
+    assert cycle.gained == pytest.approx(0.25)
+    assert cycle.surplus > 0
+
+
+def test_dropped_on_our_surface_it_oscillates_and_settles() -> None:
+    soft = drop.drop_on_tissue()
+    assert 2.5e-3 < soft.deepest < 3.5e-3
+    assert 0.9e-3 < soft.settled < 1.1e-3
+    assert soft.oscillations >= 2
+    assert soft.last_force == pytest.approx(drop.MASS_KG * drop.GRAVITY, rel=0.01)
+
+
+def test_dropped_on_a_rigid_surface_it_stops() -> None:
+    rigid = drop.drop_in_dart(None, seconds=0.3)
+    assert rigid.oscillations == 0
+    assert rigid.deepest < 0.3e-3
+    assert rigid.last_force == pytest.approx(drop.MASS_KG * drop.GRAVITY, rel=0.01)
+
+
+def test_the_tool_would_sink_deep_into_the_default_wall() -> None:
+    wall = Stiffness(prony_g=(), prony_tau_s=())
+    assert 0.009 < drop.drop_on_tissue(wall, seconds=1.5).settled < 0.013
+
+
+@pytest.mark.slow
+def test_the_contact_test_of_the_paper() -> None:
+    assert_bounds(drop.section())
+
+
+def test_checks_know_their_bounds() -> None:
+    assert Check("a", 1.0, high=2.0).passed
+    assert Check("a", 3.0, high=2.0).passed is False
+    assert Check("a", 1.0, low=2.0).passed is False
+    assert Check("a", float("nan"), low=0.0, high=2.0).passed is False
+    assert Check("a", 1.0).passed is None
+
+
+def test_persons_have_the_statistics_of_the_measured_people() -> None:
+    assert_bounds(population.section())
+
+
+def test_people_all_alike_or_too_stiff_would_be_found_out() -> None:
+    people = population.measured()
+    alike = PopulationSample(people.person, np.tile(np.median(people.force, axis=0), (len(people.force), 1)))
+    stiff = PopulationSample(people.person, 1.3 * people.force)
+    for wrong in (alike, stiff):
+        assert any(check.passed is False for check in population.section(wrong).checks)
+
+
+def test_bone_is_felt_as_bone() -> None:
+    assert_bounds(persons.section())
+
+
+def test_lumps_below_the_skin_against_the_elastic_tier() -> None:
+    assert_bounds(buried.section())
+
+
+def test_voluntary_guarding_gives_way_under_a_press_and_more_under_strokes() -> None:
+    assert_bounds(guarding.section())
+
+
+def test_guarding_that_never_fades_would_be_found_out() -> None:
+    found = guarding.measure()
+    stubborn = {**found.strokes, "voluntary": found.strokes["involuntary"]}
+    assert any(check.passed is False for check in guarding.section(replace(found, strokes=stubborn)).checks)
+
+
+@pytest.mark.slow
+def test_the_elastic_tier_still_says_so() -> None:
+    lump = next(one for one in buried.ELASTIC_TIER if (one.radius_m, one.depth_m, one.contrast) == (0.020, 0.010, 4.0))
+    assert buried.on_elastic_tier(lump) == pytest.approx(lump.ratio, rel=0.005)
+
+
+@pytest.mark.slow
+def test_elastic_tier_against_hertz_and_sneddon() -> None:
+    assert_bounds(elastic.section())
+
+
+def test_sneddon_is_hertz_where_it_is_shallow() -> None:
+    assert hertz.sneddon_force(1e-4, 0.02) == pytest.approx(float(hertz.hertz_force(1e-4, 0.02)), rel=2e-3)
+    assert 0.93 < hertz.sneddon_force(0.010, 0.02) / float(hertz.hertz_force(0.010, 0.02)) < 0.96
+
+
+def test_a_sphere_rests_on_rigid_ground_in_dart() -> None:
+    scene = DartScene(None, 0.015, 1e-3, mass=0.2, height=0.0005)
+    for _ in range(200):
+        scene.fall(0.2 * 9.81)
+    assert scene.force() == pytest.approx(0.2 * 9.81, rel=0.01)
+    assert abs(scene.depth) < 1e-4
+
+
+def a_section() -> PageSection:
+    checks = (Check("good", 1.0, "N", high=2.0, against="theory"), Check("bad", 3.0, high=2.0), Check("told", 5.0))
+    return PageSection(
+        "name",
+        "Title",
+        "Text.",
+        checks,
+        lambda f: f.subplots().plot([1, 2]),
+        data={"x": np.array((1.0, np.nan)), "n": np.int64(3)},
+    )
+
+
+def test_report_files(tmp_path) -> None:
+    section = a_section()
+    write([section], tmp_path / "out")
+    facts = json.loads((tmp_path / "out" / "validate.json").read_text())
+    assert facts["name"]["data"] == {"x": [1.0, None], "n": 3}
+    assert [c["passed"] for c in facts["name"]["checks"]] == [True, False, None]
+    assert (tmp_path / "out" / "name.png").read_bytes()[:4] == b"\x89PNG"
+    assert [c.name for c in failures([section])] == ["bad"]
+    write_page([section], tmp_path / "page.md", tmp_path / "images" / "validation")
+    page = (tmp_path / "page.md").read_text()
+    assert "**missed**" in page
+    assert "(images/validation/name.png)" in page
+
+
+def test_numbers_are_short() -> None:
+    assert [number(x) for x in (0, 1.23456, 1234.5, 1.5e-9, -0.31195)] == ["0", "1.23", "1234", "1.5e-09", "-0.312"]
+
+
+def test_the_command(tmp_path, monkeypatch) -> None:
+    from palpate_validation import cli
+
+    monkeypatch.setattr(cli, "run_section", lambda name: a_section())
+    runner = CliRunner()
+    result = runner.invoke(cli.app, ["--only", "hertz", "--out", str(tmp_path)])
+    assert result.exit_code == cli.EXIT_MISSED
+    assert "FAIL" in result.output
+    assert runner.invoke(cli.app, ["--only", "nonsense"]).exit_code == EXIT_BAD_INPUT
