@@ -20,8 +20,7 @@ from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.backends.winkler import implicit_kernel as kernel
-from palpate_tissue.backends.winkler.implicit_kernel import ImplicitPatch, ImplicitWall
+from palpate_tissue.backends.winkler.implicit_kernel import ImplicitPatch, ImplicitWall, follow, press
 from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
 from palpate_tissue.near import Near, VertexSearch
 
@@ -79,7 +78,7 @@ class ImplicitTissue(TissueBackend):
         motion = self._motion
         motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
         numbers = (radius, self._excursion, self.activation, self.dt)
-        touching, wrench = kernel.press(self._wall, self._patch, self.friction, motion, numbers, SWEEPS)
+        touching, wrench = press(self._wall, self._patch, self.friction, motion, numbers, SWEEPS)
         if self.touching and not touching:
             self.friction.release()
         self.touching = touching
@@ -113,7 +112,7 @@ class ImplicitTissue(TissueBackend):
         if self._steps % self._every == 0 or self._steps < self._sprung:
             if self._patch is not None:
                 self._wall.clock[self._patch.near] = self._steps
-            kernel.follow(self._wall, self._free, self._steps, self.activation, FAR_SWEEPS)
+            follow(self._wall, self._free, self._steps, self.activation, FAR_SWEEPS)
         self._steps += 1
 
     def _leave(self) -> None:
@@ -134,7 +133,7 @@ class ImplicitTissue(TissueBackend):
         stepped = np.zeros(len(model.vertices), dtype=bool)
         stepped[vertex] = stepped[self._free[self._tree.query_ball_point(p, 2 * radius + self._reach_m + _MARGIN_M)]] = True
         near = np.concatenate([np.flatnonzero(stepped)[first::_APART] for first in range(_APART)])
-        kernel.follow(self._wall, near, self._steps - 1, self.activation, FAR_SWEEPS)
+        follow(self._wall, near, self._steps - 1, self.activation, FAR_SWEEPS)
         table = np.column_stack((model.normals[vertex], model.vertices[vertex], model.breathing[vertex]))
         place = np.empty(len(model.vertices), dtype=np.intp)
         place[near] = np.arange(len(near))

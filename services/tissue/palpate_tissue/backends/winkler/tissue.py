@@ -23,9 +23,8 @@ from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
-from palpate_tissue.backends.winkler.kernel import Membrane, Patch
+from palpate_tissue.backends.winkler.kernel import Membrane, Patch, step
 from palpate_tissue.backends.winkler.mechanics import assemble
 from palpate_tissue.backends.winkler.presses import press_in_turn
 from palpate_tissue.near import Near, VertexSearch
@@ -127,7 +126,7 @@ class WinklerTissue(TissueBackend):
     def _press(self, patch: Patch, radius: float, wrench: Array) -> None:
         """One explicit step; `wrench` (6,) gets force [N] and torque [N m] on the sphere, and is left alone out of contact."""
         self._wall.activation[0] = self.activation
-        touching = kernel.step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
+        touching = step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
         if touching:
             self.disturbed = True
         elif self.touching:
