@@ -32,7 +32,7 @@ from palpate_models.patient.phantom import build_phantom
 from palpate_models.robot.lbr import urdf
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_tissue.friction import shear_stiffness
+from palpate_tissue.contact import shear_stiffness
 from palpate_validation.probing import STILL
 from research.contact_rig import CONTACT_PATH, CONTROL_PATH, DEPTH_M, scenario, start_posture
 

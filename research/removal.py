@@ -39,7 +39,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "safety net": ("palpate_control.safety",),
     "driver's limits": ("palpate_robot.driver",),
     "arm's kinematics": ("palpate_robot.backends.dart.kinematics",),
-    "tissue's step": ("palpate_tissue.backends.winkler.kernel", "palpate_tissue.friction"),
+    "tissue's step": ("palpate_tissue.backends.winkler.tissue", "palpate_tissue.contact"),
     "rest point's triangles": ("palpate_tissue.surface",),
     "path and its splines": (
         "palpate_planning.strokes.path",

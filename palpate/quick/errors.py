@@ -36,7 +36,7 @@ from palpate_models.scenario.errors import Level, draw_errors, levels
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_models.section import NonNegative, Positive, Section
 from palpate_planning.descent import TARE_S
-from palpate_robot.ft_sensor import FtSensor
+from palpate_robot.sensors import FtSensor
 
 LOOP_SECTIONS: Final = ("camera", "hand_eye", "registration", "arm")
 """Sections of the errors that reach an examination through its loop; the force sensor's are simulated as they are."""

@@ -11,7 +11,7 @@ beside the linear wall: each element is passive, so their sum is (while a is con
 The power of the law is the one with which the pressed wall behaves as living people's (`remus2024`): sigma' as the
 square of the depth reproduces all 48 places within 5 % and both exponents of their force, sigma' as the depth itself does not.
 
-Each tier steps these equations in its own way: the surface tier in `palpate_tissue.backends.winkler.kernel`, the FMU in C.
+Each tier steps these equations in its own way: the surface tier in `palpate_tissue.backends.winkler.tissue`, the FMU in C.
 """
 
 from __future__ import annotations

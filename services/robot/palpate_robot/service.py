@@ -36,9 +36,8 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
-from palpate_robot.ft_sensor import FtSensor
-from palpate_robot.joint_sensor import JointSensor
 from palpate_robot.plant import DT, PlantFactory
+from palpate_robot.sensors import FtSensor, JointSensor
 from palpate_robot.stop_requests import StopRequests
 
 _TICK = round(DT * NS)

@@ -14,9 +14,8 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input
 from palpate_models.scenario.schema import Scenario
 from palpate_robot.backends.lbr.emulator import Emulator, Options
-from palpate_robot.backends.lbr.inner import InnerLoop, load_control
 from palpate_robot.backends.lbr.port import LbrPort
-from palpate_robot.backends.lbr.service import LbrService
+from palpate_robot.backends.lbr.service import InnerLoop, LbrService, load_control
 
 MS = 1_000_000
 

@@ -7,9 +7,9 @@ import pytest
 
 from palpate_bus.messages import codec
 from palpate_models.robot import lbr
-from palpate_robot.backends.lbr import idl
-from palpate_robot.backends.lbr.fri import QUALITY_WINDOW, FriSession
-from palpate_robot.backends.lbr.idl import ConnectionQuality, SessionState
+from palpate_robot.backends.lbr import port
+from palpate_robot.backends.lbr.emulator import QUALITY_WINDOW, FriSession
+from palpate_robot.backends.lbr.port import ConnectionQuality, SessionState
 
 ZERO = np.zeros(7)
 HOME = np.array(lbr.HOME)
@@ -108,13 +108,13 @@ def test_the_position_follows_as_the_stacks_controller_makes_it() -> None:
 
 
 def test_messages_are_the_stacks() -> None:
-    state = codec.store.get_msgdef(idl.STATE)
+    state = codec.store.get_msgdef(port.STATE)
     names = [name for name, _ in state.fields]
     assert names[:3] == ["sample_time", "session_state", "connection_quality"]
     assert len(names) == 18
-    for name in idl.DEFINITIONS:
+    for name in port.DEFINITIONS:
         assert codec.type_hash(name).startswith("RIHS01_")
-    command = idl.LBRTorqueCommand(HOME, np.arange(7.0))
-    raw = codec.encode(command, idl.TORQUE_COMMAND)
+    command = port.LBRTorqueCommand(HOME, np.arange(7.0))
+    raw = codec.encode(command, port.TORQUE_COMMAND)
     assert len(raw) == 4 + 14 * 8
-    assert np.array_equal(codec.decode(raw, idl.TORQUE_COMMAND).torque, np.arange(7.0))
+    assert np.array_equal(codec.decode(raw, port.TORQUE_COMMAND).torque, np.arange(7.0))

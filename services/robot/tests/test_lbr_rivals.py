@@ -15,8 +15,7 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.scenario.schema import LbrConnection
-from palpate_robot.backends.lbr.idl import TORQUE_COMMAND, LBRTorqueCommand
-from palpate_robot.backends.lbr.port import ZenohPort
+from palpate_robot.backends.lbr.port import TORQUE_COMMAND, LBRTorqueCommand, ZenohPort
 from palpate_robot.backends.lbr.service import TAKE_OVER
 
 

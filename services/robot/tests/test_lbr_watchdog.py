@@ -9,7 +9,7 @@ from lbr_bench import MS
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_robot.backends.lbr.emulator import Emulator, Options
-from palpate_robot.backends.lbr.idl import SessionState
+from palpate_robot.backends.lbr.port import SessionState
 from palpate_robot.backends.lbr.watchdog import TIMEOUT_NS, Watchdog
 
 PUSH = np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -12,8 +12,7 @@ import numpy as np
 
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import LbrConnection
-from palpate_robot.backends.lbr.idl import SessionState
-from palpate_robot.backends.lbr.port import ZenohPort
+from palpate_robot.backends.lbr.port import SessionState, ZenohPort
 
 
 def test_states_come_and_commands_move_the_arm(tmp_path: Path) -> None:

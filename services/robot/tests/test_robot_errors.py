@@ -20,9 +20,8 @@ from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.dart.service import create
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.mujoco.plant import MujocoPlant
-from palpate_robot.ft_sensor import FtSensor
-from palpate_robot.joint_sensor import RIPPLES, SETTLING_S, JointSensor
 from palpate_robot.plant import DT, Plant
+from palpate_robot.sensors import RIPPLES, SETTLING_S, FtSensor, JointSensor
 
 QUIET: dict[str, float] = {"noise_n": 0.0, "noise_nm": 0.0, "bias_n": 0.0, "bias_nm": 0.0}
 STILL: dict[str, float] = {"position_noise_rad": 0.0, "velocity_noise_radps": 0.0}

@@ -14,9 +14,8 @@ from scipy.optimize import nnls
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
-from palpate_tissue.backends.elastic.compliance import Compliance, SizeError, compliance
-from palpate_tissue.backends.elastic.contact import ContactSolver
-from palpate_tissue.backends.elastic.kernel import LayerKernel, layer_factor
+from palpate_tissue.backends.elastic.compliance import Compliance, LayerKernel, SizeError, compliance, layer_factor
+from palpate_tissue.backends.elastic.patch import ContactSolver
 from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_tissue.backends.elastic.solid import brick_stiffness, graded_grid, skin_compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue, update_rule

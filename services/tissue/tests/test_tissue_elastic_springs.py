@@ -17,9 +17,8 @@ from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_models.patient.tension import tension_of_ratio
 from palpate_models.patient.wall import MEDIAN
-from palpate_tissue.backends.elastic.compliance import Compliance, compliance
-from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
-from palpate_tissue.backends.elastic.springs import MUSCLE
+from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance, compliance
+from palpate_tissue.backends.elastic.patch import MUSCLE
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 
 STILL = np.zeros(3)

@@ -15,11 +15,9 @@ from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_models.patient.wall import stress
-from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, StabilityError, assemble
-from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_tissue.friction import Push, Sphere, rub, skin
-from palpate_tissue.near import RIM
+from palpate_tissue.backends.winkler.tissue import WinklerTissue, move_freely
+from palpate_tissue.contact import RIM, Push, Sphere, rub, skin
 
 ELASTIC = Stiffness(length_m=0.015, prony_g=(), prony_tau_s=(), friction=0.0)
 STILL = np.zeros(3)
@@ -329,7 +327,7 @@ def test_fields_of_small_and_large_meshes_move_alike():
     moved = []
     for dtype in (np.uint16, np.uint32):
         u = start.copy()
-        kernel.move_freely(wall._replace(u=u, indices=wall.indices.astype(dtype)))
+        move_freely(wall._replace(u=u, indices=wall.indices.astype(dtype)))
         moved.append(u)
     np.testing.assert_array_equal(*moved)
     assert (moved[0] != start).any()

@@ -22,7 +22,7 @@ from palpate_models.scenario.schema import Exam, Scenario
 from palpate_models.section import Pose
 from palpate_tissue.backends.fmu.service import create as create_fmu
 from palpate_tissue.backends.winkler.service import create
-from palpate_tissue.moving.service import MovingBody
+from palpate_tissue.moving import MovingBody
 
 MOVED = (Motion(kind="shift", at_s=0.02, over_s=0.1), Motion(kind="turn", at_s=0.02, over_s=0.1))
 LYING = Exam(pose=Pose(xyz_m=(0.5, 0.1, 0.9), rpy_rad=(0.1, -0.05, 0.4)))

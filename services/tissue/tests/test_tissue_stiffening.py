@@ -11,9 +11,8 @@ import pytest
 from palpate_models.patient import wall
 from palpate_models.patient.phantom import build_phantom, flat_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
-from palpate_tissue.backends.winkler import kernel
 from palpate_tissue.backends.winkler.mechanics import STEP_LIMIT, assemble
-from palpate_tissue.backends.winkler.tissue import WinklerTissue
+from palpate_tissue.backends.winkler.tissue import WinklerTissue, stiffen
 
 STILL = np.zeros(3)
 RADIUS = 0.015
@@ -41,7 +40,7 @@ def test_the_compiled_springs_are_those_of_the_law():
     before = np.where(model.fixed, 0.0, rng.uniform(-0.01, 0.06, len(model.vertices)))  # the spring is straight from 26 mm on
     tissue.displacement[:] = before
     tissue._wall.activation[0] = tissue.activation
-    kernel.stiffen(tissue._wall)
+    stiffen(tissue._wall)
     beside = wall.stress(before, model.stiffening) + 0.7 * model.tension * np.maximum(before, 0.0)
     np.testing.assert_allclose(tissue.displacement, before - tissue.dt / 0.05 * beside, atol=1e-17)
 

@@ -1,22 +1,9 @@
-"""The robot's physics in DART: rigid-body dynamics with joint friction, end stops, and contact with table and base.
-
-DART integrates semi-implicitly at 1 ms: accelerations by articulated bodies with the joint damping taken implicitly, end
-stops and contacts as constraints on the velocity, then positions with the new velocity.
-
-    (M + dt D(v)) a = tau - h(q, v) - D(v) v + J' F,    D(v) = d + f / max(|v|, v_stick),    v += dt a,    q += dt v
-
-with viscous damping d and Coulomb friction f of each joint. So friction, too, is implicit and can neither chatter nor add
-energy. DART's own Coulomb constraint is not used: it stops a joint with the inertia M instead of M + dt D, which makes
-0.1 N m of friction on A7 (5e-4 kg m^2, 10 N m s/rad) stick up to 2.1 N m.
-
-Looking for contacts is more than half of DART's step. While nothing is within reach (`clearance.py`) the step leaves that
-out; the result is the same to the bit.
-"""
+"""How far the arm may move before anything can touch: a bound that is cheap to keep and seldom to be found anew."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,12 +13,42 @@ import numpy as np
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.gravity import GRAVITY
 from palpate_models.robot import lbr
-from palpate_models.robot.table import boxes
+from palpate_models.robot.lbr import Capsule
+from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
-from palpate_robot.backends.dart.clearance import Clearance
 from palpate_robot.backends.dart.kinematics import Kinematics
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM, STICK_RADPS, Wrench
+
+REACH_M: Final = 1.5
+"""No point of arm and tool is further than this from any joint's axis, so it moves slower than this times sum |v|."""
+
+
+class Clearance:
+    """Bounds from below how far capsules on links are from boxes, and joints from their stops."""
+
+    def __init__(
+        self, links: Mapping[str, Any], capsules: Mapping[str, tuple[Capsule, ...]], boxes: tuple[Box, ...], stop: Array
+    ):
+        """DART bodies and capsules by link, the boxes, and the positions of the joints' stops [rad], shape (7,)."""
+        pairs = [(links[name], capsule) for name, parts in capsules.items() for capsule in parts]
+        self._bodies = [body for body, _ in pairs]
+        ends = np.array([(capsule.start, capsule.end) for _, capsule in pairs])
+        self._ends: Array = np.concatenate((ends, np.ones((*ends.shape[:2], 1))), axis=2)  # (n, 2, 4)
+        self._radii = np.array([capsule.radius for _, capsule in pairs])
+        self._X_BW = np.array([np.linalg.inv(box.X_WB) for box in boxes])
+        self._half = np.array([box.size for box in boxes]) / 2
+        self._stop = stop
+
+    def angle(self, q: Array) -> float:
+        """Sum of |angles| [rad] that the joints, now at `q`, may turn before a stop or a box can be reached; may be negative."""
+        X_WL = np.array([body.getWorldTransform().matrix() for body in self._bodies])
+        ends_W = self._ends @ X_WL.transpose(0, 2, 1)
+        ends_B = np.einsum("bij,nkj->bnki", self._X_BW, ends_W)[..., :3]
+        gap = np.maximum(ends_B.min(axis=2), -ends_B.max(axis=2)) - self._half[:, None, :]  # the boxes of capsules, axis by axis
+        distance = np.linalg.norm(np.maximum(gap, 0.0), axis=2) - self._radii
+        return min(float(distance.min()) / REACH_M, float((self._stop - np.abs(q)).min()))
+
 
 LEAST_CLEARANCE_RAD: Final = 0.01
 """Closer than this, in angle, DART looks for contacts: far more than a step turns."""

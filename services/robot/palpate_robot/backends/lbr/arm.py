@@ -12,7 +12,7 @@ from palpate_bus.contract import contract
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
-from palpate_robot.backends.lbr.idl import ClientCommandMode, ConnectionQuality, SafetyState, SessionState
+from palpate_robot.backends.lbr.port import ClientCommandMode, ConnectionQuality, SafetyState, SessionState
 
 VELOCITY_LAG_S: Final = 0.004
 """Time constant of the low-pass on the differentiated position: LBRState carries no velocity. It keeps the encoder's steps

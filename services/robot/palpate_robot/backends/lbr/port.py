@@ -1,15 +1,107 @@
-"""What the driver exchanges with the ROS side: the stack's topics, the F/T sensor's, and the emulator's."""
+"""The messages of `lbr_fri_idl` (branch fri-1, FRI 1.11 to 1.16) and the values of FRI's enumerations.
+
+Field names and types are those of the ROS package, so that type hash and CDR are the same.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from enum import IntEnum
 from typing import Any
 
+from rosbags.typesys import get_types_from_msg
+
+from palpate_bus.messages import codec
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import LbrConnection
-from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand
+
+_STATE = """\
+float64 sample_time
+int8 session_state
+int8 connection_quality
+int8 safety_state
+int8 operation_mode
+int8 drive_state
+int8 client_command_mode
+int8 overlay_type
+int8 control_mode
+uint32 time_stamp_sec
+uint32 time_stamp_nano_sec
+float64[7] measured_joint_position
+float64[7] commanded_joint_position
+float64[7] measured_torque
+float64[7] commanded_torque
+float64[7] external_torque
+float64[7] ipo_joint_position
+float64 tracking_performance
+"""
+STATE = "lbr_fri_idl/msg/LBRState"
+TORQUE_COMMAND = "lbr_fri_idl/msg/LBRTorqueCommand"
+DEFINITIONS = {STATE: _STATE, TORQUE_COMMAND: "float64[7] joint_position\nfloat64[7] torque\n"}
+
+
+def register() -> None:
+    """Makes the messages known to the codec; further calls do nothing."""
+    if STATE in codec.store.types:
+        return
+    types: dict[str, Any] = {}
+    for name, text in DEFINITIONS.items():
+        types.update(get_types_from_msg(text, name))
+    codec.store.register(types)
+
+
+register()
+LBRState: Any = codec.message_type(STATE)
+LBRTorqueCommand: Any = codec.message_type(TORQUE_COMMAND)
+
+
+class SessionState(IntEnum):
+    """KUKA::FRI::ESessionState."""
+
+    IDLE = 0
+    MONITORING_WAIT = 1
+    MONITORING_READY = 2
+    COMMANDING_WAIT = 3
+    COMMANDING_ACTIVE = 4
+
+
+class ConnectionQuality(IntEnum):
+    """KUKA::FRI::EConnectionQuality."""
+
+    POOR = 0
+    FAIR = 1
+    GOOD = 2
+    EXCELLENT = 3
+
+
+class SafetyState(IntEnum):
+    """KUKA::FRI::ESafetyState."""
+
+    NORMAL_OPERATION = 0
+    SAFETY_STOP_LEVEL_0 = 1
+    SAFETY_STOP_LEVEL_1 = 2
+    SAFETY_STOP_LEVEL_2 = 3
+
+
+class ClientCommandMode(IntEnum):
+    """KUKA::FRI::EClientCommandMode."""
+
+    NO_COMMAND_MODE = 0
+    POSITION = 1
+    WRENCH = 2
+    TORQUE = 3
+
+
+class FriControlMode(IntEnum):
+    """KUKA::FRI::EControlMode."""
+
+    POSITION_CONTROL_MODE = 0
+    CART_IMP_CONTROL_MODE = 1
+    JOINT_IMP_CONTROL_MODE = 2
+    NO_CONTROL = 3
+
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 TOOL_STATE = "palpation_msgs/msg/ToolState"

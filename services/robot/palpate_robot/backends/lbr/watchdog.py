@@ -26,7 +26,7 @@ from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import LbrConnection
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm
-from palpate_robot.backends.lbr.idl import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
+from palpate_robot.backends.lbr.port import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
 
 log = logging.getLogger("watchdog")
 

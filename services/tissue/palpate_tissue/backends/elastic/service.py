@@ -12,7 +12,7 @@ from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.elastic.compliance import PITCH_M, SizeError, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
-from palpate_tissue.moving.service import carried
+from palpate_tissue.moving import carried
 from palpate_tissue.service import TissueService
 
 

@@ -18,9 +18,8 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
-from palpate_tissue.backends.elastic.compliance import POISSON, Compliance, compliance
-from palpate_tissue.backends.elastic.contact import ContactSolver
-from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
+from palpate_tissue.backends.elastic.compliance import POISSON, YOUNG_OVER_K_W, Compliance, compliance
+from palpate_tissue.backends.elastic.patch import ContactSolver
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 
 Profile = Literal["sphere", "paraboloid"]

@@ -24,14 +24,10 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue import friction
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.backends.elastic.compliance import Compliance
-from palpate_tissue.backends.elastic.modulus import YOUNG_OVER_K_W
-from palpate_tissue.backends.elastic.patch import ElasticPatch, SprungPatch
-from palpate_tissue.backends.elastic.springs import MUSCLE, VertexSprings
-from palpate_tissue.friction import Sphere, rub
-from palpate_tissue.near import VertexSearch
+from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance
+from palpate_tissue.backends.elastic.patch import MUSCLE, ElasticPatch, SprungPatch, VertexSprings
+from palpate_tissue.contact import Sphere, VertexSearch, rub, skin
 
 _MARGIN_M = 0.0025
 """The vertices near the sphere are searched anew when it has moved this far."""
@@ -80,7 +76,7 @@ class ElasticTissue(TissueBackend):
         stiffness = stiffness or Stiffness()
         super().__init__(model, breathing, dt)
         self.compliance = compliance
-        self.friction = friction.skin(stiffness.friction, model.background)
+        self.friction = skin(stiffness.friction, model.background)
         self.disturbed = False
         """Whether anything has ever moved."""
         self._prony_g, self._stiffness = stiffness.prony_g, stiffness

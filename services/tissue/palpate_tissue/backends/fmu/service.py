@@ -26,7 +26,7 @@ from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.wiring import Wiring
-from palpate_tissue.moving.service import carried
+from palpate_tissue.moving import carried
 
 _log = logging.getLogger("palpate.tissue")
 

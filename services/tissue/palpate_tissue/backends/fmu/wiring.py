@@ -1,21 +1,187 @@
-"""A map tied to an FMU and to the contract: checked once, then arrays move between messages and ports."""
+"""Units of the contract and of FMUs, compared and converted by their SI base units."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from palpate_bus.contract import Contract, Topic
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages.codec import Message, message_type, store
+from palpate_bus.messages.stamps import header
 from palpate_fmu.instance import FmuInstance, FmuVariable, Port
 from palpate_models.numerics.frames import Array, inverse
-from palpate_tissue.backends.fmu.fields import Make, maker, reader, size
 from palpate_tissue.backends.fmu.mapping import FmuMap, FrameChange, InputEntry, MapError, OutputEntry, _Entry
-from palpate_tissue.backends.fmu.units import fmu_unit, parse_unit
+
+BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+_NAMED: dict[str, tuple[float, dict[str, int]]] = {
+    "1": (1.0, {}),
+    **{base: (1.0, {base: 1}) for base in BASES},
+    "N": (1.0, {"kg": 1, "m": 1, "s": -2}),
+    "J": (1.0, {"kg": 1, "m": 2, "s": -2}),
+    "W": (1.0, {"kg": 1, "m": 2, "s": -3}),
+    "Pa": (1.0, {"kg": 1, "m": -1, "s": -2}),
+    "V": (1.0, {"kg": 1, "m": 2, "s": -3, "A": -1}),
+    "Hz": (1.0, {"s": -1}),
+    "ms": (1e-3, {"s": 1}),
+    "ns": (1e-9, {"s": 1}),
+    "mm": (1e-3, {"m": 1}),
+    "deg": (0.017453292519943295, {"rad": 1}),
+}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """value [SI] = factor * value + offset."""
+
+    exponents: tuple[int, ...]
+    """The exponent of each unit in `BASES`."""
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def to(self, other: Unit) -> tuple[float, float]:
+        """Factor and offset that convert a value in this unit to `other`."""
+        return self.factor / other.factor, (self.offset - other.offset) / other.factor
+
+
+def parse_unit(text: str) -> Unit:
+    """A unit of the contract: `m`, `N m`, `N/m^3`, `kg m/s^2`. Raises ValueError if it is none."""
+    exponents = dict.fromkeys(BASES, 0)
+    factor = 1.0
+    over, _, under = text.partition("/")
+    for part, sign in ((over, 1), (under, -1)):
+        for word in part.replace(".", " ").replace("*", " ").split():
+            name, _, power = word.partition("^")
+            if name not in _NAMED:
+                raise ValueError(f"unit {text!r}: {name!r} is not known")
+            own, bases = _NAMED[name]
+            count = sign * int(power or 1)
+            factor *= own**count
+            for base, exponent in bases.items():
+                exponents[base] += count * exponent
+    return Unit(tuple(exponents.values()), factor)
+
+
+def fmu_unit(name: str, description: Any) -> Unit | None:
+    """A unit as the FMU defines it; by its name where it gives no base units; None if neither says anything."""
+    for definition in description.unitDefinitions:
+        base = definition.baseUnit
+        if definition.name == name and base is not None:
+            return Unit(tuple(getattr(base, item) for item in BASES), base.factor, base.offset)
+    try:
+        return parse_unit(name)
+    except ValueError:
+        return None
+
+
+Values = Mapping[str, Any]
+"""What a message is filled with, by path: an array, a number or a text."""
+Make = Callable[[int, Values], Any]
+
+_HEADER = "std_msgs/msg/Header"
+_NAME, _ARRAY, _SEQUENCE = 2, 3, 4
+
+
+def _fields(name: str) -> list[tuple[str, Any]]:
+    return list(store.get_msgdef(name).fields)
+
+
+def _triple(name: str) -> list[str] | None:
+    """The fields of a message that is nothing but numbers."""
+    fields = _fields(name)
+    if fields and all(int(kind) == 1 and detail[0] not in ("string", "wstring") for _, (kind, detail) in fields):
+        return [field for field, _ in fields]
+    return None
+
+
+def describe(name: str, path: str) -> Any:
+    """The type of a field of a message type. Raises MapError if there is none."""
+    here: Any = (_NAME, name)
+    for part in path.split("."):
+        found = dict(_fields(here[1])) if int(here[0]) == _NAME else {}
+        if part not in found:
+            raise MapError(f"{name} has no field {path!r}: at {part!r} there is {', '.join(found) or 'nothing more'}")
+        here = found[part]
+    return here
+
+
+def size(name: str, path: str) -> int | None:
+    """How many numbers a field holds; None for an array of any length. Raises MapError if it holds none."""
+    kind, detail = describe(name, path)
+    if int(kind) == _NAME:
+        members = _triple(detail)
+        if members is None:
+            raise MapError(f"{name}: field {path!r} is of the type {detail}, which is more than numbers")
+        return len(members)
+    if int(kind) == _SEQUENCE:
+        return None
+    return int(detail[1]) if int(kind) == _ARRAY else 1
+
+
+def reader(name: str, path: str) -> Callable[[Message], ArrayLike]:
+    """A function that gives the numbers of a field of a message."""
+    kind, detail = describe(name, path)
+    get = attrgetter(path)
+    members = _triple(detail) if int(kind) == _NAME else None
+    if members is None:
+        return get
+    inner = attrgetter(*(f"{path}.{member}" for member in members))
+    return lambda message: np.array(inner(message))
+
+
+def _cast(base: str) -> Callable[[Any], Any]:
+    if base == "string":
+        return str
+    if base == "bool":
+        return bool
+    return float if base.startswith("float") else int
+
+
+def maker(name: str, frame: str, filled: frozenset[str], prefix: str = "") -> Make:
+    """A function of (t [ns], values by path) that makes a message; fields that are not in `filled` are zero or empty.
+
+    Headers are stamped t, in `frame`.
+    """
+    if name == _HEADER:
+        return lambda t, _: header(t, frame)
+    cls = message_type(name)
+    members = _triple(name)
+    if prefix and prefix[:-1] in filled and members is not None:
+        path = prefix[:-1]
+        return lambda _, values: cls(*np.asarray(values[path]).ravel().tolist())
+    makes = tuple(_field_maker(kind, detail, frame, filled, prefix + field) for field, (kind, detail) in _fields(name))
+    return lambda t, values: cls(*(make(t, values) for make in makes))
+
+
+def _field_maker(kind: Any, detail: Any, frame: str, filled: frozenset[str], path: str) -> Make:
+    if int(kind) == _NAME:
+        return maker(detail, frame, filled, f"{path}.")
+    if int(kind) in (_ARRAY, _SEQUENCE):
+        return _array_maker(detail, path if path in filled else None, int(kind) == _ARRAY)
+    cast = _cast(detail[0])
+    if path not in filled:
+        blank = cast(0) if cast is not str else ""
+        return lambda _t, _values: blank
+    if cast is str:
+        return lambda _, values: str(values[path])
+    return lambda _, values: cast(np.asarray(values[path]).ravel()[0])
+
+
+def _array_maker(detail: Any, path: str | None, fixed: bool) -> Make:
+    """Numbers in an array; empty or zero without a path. Arrays of messages stay empty."""
+    (inner, item), extent = detail
+    if int(inner) != 1 or item[0] == "string":
+        return lambda _t, _values: []
+    dtype = np.dtype(item[0])
+    if path is None:
+        empty = np.zeros(extent if fixed else 0, dtype=dtype)
+        return lambda _t, _values: empty
+    return lambda _, values: np.ascontiguousarray(np.asarray(values[path], dtype=dtype).ravel())
+
 
 Change = Callable[[Any], Any]
 

@@ -25,9 +25,8 @@ from palpate_models.patient.guarding import Activation
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_models.scenario import press
-from palpate_tissue.backends.winkler.implicit import implicit_wall
-from palpate_tissue.backends.winkler.implicit_kernel import ImplicitWall, Stride, sweep, unbalanced
-from palpate_tissue.near import RIM
+from palpate_tissue.backends.winkler.implicit import ImplicitWall, Stride, implicit_wall, sweep, unbalanced
+from palpate_tissue.contact import RIM
 
 ENDS_S: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.75, press.DURATION_S - 0.5 * press.READ_S)
 """Ends of the steps, from the touch [s]: at full depth, where the force is greatest, and last in the middle of the reading."""

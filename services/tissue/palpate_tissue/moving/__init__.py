@@ -1,1 +1,0 @@
-"""A patient who moves: a service that carries any tissue service along."""
