@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SUFFIXES = {".py", ".md", ".msg", ".yaml", ".yml", ".j2"}
 PHRASES = {
     "write 'continue' or 'resume'": r"\b(go|goes|gone|going|went) on\b",
-    "name the quantity ('this distance', 'up to N')": r"\b[Ss]o ((much|many|long|often|near)\b(?! (as|that)\b)|far (from|below|above|off)\b)",
+    "name the quantity": r"\b[Ss]o ((much|many|long|often|near)\b(?! (as|that)\b)|far (from|below|above|off)\b)",
     "write 'is not a'": r"(?<!\b[Tt]here )\b(is|are) no (?!(longer|more|less|other|match)\b)[a-z]+",
     "write 'current', 'previous', 'recent'": r"\bof (now|then|before|late)\b",
     "write 'during'": r"\bin mid-\w+",
