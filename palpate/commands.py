@@ -55,7 +55,7 @@ GROUPS = {
         "reproduce": "palpate_reproduction.command:reproduce",
     },
     "Maintain": {
-        "bench": "palpate_benchmarks.bench_command:bench",
+        "bench": "palpate_benchmarks.bench:bench",
         "faults": "palpate_benchmarks.campaign_command:faults",
         "fuzz": "palpate.fuzz.command:fuzz",
     },

@@ -1,7 +1,6 @@
-"""`palpate bench`: what the parts (the bus is one) and whole runs cost, as a table and as bench.json.
+"""`palpate bench`: the cost of the parts and of whole runs, as tables and as bench.json.
 
-Machines differ and are noisy, so what counts are ratios within one call: simulated over wall time, our bus over raw zenoh, the
-parts of a tick.
+Machines differ and are noisy; compare ratios within one call: simulated over wall time, and the parts of a tick.
 """
 
 from __future__ import annotations
@@ -9,26 +8,96 @@ from __future__ import annotations
 import json
 import platform
 import tempfile
+import time
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
 from palpate.case_display import CaseDisplay
-from palpate.report.files import write_text
-from palpate.report.platforms import fingerprint
-from palpate.run.composed import run_composed
-from palpate.run.distributed import run_distributed
-from palpate.run.placement import placement
-from palpate.run.roles import OBSERVERS, workers
-from palpate_conductor.result import RunResult
-from palpate_models.scenario.schema import Scenario
+from palpate.command_line import output_file
+from palpate.run.options import DEFAULT_SCENARIO, Settings
+
+if TYPE_CHECKING:
+    from palpate_conductor.result import RunResult
+    from palpate_models.scenario.schema import Scenario
+
+GROUPS = ("parts", "runs")
+WIDTH = 160
+"""Columns of the tables where the terminal has fewer, or the output is not a terminal."""
 
 
-def _figures(result: RunResult) -> dict[str, Any]:
+def bench(
+    scenario: Annotated[str, typer.Argument(help="The examination to time.")] = DEFAULT_SCENARIO,
+    out: Annotated[Path, output_file("Output file.", "--out", "-o")] = Path("bench.json"),
+    only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(GROUPS)}; may be repeated. All by default.")] = None,
+    settings: Settings = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only.")] = False,
+) -> None:
+    """Measure the speed of the parts and of whole runs; print tables and write bench.json."""
+    for group in only or ():
+        if group not in GROUPS:
+            raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
+    from palpate.run.inputs import usable
+
+    screen, console = Console(stderr=True), Console(width=max(WIDTH, Console().width))
+    chosen = usable(scenario, settings)
+    with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:
+        figures = measure(chosen, display, only or GROUPS, out)
+    for table in tables(figures):
+        console.print(table)
+    console.print(f"{platform.platform()}, written to {out}", highlight=False)
+
+
+def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], out: Path) -> dict[str, Any]:
+    """Return the figures of the chosen groups; `out` is written after each, so that an interrupted call leaves a part."""
+    from palpate.report.files import write_text
+    from palpate.report.platforms import fingerprint
+
+    figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
+    cases: list[tuple[str, str, Callable[[], dict[str, Any]]]] = []
+    if "parts" in groups:
+        cases += [("parts", name, part) for name, part in PARTS.items()]
+    if "runs" in groups:
+        cases += [("runs", name, run) for name, run in run_cases(scenario).items()]
+    for done, (group, name, case) in enumerate(cases):
+        display.tell(done, len(cases), name)
+        figures[group][name] = case()
+        write_text(out, json.dumps(figures, indent=2))
+    return figures
+
+
+def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:
+    """Return the ways to run the scenario: composed; distributed, with the 1 kHz loop in one process, and with observers."""
+    from palpate.run.composed import run_composed
+    from palpate.run.distributed import run_distributed
+    from palpate.run.placement import placement
+    from palpate.run.roles import OBSERVERS, workers
+
+    loop = ["robot,tissue,control"]
+
+    def distributed(observers: tuple[str, ...], together: Sequence[str]) -> Callable[[], dict[str, Any]]:
+        groups = placement((*workers(scenario), *observers), together, None)
+        return lambda: _figures(lambda out: run_distributed(scenario, out, lambda _: None, observers, groups=groups))
+
+    return {
+        "composed": lambda: _figures(lambda out: run_composed(scenario, out, lambda _: None, ())),
+        "distributed": distributed((), ()),
+        "1 kHz loop in one process": distributed((), loop),
+        "distributed, recorder and viewer": distributed(OBSERVERS, ()),
+        "1 kHz loop in one process, recorder and viewer": distributed(OBSERVERS, loop),
+    }
+
+
+def _figures(run: Callable[[Path], RunResult]) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
+        result = run(Path(folder))
+    if result.interrupted:
+        raise KeyboardInterrupt
     return {
         "sim_time_s": result.sim_time_s,
         "wall_time_s": result.wall_time_s,
@@ -40,71 +109,68 @@ def _figures(result: RunResult) -> dict[str, Any]:
     }
 
 
-PARTS = {
-    "codec": "palpate_benchmarks.codec",
-    "fmu": "palpate_benchmarks.fmu",
-    "tissue": "palpate_benchmarks.tissue",
-    "tissue, elastic": "palpate_benchmarks.elastic",
-}
-"""The modules that measure the parts; each has a function `measure()`."""
+def codec_cost(repeats: int = 2000) -> dict[str, float]:
+    """Return the median time to encode and to decode a joint state [us]."""
+    from palpate_bus.messages import JointState, codec
+    from palpate_bus.messages.stamps import header
 
-
-Save = Callable[[dict[str, Any]], None]
-
-
-def _distributed(scenario: Scenario) -> dict[str, Callable[[Path], RunResult]]:
-    """Runs of services on processes: one process each, and the loop at 1 kHz in one process; without observers and with them."""
-    loop = ["robot,tissue,control"]
-
-    def runs(observers: tuple[str, ...], together: Sequence[str]) -> Callable[[Path], RunResult]:
-        groups = placement((*workers(scenario), *observers), together, None)
-        return lambda out: run_distributed(scenario, out, lambda _: None, observers, groups=groups)
-
+    kind, values = "sensor_msgs/msg/JointState", np.arange(7.0)
+    message = JointState(header(1), [f"lbr_A{i}" for i in range(1, 8)], values, values, values)
+    encode, decode = codec.encoder(kind), codec.decoder(kind)
+    payload = encode(message)
     return {
-        "distributed": runs((), ()),
-        "1 kHz loop in one process": runs((), loop),
-        "distributed, recorder and viewer": runs(OBSERVERS, ()),
-        "1 kHz loop in one process, recorder and viewer": runs(OBSERVERS, loop),
+        "encode_us": _median_us(lambda _: encode(message), repeats),
+        "decode_us": _median_us(lambda _: decode(payload), repeats),
     }
 
 
-def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], save: Save) -> dict[str, Any]:
-    """The figures of some groups (see `bench_command.GROUPS`), by name.
+def tissue_cost(tier: str, steps: int = 2000) -> dict[str, float]:
+    """Return the median cost of a step [us] of a tissue tier, `surface` or `elastic`.
 
-    `save` gets what there is after each: an interrupted call leaves its part.
+    The indenter, 15 mm in radius, slides over the default abdomen at 30 mm/s and 10 mm depth.
     """
-    figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
-    parts = PARTS if "parts" in groups else {}
-    cases = {"composed": lambda out: run_composed(scenario, out, lambda _: None, ()), **_distributed(scenario)}
-    names = list(cases) if "runs" in groups else []
-    total = len(parts) + len(names)
-    for done, (part, module) in enumerate(parts.items()):
-        display.tell(done, total, f"{part}: cost of a step")
-        figures["parts"][part] = import_module(module).measure()
-        save(figures)
-    for done, name in enumerate(names, len(parts)):
-        display.tell(done, total, f"{scenario.name}, {name}")
-        with tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
-            result = cases[name](Path(folder))
-        if result.interrupted:
-            raise KeyboardInterrupt
-        figures["runs"][name] = _figures(result)
-        save(figures)
-    return figures
+    from palpate_models.patient.phantom import build_phantom
+    from palpate_models.patient.schema import Phantom
+    from palpate_tissue.backend import TissueBackend
+    from palpate_tissue.backends.elastic.compliance import compliance
+    from palpate_tissue.backends.elastic.tissue import ElasticTissue
+    from palpate_tissue.backends.winkler.tissue import WinklerTissue
+    from palpate_tissue.surface import SkinSurface
+
+    radius_m, depth_m, velocity, phantom = 0.015, 0.010, np.array((0.03, 0.0, 0.0)), Phantom()
+    model = build_phantom(phantom, seed=0)
+    surface = SkinSurface(model)
+    body: TissueBackend = (
+        WinklerTissue(model, phantom.stiffness)
+        if tier == "surface"
+        else ElasticTissue(model, compliance(model, ()), phantom.stiffness)
+    )
+    under = [surface.nearest(np.array((-0.03, 0.01, 0.0)) + velocity * body.dt * k) for k in range(steps)]
+    path = [place.position + (radius_m - depth_m) * place.normal for place in under]
+    cost = _median_us(lambda k: body.step(k * body.dt, path[k], velocity, radius_m, np.zeros(3)), steps)
+    return {"vertices": len(model.vertices), "contacts": len(body.contacts), "step_us": cost}
+
+
+def _median_us(call: Callable[[int], object], repeats: int) -> float:
+    costs = np.empty(repeats)
+    for k in range(repeats):
+        begin = time.perf_counter_ns()
+        call(k)
+        costs[k] = time.perf_counter_ns() - begin
+    return float(np.median(costs)) / 1e3
+
+
+PARTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "codec": codec_cost,
+    "tissue": lambda: tissue_cost("surface"),
+    "tissue, elastic": lambda: tissue_cost("elastic"),
+}
 
 
 def tables(figures: dict[str, Any]) -> list[Table]:
-    """The figures as tables."""
-    runs = Table(
-        "run",
-        "sim [s]",
-        "wall [s]",
-        "real-time factor",
-        "to first tick [s]",
-        "run hash",
-        title="Whole examinations",
-        title_justify="left",
-    )
+    """Return the figures as tables."""
+    columns = ("run", "sim [s]", "wall [s]", "real-time factor", "to first tick [s]", "run hash")
+    runs = Table(*columns, title="Whole examinations", title_justify="left")
     for name, run in figures["runs"].items():
         runs.add_row(
             name,
@@ -115,28 +181,14 @@ def tables(figures: dict[str, Any]) -> list[Table]:
             (run["run_hash"] or run["failure"] or "")[:12],
         )
     columns = ("compute", "decode", "encode", "send", "transport", "wait")
-    blame = Table("run", "service", *columns, "waits most for", title="Blame: mean wall time a step [us]", title_justify="left")
+    blame = Table("run", "service", *columns, "waits most for", title="Mean wall time of a step [us]", title_justify="left")
     for name, run in figures["runs"].items():
         for role, row in run["blame"].items():
             if row:
                 most = next(iter(row["waited_for"]), "")
                 blame.add_row(name, role, *(f"{row[column]:.0f}" for column in columns), most)
-    small = Table("what", "figure", "value", title="Parts", title_justify="left")
+    parts = Table("part", "figure", "value", title="Parts", title_justify="left")
     for group, values in figures["parts"].items():
         for figure, value in values.items():
-            small.add_row(group, figure, f"{value:.4g}" if isinstance(value, int | float) else str(value))
-    return [table for table in (runs, blame, small) if table.row_count]
-
-
-def bench(scenario: Scenario, out: Path, console: Console, groups: Sequence[str], quiet: bool = False) -> None:
-    """Measures, prints the tables and writes bench.json; shows on a terminal how far it is, unless `quiet`."""
-
-    def save(figures: dict[str, Any]) -> None:
-        write_text(out, json.dumps(figures, indent=2))
-
-    screen = Console(stderr=True)
-    with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:
-        figures = measure(scenario, display, groups, save)
-    for table in tables(figures):
-        console.print(table)
-    console.print(f"{platform.platform()}, written to {out}", highlight=False)
+            parts.add_row(group, figure, f"{value:.4g}")
+    return [table for table in (runs, blame, parts) if table.row_count]

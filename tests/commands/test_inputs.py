@@ -21,7 +21,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     monkeypatch.setattr(subprocess, "run", started)
     monkeypatch.setattr(subprocess, "Popen", started)
-    monkeypatch.setattr("palpate_benchmarks.bench.bench", started)
+    monkeypatch.setattr("palpate_benchmarks.bench.measure", started)
     monkeypatch.chdir(tmp_path)
 
 

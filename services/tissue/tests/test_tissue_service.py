@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_benchmarks import tissue as bench
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
@@ -230,13 +229,6 @@ def test_normals_of_a_dent_are_those_of_the_mesh():
     normals = SkinSurface(model).normals(inward).T
     angle = np.degrees(np.arccos(np.clip((normals * mesh).sum(axis=1), -1, 1)))
     assert angle[near].max() < 2
-
-
-def test_bench_measures_a_step_in_contact():
-    result = bench.measure(steps=50)
-    assert result["vertices"] > 2700
-    assert result["contacts"] > 5
-    assert result["step_us_p50"] > 0
 
 
 def test_a_process_that_stood_still_moves_the_tool_as_fast_as_it_went() -> None:
