@@ -65,13 +65,13 @@ EXTRAS = {
     "dashboard": "dashboard",
     "fmu": "fmu",
     "study": "study",
-    "validate": "benchmarks",
-    "reproduce": "benchmarks",
-    "bench": "benchmarks",
-    "faults": "benchmarks",
-    "fuzz": "fuzz",
+    "validate": "bench",
+    "reproduce": "bench",
+    "bench": "bench",
+    "faults": "bench",
+    "fuzz": "bench",
 }
-"""What installs the libraries of a command that the default examination does not need."""
+"""Extras of the commands that need more than `run`."""
 MARGIN = 1
 """Columns that Typer leaves free on each side of a command's help."""
 INDENT = "  "

@@ -1,4 +1,4 @@
-"""Each extra of pyproject.toml names the libraries that its role imports: no fewer, or its install would not run, and no more."""
+"""Extras and dependency groups of pyproject.toml name exactly the libraries that their modules import."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import requires
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
@@ -18,64 +19,62 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
-ROOMS: dict[str, Path] = {
+GROUPS: dict[str, list[Any]] = PROJECT["dependency-groups"]
+PACKAGES: dict[str, Path] = {
     Path(path).name: ROOT / path for path in PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
 }
 BARE = ""
-"""No extra: what palpate depends on in any case."""
+"""No extra: the dependencies of palpate itself."""
 
-EXTRA_OF = {
+NEEDS = {
     "palpate": "run",
-    "palpate.__init__": "study",  # names of the interface, which are imported when they are asked for
-    "palpate.command_line": "cli",
+    "palpate.__init__": "study",  # lazily imported names of the library
     "palpate.interface": "library",
     "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
-    "palpate.live.dashboard": "all",  # the command line on what the dashboard draws
-    "palpate.live.viewing": "all",
-    "palpate.fuzz": "fuzz",
+    "palpate.live.dashboard": "dashboard",
+    "palpate.live.viewing": "dashboard",
+    "palpate.fuzz": "bench",
     "palpate.search": "library",
     "palpate.search.curves": "study",
-    "palpate.search.environment": "learn-env",
     "palpate.search.learn": "learn",
-    "palpate.search.speed": "learn-env",
     "palpate.search.whole": "study",
     "palpate.study": "study",
     "palpate_bus": BARE,
-    "palpate_bus.recordings": "recordings",
-    "palpate_bus.security.keys": "secure",
-    "palpate_bus.testing.strategies": "fuzz",
-    "palpate_models": "models",
-    "palpate_planning.placement.redundancy": "planning",
-    "palpate_planning.placement.inverse_kinematics": "planning",
-    "palpate_planning.placement.symbolic": "planning",
-    "palpate_robot": "models",  # what its backends share
-    "palpate_robot.backends.dart": "robot",
-    "palpate_robot.backends.mujoco": "robot-mujoco",
-    "palpate_robot.backends.lbr": "robot-lbr",
-    "palpate_robot.backends.lbr.emulator": "all",
-    "palpate_tissue": "tissue",
-    "palpate_tissue.backends.elastic": "tissue-elastic",
-    "palpate_tissue.backends.fmu": "tissue-fmu",
-    "palpate_camera": "models",  # what its backends share
-    "palpate_camera.backends.kinect": "camera",
-    "palpate_camera.backends.replay": "camera-replay",
-    "palpate_camera.backends.ros": "camera-ros",
-    "palpate_perception": "perception",
-    "palpate_planning": "planning",
-    "palpate_control": "control",
-    "palpate_assessment": "assessment",
-    "palpate_supervisor": "supervisor",
-    "palpate_conductor": "conductor",
-    "palpate_recorder": "recorder",
-    "palpate_search": "search",
-    "palpate_dashboard": "dashboard",
-    "palpate_fmu": "fmu",
-    "palpate_benchmarks": "benchmarks",
-    "palpate_validation": "benchmarks",
-    "palpate_reproduction": "benchmarks",
+    "palpate_bus.recordings": "recordings group",
+    "palpate_bus.security.keys": "conductor group",
+    "palpate_bus.testing.strategies": "bench",
+    "palpate_errors": BARE,
+    "palpate_plugins": BARE,
+    "palpate_models": "models group",
+    "palpate_planning.placement": "planning group",
+    "palpate_robot": "models group",  # modules that its backends share
+    "palpate_robot.backends.dart": "robot group",
+    "palpate_robot.backends.mujoco": "robot-mujoco group",
+    "palpate_robot.backends.lbr": "robot-lbr group",
+    "palpate_robot.backends.lbr.emulator": "run",
+    "palpate_tissue": "tissue group",
+    "palpate_tissue.backends.elastic": "tissue-elastic group",
+    "palpate_tissue.backends.fmu": "tissue-fmu group",
+    "palpate_camera": "models group",  # modules that its backends share
+    "palpate_camera.backends.kinect": "camera group",
+    "palpate_camera.backends.replay": "camera-replay group",
+    "palpate_camera.backends.ros": "camera-ros group",
+    "palpate_perception": "perception group",
+    "palpate_planning": "planning group",
+    "palpate_control": "control group",
+    "palpate_assessment": "assessment group",
+    "palpate_supervisor": "supervisor group",
+    "palpate_conductor": "conductor group",
+    "palpate_recorder": "recorder group",
+    "palpate_search": "search group",
+    "palpate_dashboard": "dashboard group",
+    "palpate_fmu": "tissue-fmu group",
+    "palpate_benchmarks": "bench",
+    "palpate_validation": "bench",
+    "palpate_reproduction": "bench",
 }
-"""The extra that a package or module needs; the longest name that fits counts."""
+"""The extra, or the group of an image, that a package or module needs. The longest matching name counts."""
 DISTRIBUTION = {
     "PIL": "pillow",
     "libusb_package": "libusb-package",
@@ -91,31 +90,55 @@ DISTRIBUTION = {
     "yaml": "pyyaml",
     "zenoh": "eclipse-zenoh",
 }
-"""Distributions whose name is not that of what is imported."""
+"""Distributions by the name of the import, where it differs."""
 OPTIONAL = {"zenoh_ros2_sdk"}
-"""Looked for with find_spec before they are imported: a fuzzer and a client to compare with, in no extra."""
-WHEN_ASKED_FOR = {"playwright": "picture", "palpate_robot.plant.Plant": "robot"}
-"""Imported by one function alone, which only those call who have the extra that is named here."""
+"""Imported only if find_spec finds it; in no extra."""
+ON_DEMAND = {"playwright": "dashboard", "palpate_robot.plant.Plant": "run"}
+"""Imports of a single function, and the extra that its callers need."""
 NOT_IMPORTED = {"bokeh", "ziglang"}
-"""Run as a program, or by another library: Dask draws its dashboard with bokeh."""
+"""Run as a program, or imported by another library: Dask's dashboard uses bokeh."""
 
 
-def extra_of(module: str) -> str:
-    """The extra of a module or of a name in one."""
+def need_of(module: str) -> str:
+    """Return the extra or group of a module or of a name in one."""
     parts = module.split(".")
-    return next(EXTRA_OF[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in EXTRA_OF)
+    return next(NEEDS[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in NEEDS)
 
 
-def own_lines(extra: str) -> set[str]:
-    """Distributions that an extra names itself."""
-    lines = PROJECT["project"]["dependencies"] if extra == BARE else EXTRAS[extra]
-    return {re.split(r"[<>=]", line)[0] for line in lines if not line.startswith("palpate[")}
+def lines(name: str) -> list[Any]:
+    """Return the lines of an extra, of a group ("robot group"), or of the project's dependencies."""
+    if name == BARE:
+        dependencies: list[Any] = PROJECT["project"]["dependencies"]
+        return dependencies
+    return GROUPS[name.removesuffix(" group")] if name.endswith(" group") else EXTRAS[name]
 
 
-def with_named(extra: str) -> set[str]:
-    """An extra and those that it names, theirs too, and what is installed in any case."""
-    named = [inner for line in EXTRAS.get(extra, ()) if line.startswith("palpate[") for inner in line[8:-1].split(",")]
-    return {extra, BARE}.union(*map(with_named, named))
+def direct(name: str) -> set[str]:
+    """Return the distributions that an extra or group names itself."""
+    return {re.split(r"[<>=]", line)[0] for line in lines(name) if isinstance(line, str) and not line.startswith("palpate[")}
+
+
+def included(name: str) -> set[str]:
+    """Return an extra or group with those that it includes, directly or not."""
+    inner: list[str] = []
+    for line in lines(name):
+        if isinstance(line, dict):
+            inner.append(f"{line['include-group']} group")
+        elif line.startswith("palpate["):
+            inner += line[8:-1].split(",")
+    return {name, BARE}.union(*map(included, inner))
+
+
+def extra_with(name: str) -> str:
+    """Return the extra that installs the libraries of a group."""
+    if not name.endswith(" group"):
+        return name
+    return {"robot-mujoco": "mujoco", "tissue-fmu": "fmu", "dashboard": "dashboard"}.get(name.removesuffix(" group"), "run")
+
+
+def libraries(name: str) -> set[str]:
+    """Return the distributions that an extra or group installs."""
+    return set().union(*map(direct, included(name)))
 
 
 def imported(tree: ast.Module) -> Iterator[str]:
@@ -131,40 +154,51 @@ def imported(tree: ast.Module) -> Iterator[str]:
 
 @cache
 def needs() -> list[tuple[str, str, str]]:
-    """(the importing file, its extra, what it imports) for everything beyond the standard library."""
+    """Return (importing file, its extra or group, imported name) for everything outside the standard library."""
     found = []
-    for package, folder in ROOMS.items():
+    for package, folder in PACKAGES.items():
         for path in sorted(folder.rglob("*.py")):
             module = ".".join((package, *path.relative_to(folder).with_suffix("").parts))
             for name in set(imported(ast.parse(path.read_text(encoding="utf-8")))):
                 top = name.partition(".")[0]
                 if top not in sys.stdlib_module_names | OPTIONAL:
-                    needing = next((WHEN_ASKED_FOR[key] for key in (top, name) if key in WHEN_ASKED_FOR), extra_of(module))
+                    needing = next((ON_DEMAND[key] for key in (top, name) if key in ON_DEMAND), need_of(module))
                     found.append((str(path.relative_to(ROOT)), needing, name))
     return found
 
 
-@pytest.mark.parametrize("extra", sorted(set(EXTRA_OF.values())))
-def test_an_extra_has_what_its_role_imports(extra: str) -> None:
-    installed = with_named(extra)
-    libraries = set().union(*map(own_lines, installed))
+@pytest.mark.parametrize("need", sorted(set(NEEDS.values())))
+def test_imports_are_installed(need: str) -> None:
+    installed = libraries(need)
     for where, needing, name in needs():
-        if needing == extra:
+        if needing == need:
             top = name.partition(".")[0]
-            if top in ROOMS:
-                assert extra_of(name) in installed, f"{where} imports {name}, which needs palpate[{extra_of(name)}]"
+            if top in PACKAGES:
+                missing = libraries(need_of(name)) - installed
+                assert not missing, f"{where} imports {name}, which needs {missing}; {need} does not install it"
             else:
-                assert DISTRIBUTION.get(top, top) in libraries, f"{where} imports {top}, which palpate[{extra}] does not install"
+                assert DISTRIBUTION.get(top, top) in installed, f"{where} imports {top}, which {need} does not install"
 
 
-@pytest.mark.parametrize("extra", [BARE, *(name for name in EXTRAS if own_lines(name))])
-def test_an_extra_has_nothing_that_nothing_imports(extra: str) -> None:
-    used = {name.partition(".")[0] for _, needing, name in needs() if extra in with_named(needing)}
-    assert own_lines(extra) <= {DISTRIBUTION.get(name, name) for name in used} | NOT_IMPORTED
+@pytest.mark.parametrize("name", [name for name in [BARE, *EXTRAS, *(f"{g} group" for g in GROUPS)] if direct(name)])
+def test_nothing_is_installed_that_nothing_imports(name: str) -> None:
+    image = [extra_with(name)] if name == "conductor group" else []  # its image has the command line
+    used = {
+        word.partition(".")[0]
+        for _, need, word in needs()
+        if need in image or name in included(need) | included(extra_with(need))
+    }
+    assert direct(name) <= {DISTRIBUTION.get(one, one) for one in used} | NOT_IMPORTED
 
 
 def test_all_is_all_but_torch() -> None:
-    assert with_named("all") == {*EXTRAS, BARE} - {"learn"}
+    assert included("all") == {*EXTRAS, BARE} - {"learn"}
+
+
+@pytest.mark.parametrize("name", sorted(GROUPS))
+def test_images_install_nothing_that_no_extra_does(name: str) -> None:
+    group = f"{name} group"
+    assert libraries(group) <= libraries(extra_with(group))
 
 
 def with_required(distributions: set[str]) -> set[str]:
@@ -184,9 +218,9 @@ def test_the_conductors_image_has_all_that_its_command_imports() -> None:
     done = subprocess.run(
         [sys.executable, "-c", words, "palpate.run.conducting"], capture_output=True, text=True, check=True, timeout=120
     )
-    has = with_required(set().union(*map(own_lines, with_named("conductor"))))
-    tops = {name.partition(".")[0] for name in done.stdout.split()} - ROOMS.keys()
+    has = with_required(libraries("conductor group"))
+    tops = {name.partition(".")[0] for name in done.stdout.split()} - PACKAGES.keys()
     named = {DISTRIBUTION.get(top, top) for top in tops}
-    others = set().union(*(own_lines(extra) for extra in EXTRAS)) - has
+    others = set().union(*map(direct, EXTRAS)) - has
     assert "mcap" in others
-    assert not named & others, f"palpate[conductor] does not install {', '.join(sorted(named & others))}"
+    assert not named & others, f"the conductor's image does not install {', '.join(sorted(named & others))}"

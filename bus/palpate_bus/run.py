@@ -23,7 +23,7 @@ from typing import Any, Protocol
 import zenoh
 
 from palpate_bus.contract import MS, Role, contract
-from palpate_bus.implementations import ChoiceError, create
+from palpate_bus.implementations import create
 from palpate_bus.runtime.collection import rare_collections
 from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.distributed import LockstepNode
@@ -36,6 +36,7 @@ from palpate_bus.service import Service
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
+from palpate_plugins import PluginError
 
 EXIT_FAILED = 3
 
@@ -92,7 +93,7 @@ def main(role: str, load: Callable[[str], NamesServices]) -> None:
 
 
 def chosen(role: str, load: Callable[[str], NamesServices], words: Sequence[str] = ()) -> Service:
-    """The service of `role` that the first word names, or else the scenario. Raises BusConfigError, ChoiceError."""
+    """The service of `role` that the first word names, or else the scenario. Raises BusConfigError, PluginError."""
     scenario = load(str(Settings.read().required("scenario", "want a scenario file, as `palpate prepare` writes it")))
     return create(role, words[0] if words else getattr(scenario.services, role, "default"), scenario)
 
@@ -135,7 +136,7 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         status = EXIT_FAILED
     except KeyboardInterrupt:
         status = EXIT_FAILED
-    except (BusConfigError, ChoiceError) as error:
+    except (BusConfigError, PluginError) as error:
         log.error("%s", error)
         status = EXIT_FAILED
     except Exception:

@@ -40,9 +40,9 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.check.suites.tissue import STILL
     from palpate.live.connection import refusing
     from palpate.live.console import EXIT_TROUBLE, print_json
-    from palpate_bus.implementations import ChoiceError
     from palpate_bus.runs.joining import NoBus
     from palpate_models.scenario.load import ScenarioError, load_scenario
+    from palpate_plugins import PluginError
 
     with refusing():
         if role not in SUITES:
@@ -50,7 +50,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
         try:
             settings = RigSettings(load_scenario(scenario, STILL), 1e3 * slack, motion or role != "robot" or service is not None)
             report = None if service is None else check_here(role, service, settings)
-        except (ScenarioError, ChoiceError) as error:
+        except (ScenarioError, PluginError) as error:
             refuse(error)
         if report is None:
             report = check_live(role, settings, connect, listen, start, domain, wait)

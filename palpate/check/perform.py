@@ -20,7 +20,7 @@ _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED
 
 
 def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceReport:
-    """Checks an implementation in this process, in simulated time. Raises ChoiceError for one that there is not."""
+    """Checks an implementation in this process, in simulated time. Raises PluginError for one that there is not."""
     rig, report = ServiceRig(implementations.create(role, choice, settings.scenario), settings), ConformanceReport(role)
     with CheckDisplay(rig, report):
         return check(rig, report)

@@ -139,7 +139,7 @@ def assess(touches: Touch | Iterable[Touch]) -> Assessment:
     ------
     ValueError
         There are no touches, or they are of several patients.
-    ChoiceError
+    PluginError
         The scenario's assessment cannot be made.
 
     Examples

@@ -154,7 +154,7 @@ def run(
 
     Raises
     ------
-    ScenarioError, MeshError, ChoiceError
+    ScenarioError, MeshError, PluginError
         As `palpate.scenario` does, before anything starts.
     ExaminationError
         There are no results: the folder cannot take them, for instance.

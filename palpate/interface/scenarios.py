@@ -37,7 +37,7 @@ def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int |
         Names file, field, value and what is allowed.
     MeshError
         The phantom cannot be made.
-    ChoiceError
+    PluginError
         There is no such service.
 
     Examples

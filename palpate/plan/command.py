@@ -37,7 +37,7 @@ def plan(
     from palpate.plan.prospect import NoPathError, draw, prospect, summary
     from palpate.run.inputs import usable
     from palpate_models.patient.phantom import build_phantom
-    from palpate_models.scenario.named_function import PatternError
+    from palpate_plugins import PluginError
 
     chosen = usable(scenario, settings, seed)
     try:
@@ -45,7 +45,7 @@ def plan(
             phantom = build_phantom(chosen.phantom, chosen.seed)
             planned = prospect(chosen, phantom)
             draw(out, chosen, phantom, planned)
-    except (NoPathError, PatternError, OSError) as error:
+    except (NoPathError, PluginError, OSError) as error:
         refuse(error)
     console = Console()
     console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)

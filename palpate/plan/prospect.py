@@ -47,7 +47,7 @@ class Prospect:
 
 
 def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
-    """Plans on the true rest surface, as registered. Raises PatternError, and NoPathError when no target is in reach."""
+    """Plans on the true rest surface, as registered. Raises PluginError, and NoPathError when no target is in reach."""
     scan = scan_over(scenario, phantom)
     known = exam_input(scenario)
     X_WA = np.array(known.X_WA)

@@ -49,7 +49,7 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
     """Examines the patient of a scenario without arm and bus, with the errors that whole examinations have.
 
     `errors`: distributions of its loop; None for those of loop.yaml. `drawn` as in `Loop`. Raises UnknownLoopError where it has
-    none, NoTissueError for a tissue of which there is no copy, ChoiceError for an assessment that cannot be made.
+    none, NoTissueError for a tissue of which there is no copy, PluginError for an assessment that cannot be made.
     """
     begin, clock = process_time(), perf_counter()
     gathered = examined(scenario, errors, drawn)

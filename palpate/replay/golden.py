@@ -21,13 +21,13 @@ from palpate.replay.compare import Tolerance, TopicResult, compare
 from palpate.replay.rerun import rerun
 from palpate_bus import implementations
 from palpate_bus.contract import MS, Contract, Topic, contract
-from palpate_bus.implementations import ChoiceError
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds, time_message
 from palpate_bus.recordings import SCENARIO, RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Service
 from palpate_models.scenario.load import load_scenario, view_of
 from palpate_models.scenario.schema import Scenario
+from palpate_plugins import PluginError
 
 DROPPED_BITS = np.int64(~((1 << 29) - 1))
 """Keeps 23 of the 52 fraction bits of a double, and so 24 significant ones."""
@@ -139,14 +139,14 @@ class GoldenCase:
 def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase:
     """Opens a recording and makes the service `choice`: ROLE as the scenario has it, or ROLE=NAME_OR_FILE.
 
-    The scenario is `scenario`, else the recording's own, else the one beside it. Raises RecordingError, ChoiceError or
+    The scenario is `scenario`, else the recording's own, else the one beside it. Raises RecordingError, PluginError or
     ScenarioError.
     """
     rules = contract()
     role, _, name = choice.partition("=")
     workers = [row.name for row in rules.roles.values() if not row.observer and row.name != "conductor"]
     if role not in workers:
-        raise ChoiceError(f"--service {choice}: no service {role!r}; services are {', '.join(workers)}")
+        raise PluginError(f"--service {choice}: no service {role!r}; services are {', '.join(workers)}")
     if name:
         implementations.check(role, name)
     recording = open_recording(path)

@@ -18,11 +18,11 @@ from palpate.replay.golden import GoldenCase, make_reference, prepare, replay_se
 from palpate.replay.play import Player, PlayError
 from palpate.time_left import TimeLeft
 from palpate_bus.contract import contract
-from palpate_bus.implementations import ChoiceError
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_bus.settings import BusConfigError
 from palpate_models.scenario.load import ScenarioError
+from palpate_plugins import PluginError
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def write_reference(file: Path, service: str, scenario: Path | None, part: Passa
         case = prepare(file, service, scenario)
         end = part.end(case.end)
         make_reference(case, target, part.start, case.end if end is None else end)
-    except (RecordingError, ChoiceError, ScenarioError, OSError) as error:
+    except (RecordingError, PluginError, ScenarioError, OSError) as error:
         refuse(error)
     Console(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
 
@@ -96,7 +96,7 @@ def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[s
         allowed = parse_tolerance(tolerance)
         with TimeLeft(f"running {case.role} again", 0, case.end) as bar:
             results = replay_service(case, allowed, bar.reach)
-    except (RecordingError, ChoiceError, ScenarioError, OSError) as error:
+    except (RecordingError, PluginError, ScenarioError, OSError) as error:
         refuse(error)
     if as_json:
         print(json.dumps({name: as_dict(result) for name, result in results.items()}, indent=2))
@@ -107,22 +107,22 @@ def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[s
 
 
 def parse_tolerance(words: list[str]) -> Tolerance:
-    """`--tolerance` options. Raises ChoiceError that names the one that cannot be."""
+    """`--tolerance` options. Raises PluginError that names the one that cannot be."""
     relative, absolute = RELATIVE, {}
     for word in words:
         name, _, number = word.rpartition("=")
         try:
             value = float(number)
         except ValueError:
-            raise ChoiceError(f"--tolerance {word}: want a number, or TOPIC:FIELD=NUMBER") from None
+            raise PluginError(f"--tolerance {word}: want a number, or TOPIC:FIELD=NUMBER") from None
         if not value >= 0:
-            raise ChoiceError(f"--tolerance {word}: want at least 0")
+            raise PluginError(f"--tolerance {word}: want at least 0")
         if not name:
             relative = value
             continue
         topic = name.partition(":")[0]
         if topic not in contract().topics:
-            raise ChoiceError(f"--tolerance {word}: the contract has no topic {topic!r}")
+            raise PluginError(f"--tolerance {word}: the contract has no topic {topic!r}")
         absolute[name] = value
     return Tolerance(relative, absolute)
 

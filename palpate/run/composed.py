@@ -27,13 +27,13 @@ from palpate_models.scenario.schema import Scenario
 def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
     """The services of `roles` in this process, as the scenario chooses them.
 
-    Raises ChoiceError for one that there is not, or that lacks its libraries.
+    Raises PluginError for one that there is not, or that lacks its libraries.
     """
     return [create(role, choice(scenario, role), seen(scenario, view_of(role))) for role in roles]
 
 
 def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
-    """Runs all services in this process. Raises ChoiceError for a service that cannot be made."""
+    """Runs all services in this process. Raises PluginError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
     collector = Collector(tree=FrameTree(exam_input(scenario)))

@@ -38,7 +38,7 @@ def run_distributed(
 
     The user starts the roles of `absent`; `groups` are the roles of each process, by default one each.
 
-    Raises ProcessListError when the compose file cannot be used, ChoiceError when a service cannot, PlacementError when it cannot
+    Raises ProcessListError when the compose file cannot be used, PluginError when a service cannot, PlacementError when it cannot
     share a process, BusConfigError when the certificates cannot; later failures are in the result.
     """
     begin = perf_counter()
@@ -95,7 +95,7 @@ def run_distributed(
 
 
 def _check(process: ServiceProcess, scenario: Scenario) -> None:
-    """Raises ChoiceError when what plays a role cannot be started here. A program that is none of ours is not looked at."""
+    """Raises PluginError when what plays a role cannot be started here. A program that is none of ours is not looked at."""
     if process.words is not None:
         name = process.words[0] if process.words else choice(scenario, process.role)
         implementations.check(process.role, name)

@@ -32,13 +32,14 @@ from palpate.run.repeat import repeat, run_to_its_end
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
-from palpate_bus.implementations import ChoiceError, check_libraries
+from palpate_bus.implementations import check_libraries
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_conductor.outcome import RunFailed
 from palpate_conductor.result import RunResult, Tell
 from palpate_conductor.timing import Timing
 from palpate_models.scenario.schema import Scenario
+from palpate_plugins import PluginError
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def _dashboard_lacks(scenario: Scenario) -> str:
     """What keeps the dashboard from drawing, and what to install; empty where nothing does."""
     try:
         check_libraries("dashboard", choice(scenario, "dashboard"))
-    except ChoiceError as error:
+    except PluginError as error:
         return str(error).partition(": ")[2]
     return ""
 
@@ -122,7 +123,7 @@ def examine(scenario: Scenario, how: How, before: Resumption | None = None) -> N
                 if before is not None:
                     result = replace(result, run_hash=None, earlier=before.earlier)
             conclude(console, folder, scenario, result, quiet, how.as_json)
-    except (ProcessListError, ChoiceError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
+    except (ProcessListError, PluginError, PlaceError, PlacementError, BusConfigError, KeysError, FolderError, OSError) as error:
         refuse(error)
     except RunFailed as error:
         fail(error)

@@ -10,13 +10,12 @@ import numpy as np
 from palpate.command_line import refuse
 from palpate.run.roles import NONE, checked, settings_of
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate_bus.implementations import ChoiceError
 from palpate_models.patient.mesh import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.load import ScenarioError, load_scenario
-from palpate_models.scenario.named_function import PatternError, is_file
 from palpate_models.scenario.patterns import Scan, scan_of
 from palpate_models.scenario.schema import Scenario
+from palpate_plugins import PluginError, is_file
 
 
 def surface_of(phantom: PhantomModel) -> TrueSurface:
@@ -25,7 +24,7 @@ def surface_of(phantom: PhantomModel) -> TrueSurface:
 
 
 def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
-    """The scan of the scenario's pattern. Raises PatternError for one that cannot be used, and for a region off the body."""
+    """The scan of the scenario's pattern. Raises PluginError for one that cannot be used, and for a region off the body."""
     surface = surface_of(phantom)
     scan = scan_of(scenario.exam, surface.points)
     off = ~np.isfinite(surface.height(scan.targets))
@@ -33,7 +32,7 @@ def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
         exam = scenario.exam
         (left, feet), (right, head) = (edge(phantom.vertices[:, :2], axis=0) for edge in (np.min, np.max))
         x, y = scan.targets[off][0]
-        raise PatternError(
+        raise PluginError(
             f"{scenario.name}: exam.region_m = {exam.region_m}, exam.centre_m = {exam.centre_m}: {off.sum()} of {len(off)} "
             f"targets lie off the body, the first at ({x:.3f}, {y:.3f}) m; the body reaches from x = {left:.2f} to {right:.2f} m "
             f"and from y = {feet:.2f} to {head:.2f} m"
@@ -66,15 +65,15 @@ def usable(
         return examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
     except MeshError as error:
         refuse(f"{name}: {error}")
-    except (ScenarioError, PatternError, ChoiceError) as error:
+    except (ScenarioError, PluginError) as error:
         refuse(error)
 
 
 def examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
     """The scenario, after its phantom could be made and its services were found, unless they run `elsewhere`.
 
-    Raises MeshError for a phantom that cannot be made, PatternError for a scan that cannot be made or leaves the body,
-    ChoiceError for a service that there is not.
+    Raises MeshError for a phantom that cannot be made, PluginError for a scan that cannot be made or leaves the body,
+    PluginError for a service that there is not.
     """
     scenario = with_whole_path(scenario)
     if scenario.services.tissue != NONE:

@@ -20,12 +20,12 @@ import typer
 from palpate.command_line import refuse
 from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.joining import NoBus, named_runs
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.handover import ROLES
 from palpate_errors import UserError
+from palpate_plugins import PluginError, is_file
 
 FILE = "places.json"
 """In the results folder of a run."""
@@ -125,11 +125,11 @@ def place_to_take(role: str, run: Run) -> ServicePlace:
 
 
 def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[str, ...]:
-    """The words that start the process: those of the run, or those of the chosen implementation. Raises ChoiceError."""
+    """The words that start the process: those of the run, or those of the chosen implementation. Raises PluginError."""
     if service is None:
         return place.command
     implementations.check(role, service)
-    word = str(Path(service).resolve()) if implementations.is_file(service) else service
+    word = str(Path(service).resolve()) if is_file(service) else service
     return ("python", "-m", f"palpate_{role}", word)
 
 
@@ -144,7 +144,7 @@ def enter(find: Callable[[str, Run], ServicePlace], role: str, service: str | No
     try:
         place = find(role, named_runs(run)[-1])
         command = command_for(role, place, service)
-    except (NoBus, PlaceError, ChoiceError) as error:
+    except (NoBus, PlaceError, PluginError) as error:
         refuse(error)
     become(command, place.environment)
 

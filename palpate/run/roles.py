@@ -10,13 +10,13 @@ from zipfile import ZipFile, is_zipfile
 from palpate.run.options import Record
 from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.run_name import name_run
 from palpate_bus.settings import Settings
 from palpate_models.scenario.explain import did_you_mean
 from palpate_models.scenario.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario.schema import Scenario, Services
-from palpate_search.choice import PolicyError, findable
+from palpate_plugins import PluginError, is_file
+from palpate_search.choice import policy
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
 WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or role.optional))
@@ -46,13 +46,13 @@ def choice(scenario: Scenario, role: str) -> str:
 
 
 def settings_of(options: Sequence[str]) -> list[str]:
-    """What `--service ROLE=NAME_OR_FILE` is short for. Raises ChoiceError for an option that names no role."""
+    """What `--service ROLE=NAME_OR_FILE` is short for. Raises PluginError for an option that names no role."""
     settings = []
     for option in options:
         role, equals, name = option.partition("=")
         if not equals or role not in _ROLES:
             roles = f"{', '.join(_ROLES)}{did_you_mean(role, _ROLES)}"
-            raise ChoiceError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {roles}")
+            raise PluginError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {roles}")
         settings.append(f"services.{role}={json.dumps(name)}")
     return settings
 
@@ -60,39 +60,41 @@ def settings_of(options: Sequence[str]) -> list[str]:
 def checked(scenario: Scenario) -> Scenario:
     """The scenario with files of your own by their absolute path, after all its choices were found to exist.
 
-    Raises ChoiceError that names the scenario, the field, its value and what is allowed.
+    Raises PluginError that names the scenario, the field, its value and what is allowed.
     """
     services = {role: choice(scenario, role) for role in _ROLES}
     for role in scenario.services.model_extra or {}:
         if role not in _ROLES:
             known = f"it has {', '.join(_ROLES)}{did_you_mean(role, _ROLES)}"
-            raise ChoiceError(f"{scenario.name}: services.{role}: the contract has no such role; {known}")
+            raise PluginError(f"{scenario.name}: services.{role}: the contract has no such role; {known}")
     for role, name in services.items():
         if (role, name) == ("tissue", NONE) or (name == "default" and _ROLES[role].optional and role not in workers(scenario)):
             continue
         try:
             implementations.check(role, name)
-        except ChoiceError as error:
-            raise ChoiceError(f"{scenario.name}: {error}") from error
-        if implementations.is_file(name):
+        except PluginError as error:
+            raise PluginError(f"{scenario.name}: {error}") from error
+        if is_file(name):
             services[role] = str(Path(name).resolve())
     _check_fmu(scenario)
     search = scenario.search
     if scenario.exam.searched:
         try:
-            search = search.model_copy(update={"policy": findable(search.policy)})
-        except PolicyError as error:
-            raise ChoiceError(f"{scenario.name}: {error}") from error
+            policy(search.policy)
+        except PluginError as error:
+            raise PluginError(f"{scenario.name}: {error}") from error
+        if is_file(search.policy):
+            search = search.model_copy(update={"policy": str(Path(search.policy).resolve())})
     return scenario.model_copy(update={"services": Services.model_validate(services), "search": search})
 
 
 def _check_fmu(scenario: Scenario) -> None:
-    """Raises ChoiceError for an FMU, or a map of its variables, that is not there, or a file that is no FMU."""
+    """Raises PluginError for an FMU, or a map of its variables, that is not there, or a file that is no FMU."""
     for field, given in (("fmu", scenario.tissue.fmu), ("fmu_map", scenario.tissue.fmu_map)):
         if given and not Path(given).is_file():
-            raise ChoiceError(f"{scenario.name}: tissue.{field} = {given!r}: there is no such file")
+            raise PluginError(f"{scenario.name}: tissue.{field} = {given!r}: there is no such file")
     if (given := scenario.tissue.fmu) and not _is_fmu(Path(given)):
-        raise ChoiceError(
+        raise PluginError(
             f"{scenario.name}: tissue.fmu = {given!r}: this is not an FMU, which is a zip archive with modelDescription.xml in it"
         )
 

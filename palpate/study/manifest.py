@@ -16,13 +16,13 @@ from typing import Any, Final, NamedTuple
 
 from palpate.run.roles import checked
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
-from palpate_bus.implementations import ChoiceError, is_file
 from palpate_models.patient.mesh import MeshError
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.errors import Errors
 from palpate_models.scenario.load import ScenarioError, as_settings, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Section
+from palpate_plugins import PluginError, is_file
 
 ID_DIGITS: Final = 16
 TUNE_SEEDS: Final = 1000
@@ -193,7 +193,7 @@ def _usable(where: str, scenario: Scenario) -> Scenario:
     try:
         build_phantom(scenario.phantom, scenario.seed)
         return checked(scenario)
-    except (ChoiceError, MeshError) as error:
+    except (PluginError, MeshError) as error:
         raise StudyError(f"{where}: {error}") from error
 
 

@@ -25,9 +25,9 @@ from palpate.study.shards import Shard, merge
 from palpate.study.spec import Method, Study, StudyError, checked_study, load_study, study_names, with_methods
 from palpate.study.statistics.reading import TablesError
 from palpate.study.workers import Workers, WorkersError, cluster, cores, threads
-from palpate_bus.implementations import ChoiceError
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
+from palpate_plugins import PluginError
 
 TOLD = 10
 """Cases that did not complete that are told one by one."""
@@ -75,7 +75,7 @@ def run_study(order: StudyOrder) -> None:
         folder = order.out or usual_folder(study.name, order.split)
         command = command_of(order.name, request, order.methods or (), order.services or ())
         manifest = opened(folder, study.name, cases, command, order.keep)
-    except (StudyError, ChoiceError, OSError) as error:
+    except (StudyError, PluginError, OSError) as error:
         refuse(error)
     own = part.part(cases) if part else cases
     count = order.workers or cores()
@@ -107,7 +107,7 @@ def print_scenario(case: Path) -> None:
 
 
 def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | None) -> Study:
-    """The study with the methods that are asked for. Raises StudyError or ChoiceError."""
+    """The study with the methods that are asked for. Raises StudyError or PluginError."""
     methods: dict[str, Any] = {name: method.model_dump(mode="json") for name, method in study.methods.items()}
     if services:
         settings_of(services)

@@ -19,8 +19,8 @@ from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import COMMANDS, app_for, main
 from palpate.reference import walked
 from palpate.run import examine
-from palpate_bus.implementations import ChoiceError
 from palpate_models.scenario.load import load_scenario
+from palpate_plugins import PluginError
 
 
 def names(word: str) -> set[str]:
@@ -89,7 +89,7 @@ def test_a_command_that_lacks_its_libraries_names_what_to_install(monkeypatch: p
 
 def test_a_run_does_without_the_dashboard_where_its_libraries_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     def lacking(role: str, choice: str) -> None:
-        raise ChoiceError(f"services.{role} = {choice!r}: the module rerun is not installed; pip install 'palpate[dashboard]'")
+        raise PluginError(f"services.{role} = {choice!r}: the module rerun is not installed; pip install 'palpate[dashboard]'")
 
     how = examine.How(None, False, True, (), None, False, False, 0.0, (), 1.0, "normal", False, None, False, False, None)
     assert examine._observers(load_scenario("clean"), how) == ("dashboard", "recorder")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from palpate.run.places import Absent, PlaceError, ServicePlace, command_for, place_to_join, place_to_take, write_places
-from palpate_bus.implementations import ChoiceError
 from palpate_bus.runs.announcement import Run
+from palpate_plugins import PluginError
 
 ENVIRONMENT = {"PALPATE_LISTEN": "unixsock-stream//tmp/x/control.sock", "PALPATE_SCENARIO": "/out/exam.yaml"}
 COMMAND = ("python", "-m", "palpate_control")
@@ -54,9 +54,9 @@ def test_only_a_failure_for_want_of_an_answer_is_explained(tmp_path: Path) -> No
 def test_unknown_roles_and_implementations_are_answered_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(PlaceError, match="--without arm: allowed are robot"):
         Absent(("arm",), 1.0, print)
-    with pytest.raises(ChoiceError, match=r"services\.robot = 'bullet': want one of dart"):
+    with pytest.raises(PluginError, match=r"services\.robot = 'bullet': want one of dart"):
         command_for("robot", PLACE, "bullet")
-    with pytest.raises(ChoiceError, match="no such file"):
+    with pytest.raises(PluginError, match="no such file"):
         command_for("robot", PLACE, str(tmp_path / "mine.py"))
 
 

@@ -15,7 +15,7 @@ from palpate.commands import app_for
 from palpate.run.inputs import scan_over
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import load_scenario, scenario_names
-from palpate_models.scenario.named_function import PatternError
+from palpate_plugins import PluginError
 
 SPIRAL = Path(__file__).parents[2] / "docs" / "examples" / "spiral.py"
 
@@ -29,7 +29,7 @@ def test_the_region_of_every_scenario_is_on_the_body(name: str) -> None:
 def test_a_region_off_the_body_is_refused_with_where_the_body_is() -> None:
     scenario = load_scenario("clean", ["exam.centre_m=[0.3, 0.0]"])
     with pytest.raises(
-        PatternError, match=r"clean: exam\.region_m = .* targets lie off the body, the first at .* body reaches from"
+        PluginError, match=r"clean: exam\.region_m = .* targets lie off the body, the first at .* body reaches from"
     ):
         scan_over(scenario, build_phantom(scenario.phantom, scenario.seed))
 

@@ -83,7 +83,7 @@ def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs
         assert choice(checked(load_scenario("healthy", words)), role) == chosen
         processes = read_processes(compose_file(), (role,), (file,))
         assert processes[role].command == ("python", "-m", f"palpate_{role}"), "which goes by the scenario"
-        assert service["build"]["args"]["EXTRA"] == name
+        assert service["build"]["args"]["GROUP"] == name
         assert service["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
 
 

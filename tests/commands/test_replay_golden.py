@@ -13,8 +13,8 @@ from palpate.replay.command import replay
 from palpate.replay.compare import Tolerance
 from palpate.replay.golden import prepare, replay_service
 from palpate_bus.contract import contract
-from palpate_bus.implementations import ChoiceError
 from palpate_bus.recordings import RecordingError, open_recording
+from palpate_plugins import PluginError
 
 REFERENCES = Path(__file__).parent / "references"
 CHANGED = Path(__file__).parent
@@ -120,5 +120,5 @@ def test_a_recording_with_another_definition_is_refused_with_both_hashes(tmp_pat
 
 
 def test_only_services_are_run_again() -> None:
-    with pytest.raises(ChoiceError, match="dashboard"):
+    with pytest.raises(PluginError, match="dashboard"):
         prepare(REFERENCES / "control.mcap", "dashboard")

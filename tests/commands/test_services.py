@@ -8,16 +8,17 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+import palpate_plugins
 from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
 from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
-from palpate_bus import implementations
-from palpate_bus.implementations import ChoiceError, check, check_libraries, create, create_for, names
+from palpate_bus.implementations import check, check_libraries, create, create_for, names
 from palpate_bus.runtime.failure import described
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario, Services
+from palpate_plugins import PluginError
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "threshold_assessment.py"
 
@@ -38,14 +39,14 @@ def test_every_role_has_a_choice_and_its_default_is_installed() -> None:
 
 @pytest.mark.parametrize("option", ["assessment", "nobody=a.py", "conductor=a.py"])
 def test_a_role_that_is_none_is_named(option: str) -> None:
-    with pytest.raises(ChoiceError, match=rf"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of robot, tissue"):
+    with pytest.raises(PluginError, match=rf"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of robot, tissue"):
         settings_of([option])
 
 
 def test_a_name_that_is_none_is_refused_with_scenario_field_value_and_what_is_allowed() -> None:
-    with pytest.raises(ChoiceError, match=r"healthy: services\.robot = 'bullet': want one of dart, lbr, mujoco, or the path"):
+    with pytest.raises(PluginError, match=r"healthy: services\.robot = 'bullet': want one of dart, lbr, mujoco, or the path"):
         chosen("robot=bullet")
-    with pytest.raises(ChoiceError, match=r"services\.robot = 'none'"):
+    with pytest.raises(PluginError, match=r"services\.robot = 'none'"):
         chosen("robot=none")
     assert chosen("tissue=none").services.tissue == "none"
 
@@ -64,7 +65,7 @@ def test_a_file_that_is_no_service_is_refused(tmp_path: Path, text: str | None, 
     file = tmp_path / "mine.py"
     if text is not None:
         file.write_text(text)
-    with pytest.raises(ChoiceError, match=said):
+    with pytest.raises(PluginError, match=said):
         chosen(f"assessment={file}")
 
 
@@ -78,7 +79,7 @@ def test_a_file_that_is_no_service_is_refused(tmp_path: Path, text: str | None, 
 def test_what_goes_wrong_in_a_file_is_told_with_its_line(tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "mine.py"
     file.write_text(text)
-    with pytest.raises(ChoiceError, match=said):
+    with pytest.raises(PluginError, match=said):
         load_services(chosen(f"assessment={file}"), ("assessment",))
 
 
@@ -139,7 +140,7 @@ def test_a_file_may_import_what_is_beside_it(tmp_path: Path) -> None:
 
 
 def test_a_service_of_another_role_is_refused() -> None:
-    with pytest.raises(ChoiceError, match=r"makes a service of the role 'assessment'"):
+    with pytest.raises(PluginError, match=r"makes a service of the role 'assessment'"):
         create("planning", str(EXAMPLE), load_scenario("healthy"))
 
 
@@ -151,11 +152,11 @@ def test_a_missing_library_is_named_with_the_extra_to_install(monkeypatch: pytes
         raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
 
     check_libraries("robot", "mujoco")
-    monkeypatch.setattr(implementations, "distribution", absent)
+    monkeypatch.setattr(palpate_plugins, "distribution", absent)
     monkeypatch.setattr("importlib.metadata.EntryPoint.load", fails)
     check("robot", "mujoco")
-    said = r"services\.robot = 'mujoco': the module mujoco is not installed; pip install 'palpate\[robot-mujoco\]'"
-    with pytest.raises(ChoiceError, match=said):
+    said = r"services\.robot = 'mujoco': the module mujoco is not installed; pip install 'palpate\[mujoco\]'"
+    with pytest.raises(PluginError, match=said):
         check_libraries("robot", "mujoco")
-    with pytest.raises(ChoiceError, match=said):
+    with pytest.raises(PluginError, match=said):
         create_for("robot", "mujoco")

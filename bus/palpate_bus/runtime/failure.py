@@ -8,9 +8,9 @@ from traceback import walk_tb
 from typing import Any
 
 from palpate_bus.contract.conformance import Checker
-from palpate_bus.implementations import OWN
 from palpate_bus.messages.codec import CodecError, Message
 from palpate_bus.runtime.lockstep import InputBuffer, Packet
+from palpate_plugins import USER_MODULE
 
 
 def described(error: BaseException, buffers: Iterable[InputBuffer]) -> str:
@@ -30,7 +30,7 @@ def _own_line(error: BaseException) -> str:
 
 
 def _is_own(names: Mapping[str, Any]) -> bool:
-    return str(names.get("__name__", "")).startswith(OWN)
+    return str(names.get("__name__", "")).startswith(USER_MODULE)
 
 
 def invalid_inputs(buffers: Iterable[InputBuffer]) -> list[str]:

@@ -4,7 +4,7 @@
     <folder>/<name>/ca.pem, cert.pem, key.pem   what one member needs, and all that it is given (PALPATE_TLS=<folder>/<name>)
 
 Keys are ECDSA on P-256 (RFC 5480), certificates X.509 version 3 (RFC 5280). The name is the subject's common name, by which a
-router knows its members (`access.py`). Needs the `cryptography` package: `pip install palpate[secure]`.
+router knows its members (`access.py`). Needs the `cryptography` package: `pip install 'palpate[run]'`.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.named_function import PATTERN, PatternError
-from palpate_models.scenario.schema import Exam
+from palpate_models.scenario.schema import PATTERN, Exam
+from palpate_plugins import PluginError
 
 Surface = Callable[[Array], tuple[Array, Array]]
 """The surface as it is seen: of xy in A [m], shape (n, 2), the points [m] and the outward unit normals, both (n, 3), in A."""
@@ -43,27 +43,25 @@ class Scan:
 
 
 def scan_of(exam: Exam, surface: Surface) -> Scan:
-    """The scan that the examination's pattern makes. Raises PatternError for one that cannot be used, with what is wrong."""
+    """The scan that the examination's pattern makes. Raises PluginError for one that cannot be used, with what is wrong."""
     function = PATTERN.load(exam.pattern)
     try:
         made = function(exam, surface)
     except Exception as error:
-        raise PatternError(PATTERN.told(exam.pattern, error)) from error
+        raise PATTERN.failure(exam.pattern, error) from error
     if not isinstance(made, Scan):
-        raise PatternError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan of {__name__}")
+        raise PluginError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan of {__name__}")
     lines = [np.asarray(line, dtype=np.float64) for line in made.lines]
     for k, line in enumerate(lines):
         if line.ndim != 2 or line.shape[1] != 2 or not len(line) or not np.isfinite(line).all():
-            raise PatternError(f"exam.pattern = {exam.pattern!r}: line {k} has the shape {line.shape}, want finite (k, 2), k > 0")
+            raise PluginError(f"exam.pattern = {exam.pattern!r}: line {k} has the shape {line.shape}, want finite (k, 2), k > 0")
     count = sum(map(len, lines))
     if not 0 < count <= LARGEST:
-        raise PatternError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LARGEST}")
+        raise PluginError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LARGEST}")
     scan = Scan(lines, made.joined)
     off = np.abs(scan.targets - exam.centre_m) - np.array(exam.region_m) / 2
     if off.max() > OUTSIDE_M:
-        raise PatternError(
-            f"exam.pattern = {exam.pattern!r}: targets lie up to {1e3 * off.max():.0f} mm outside of exam.region_m"
-        )
+        raise PluginError(f"exam.pattern = {exam.pattern!r}: targets lie up to {1e3 * off.max():.0f} mm outside of exam.region_m")
     return scan
 
 

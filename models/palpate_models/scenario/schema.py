@@ -9,15 +9,28 @@ from __future__ import annotations
 
 from enum import StrEnum
 from math import dist
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Phantom
 from palpate_models.scenario.errors import Errors
-from palpate_models.scenario.named_function import SEARCH, known
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
+from palpate_plugins import PluginKind, is_file
+
+SEARCH: Final = "search"
+BUILTIN_PATTERNS: Final = ("lines", "raster", "snake", SEARCH)
+PATTERN: Final = PluginKind(
+    "pattern", "exam.pattern", "scan", "exam, surface", BUILTIN_PATTERNS, "palpate_models.scenario.patterns"
+)
+
+
+def _known_pattern(choice: str) -> str:
+    """Validate a name. A file is checked when it is loaded, since a scenario may be read on another machine."""
+    if is_file(choice) or choice in PATTERN.names():
+        return choice
+    raise ValueError(PATTERN.expected(choice))
 
 
 class Mode(StrEnum):
@@ -64,7 +77,7 @@ class Exam(Section):
     """Seed of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
-    pattern: Annotated[str, AfterValidator(known)] = "lines"
+    pattern: Annotated[str, AfterValidator(_known_pattern)] = "lines"
     """`lines`: there and back, every second line first, lifted at each line's end; `raster`: every line from the feet to the
     head; `snake`: there and back, line ends joined in contact; `search`: presses where the role `search` asks for them; or a
     pattern of your own: the path of a Python file that has `scan(exam, surface)`."""

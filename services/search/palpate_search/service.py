@@ -16,7 +16,8 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
-from palpate_search.choice import PolicyError, policy
+from palpate_plugins import PluginError
+from palpate_search.choice import policy
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Press, Task
 
@@ -39,7 +40,7 @@ class SearchService(Service):
     role: ClassVar[str] = "search"
 
     def __init__(self, scenario: Scenario) -> None:
-        """Starts from the examination's view of a scenario. Raises PolicyError for a policy that there is not."""
+        """Starts from the examination's view of a scenario. Raises PluginError for a policy that there is not."""
         self._posterior = Posterior(Task.of(exam_input(scenario)))
         self._policy = policy(scenario.search.policy)
         self._missed = scenario.search.missed
@@ -126,12 +127,12 @@ class SearchService(Service):
 
 
 def checked(place: Array, depth: float, task: Task) -> tuple[Array, float]:
-    """A place [m] and a depth [m] that a policy asks for. Raises PolicyError for what the arm must not press."""
+    """A place [m] and a depth [m] that a policy asks for. Raises PluginError for what the arm must not press."""
     place = np.asarray(place, dtype=float)
     if place.shape != (2,) or not np.all((place >= task.low - ROUNDED_M) & (place <= task.high + ROUNDED_M)):  # nor what is NaN
-        raise PolicyError(f"search.policy: it asks for the place {place} m; allowed are {task.low} to {task.high} m")
+        raise PluginError(f"search.policy: it asks for the place {place} m; allowed are {task.low} to {task.high} m")
     if not 0 < depth <= task.deepest + ROUNDED_M:
-        raise PolicyError(f"search.policy: it asks for a depth of {depth} m; allowed are depths above 0, up to {task.deepest} m")
+        raise PluginError(f"search.policy: it asks for a depth of {depth} m; allowed are depths above 0, up to {task.deepest} m")
     return place, float(depth)
 
 

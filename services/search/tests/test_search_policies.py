@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate
 
-from palpate_search.choice import PolicyError, policies, policy
+from palpate_plugins import PluginError
+from palpate_search.choice import policies, policy
 from palpate_search.policies.fixed import latin_hypercube, raster
 from palpate_search.policies.learned import convolved, ppo
 from palpate_search.posterior import Posterior
@@ -100,7 +101,7 @@ def test_a_policy_that_cannot_be_used_is_refused(
     monkeypatch.chdir(tmp_path)
     Path("empty.py").write_text("next = 3\n")
     Path("broken.py").write_text("def next_press(:\n")
-    with pytest.raises(PolicyError, match=words):
+    with pytest.raises(PluginError, match=words):
         policy(choice)
 
 

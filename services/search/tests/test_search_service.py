@@ -13,7 +13,7 @@ from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
 from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
-from palpate_search.choice import PolicyError
+from palpate_plugins import PluginError
 from palpate_search.presses import Task
 from palpate_search.service import FEWEST, checked, create
 
@@ -100,7 +100,7 @@ TASK = Task((0.0, 0.0), (0.1, 0.1))
     ],
 )
 def test_what_the_arm_must_not_press_is_refused(place: tuple[float, ...], depth: float, named: str) -> None:
-    with pytest.raises(PolicyError, match=named):
+    with pytest.raises(PluginError, match=named):
         checked(np.array(place), depth, TASK)
 
 

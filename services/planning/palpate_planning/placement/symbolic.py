@@ -46,7 +46,7 @@ def casadi() -> Any:
     try:
         return import_module("casadi")
     except ImportError as error:
-        raise MissingCasadiError("posture planning needs CasADi: install palpate[planning]") from error
+        raise MissingCasadiError("posture planning needs CasADi: pip install 'palpate[run]'") from error
 
 
 class ArmFunctions(NamedTuple):

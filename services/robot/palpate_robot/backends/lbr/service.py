@@ -77,7 +77,7 @@ class InnerLoop:
 
 
 def load_control(scenario: Scenario) -> Service:
-    """The control service that the scenario chooses. Raises ChoiceError when there is none."""
+    """The control service that the scenario chooses. Raises PluginError when there is none."""
     return implementations.create("control", scenario.services.control, scenario)
 
 

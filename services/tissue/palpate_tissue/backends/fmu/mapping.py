@@ -20,10 +20,10 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
-from palpate_bus.implementations import ChoiceError
+from palpate_plugins import PluginError
 
 
-class MapError(ChoiceError):
+class MapError(PluginError):
     """A map that does not fit the contract or the FMU. Names the entry and what is allowed."""
 
 

@@ -1,0 +1,189 @@
+"""Loads functions that a scenario names: services, scan patterns and search policies.
+
+A choice is the name of an entry point in the group `palpate.<kind>`, or the path of a Python file that defines the function.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib import import_module
+from importlib.machinery import PathFinder
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from traceback import extract_tb
+from typing import Any
+
+from palpate_errors import UserError
+
+USER_MODULE = "palpate_user_"
+"""Prefix of the module names of user files, before the kind."""
+
+
+class PluginError(UserError):
+    """A plug-in that cannot be used. Names the field, the choice, the line of a file, and what is allowed or missing."""
+
+
+def is_file(choice: str) -> bool:
+    """True if a choice is a path, not a name."""
+    return choice.endswith(".py")
+
+
+@dataclass(frozen=True)
+class PluginKind:
+    """The functions that one field of the scenario may name. All methods raise PluginError."""
+
+    kind: str
+    field: str
+    function: str = "create"
+    """Name of the function in a user's file."""
+    arguments: str = "scenario"
+    builtin: tuple[str, ...] = ()
+    """Functions of `builtin_module` that need no entry point."""
+    builtin_module: str = ""
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names that can be chosen."""
+        return (*self.builtin, *sorted({point.name for point in entry_points(group=f"palpate.{self.kind}")}))
+
+    def expected(self, choice: str) -> str:
+        """Return what is allowed, and the likely name if `choice` has a typing error."""
+        near = get_close_matches(choice, self.names(), n=1)
+        suggestion = f". Did you mean {near[0]}?" if near else ""
+        file = f"the path of a Python file that has {self.function}({self.arguments})"
+        return f"want one of {', '.join(self.names()) or 'none installed'}, or {file}{suggestion}"
+
+    def check(self, choice: str) -> None:
+        """Check that the function exists. Imports nothing."""
+        if is_file(choice):
+            self._check_file(Path(choice))
+        elif choice not in self.names():
+            raise self._error(choice, self.expected(choice))
+
+    def check_libraries(self, choice: str) -> None:
+        """Check that the libraries of an installed plug-in can be imported."""
+        if is_file(choice) or choice in self.builtin:
+            return
+        point = self.entry_point(choice)
+        if not all(map(_installed, _requirements(point, self._extra(point)))):
+            self._load_installed(point)  # another distribution may provide the library, so the import decides
+
+    def load(self, choice: str) -> Callable[..., Any]:
+        """Return the function."""
+        self.check(choice)
+        if is_file(choice):
+            return self._load_file(choice)
+        if choice in self.builtin:
+            function: Callable[..., Any] = getattr(import_module(self.builtin_module), choice)
+            return function
+        return self._load_installed(self.entry_point(choice))
+
+    def entry_point(self, choice: str) -> EntryPoint:
+        """Return the entry point of an installed plug-in."""
+        found = entry_points(group=f"palpate.{self.kind}", name=choice)
+        if not found:
+            raise self._error(choice, self.expected(choice))
+        return next(iter(found))
+
+    def failure(self, choice: str, error: Exception) -> PluginError:
+        """Return the PluginError for an exception of the function, with the last line of its file that took part."""
+        if isinstance(error, ModuleNotFoundError):
+            extra = None if is_file(choice) or choice in self.builtin else self._extra(self.entry_point(choice))
+            remedy = f"; pip install 'palpate[{extra}]'" if extra else ""
+            return self._error(choice, f"the module {error.name} is not installed{remedy}")
+        path = Path(choice).resolve()
+        lines = [frame.lineno for frame in extract_tb(error.__traceback__) if Path(frame.filename) == path]
+        where = f"line {lines[-1]}: " if lines else ""
+        return self._error(choice, f"{where}{type(error).__name__}: {error}")
+
+    def _error(self, choice: str, problem: str) -> PluginError:
+        return PluginError(f"{self.field} = {choice!r}: {problem}")
+
+    def _extra(self, point: EntryPoint) -> str | None:
+        """Return the extra with the plug-in's libraries: the one named after it or its kind, else `run`."""
+        offered = [] if point.dist is None else point.dist.metadata.get_all("Provides-Extra") or []
+        return next((extra for extra in (point.name, self.kind, "run") if extra in offered), None)
+
+    def _load_installed(self, point: EntryPoint) -> Callable[..., Any]:
+        try:
+            function: Callable[..., Any] = point.load()
+        except ModuleNotFoundError as error:
+            raise self.failure(point.name, error) from error
+        return function
+
+    def _check_file(self, path: Path) -> None:
+        if not path.is_file():
+            raise self._error(str(path), f"there is no such file; {self.expected(str(path))}")
+        try:
+            tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+        except (SyntaxError, ValueError) as error:
+            raise self._error(str(path), f"is not Python: {error}") from error
+        if self.function not in _defined(tree):
+            raise self._error(str(path), f"the file has no function {self.function}({self.arguments})")
+        for line, name in _imported(tree):
+            if not _importable(name, path.parent):
+                raise self._error(str(path), f"line {line}: the module {name} is not installed")
+
+    def _load_file(self, choice: str) -> Callable[..., Any]:
+        """Return the function of a user's file, which may import modules of its folder."""
+        path = Path(choice).resolve()
+        if str(path.parent) not in sys.path:
+            sys.path.append(str(path.parent))
+        name = f"{USER_MODULE}{self.kind}"
+        spec = spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = sys.modules[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(module)
+        except Exception as error:
+            raise self.failure(choice, error) from error
+        function: Callable[..., Any] = getattr(module, self.function)
+        return function
+
+
+def _requirements(point: EntryPoint, extra: str | None) -> list[str]:
+    """Return the distributions that an extra names itself."""
+    pattern = re.compile(rf"([\w.-]+).*extra == ['\"]{re.escape(extra or '')}['\"]")
+    lines = [] if point.dist is None or extra is None else point.dist.requires or []
+    return [found[1] for line in lines if (found := pattern.match(line))]
+
+
+def _installed(name: str) -> bool:
+    try:
+        distribution(name)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def _imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and top-level package of each unconditional import at the top of a module."""
+    for node in tree.body:
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name.partition(".")[0]) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.lineno, node.module.partition(".")[0]
+
+
+def _importable(name: str, folder: Path) -> bool:
+    """True if the package is installed or in `folder`. Imports nothing."""
+    return name in sys.modules or find_spec(name) is not None or PathFinder.find_spec(name, [str(folder)]) is not None
+
+
+def _defined(tree: ast.Module) -> set[str]:
+    """Return the names that a module defines or imports at its top level."""
+    found: set[str] = set()
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign):
+            found |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {alias.asname or alias.name for alias in node.names}
+    return found
