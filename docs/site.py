@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import jupytext
@@ -24,21 +24,17 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert import MarkdownExporter
 from nbconvert.writers import FilesWriter
 
-from palpate import reference
-from palpate_bus import settings
-from palpate_bus.contract import contract, doc
-from palpate_models import errors_page, scenario_page
-
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = Path("docs/notebooks")
-GENERATED: dict[str, Callable[[], str]] = {
-    "docs/topics.md": lambda: doc.page(contract()),
-    "docs/settings.md": settings.page,
-    "docs/errors.md": errors_page.page,
-    "docs/scenario.md": scenario_page.page,
-    "docs/reference/commands.md": reference.commands_page,
-    "docs/reference/messages.md": reference.messages_page,
+GENERATED = {
+    "docs/topics.md": "topics",
+    "docs/settings.md": "settings",
+    "docs/errors.md": "errors",
+    "docs/scenario.md": "scenario",
+    "docs/reference/commands.md": "commands",
+    "docs/reference/messages.md": "messages",
 }
+"""Modules of docs/generate by the page that they generate."""
 ASSETS = {".png", ".gif", ".svg", ".mp4", ".csv", ".css", ".json"}
 DIAGRAM = re.compile(r"```mermaid\n.*?```\n", re.DOTALL)
 """A browser would draw such a diagram with a library from the network."""
@@ -53,7 +49,7 @@ def gather(into: Path) -> None:
     )
     files = [Path(line) for line in listed.stdout.splitlines() if (ROOT / line).is_file()]
     pages = {file: (ROOT / file).read_text(encoding="utf-8") for file in files if file.suffix == ".md"}
-    pages |= {Path(name): page() for name, page in GENERATED.items()}
+    pages |= generated()
     for page in pages:
         target = into / ("index.md" if page == Path("README.md") else page)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -65,6 +61,13 @@ def gather(into: Path) -> None:
             shutil.copy(ROOT / file, target)
         elif file.parent == NOTEBOOKS:
             execute(file, into / NOTEBOOKS)
+
+
+def generated() -> dict[Path, str]:
+    """Return the generated pages by their path in the repository."""
+    if (folder := str(ROOT / "docs")) not in sys.path:
+        sys.path.insert(0, folder)
+    return {Path(path): import_module(f"generate.{module}").page() for path, module in GENERATED.items()}
 
 
 def execute(notebook: Path, into: Path) -> None:

@@ -1,10 +1,10 @@
-"""The settings of a process: everything that a user, `palpate run` or docker-compose.yml may say about how it runs.
+"""Settings of a process: how it runs and joins the bus, from PALPATE_ environment variables.
 
     settings = Settings.read()                                  from this process's environment
     child = settings.replaced(runtime="wallclock", record="full")
     subprocess.Popen(command, env={**os.environ, **child.to_env()})
 
-Nothing else in the project reads a PALPATE_ variable. What is examined, and how, is no setting: it is in the scenario.
+No other module reads PALPATE_ variables. The scenario, not the settings, says what is examined and how.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from palpate_errors import UserError
 
 PREFIX = "PALPATE_"
 DOMAIN_MAX = 232
-"""The highest ROS domain with DDS's default port range; zenoh itself knows no limit."""
+"""Highest ROS domain in DDS's default port range; zenoh has no limit."""
 
 COMPOSE_VARIABLES = {
     "PALPATE_SCENARIO_NAME": (
         "lump",
-        "Scenario that the containers examine: a name, or a file in the results folder as `/results/my.yaml`.",
+        "Scenario of the containers: a name, or a file in the results folder such as `/results/my.yaml`.",
     ),
     "PALPATE_SETTINGS": (
         "",
-        "Changes to the scenario, `a.b=c`, separated by spaces, with none inside: `exam.region_m=[0.1,0.1]`.",
+        "Changes to the scenario, `a.b=c`, separated by spaces; no spaces inside: `exam.region_m=[0.1,0.1]`.",
     ),
-    "PALPATE_RESULTS": ("./out", "Folder of this machine into which the containers write."),
-    "PALPATE_UID": ("1000", "User id under which the containers write; on Linux `$(id -u)`."),
-    "PALPATE_GID": ("1000", "Group id under which the containers write; on Linux `$(id -g)`."),
+    "PALPATE_RESULTS": ("./out", "Folder of this machine to which the containers write."),
+    "PALPATE_UID": ("1000", "User id of the containers' files; on Linux `$(id -u)`."),
+    "PALPATE_GID": ("1000", "Group id of the containers' files; on Linux `$(id -g)`."),
     "PALPATE_RECORDING": ("", "Folder with a recording, for compose/camera-replay.yml."),
 }
-"""What only docker-compose.yml reads: default and meaning."""
+"""Default and meaning of the variables that only docker-compose.yml reads."""
 RECORDING = "recording_mcap"
-"""The recording within a results folder: a rosbag2 folder."""
+"""Name of the recording in a results folder: a rosbag2 folder."""
 
 
 class BusConfigError(UserError):
-    """A setting that cannot work, or a bus that cannot be joined. Names the variable or field, its value and what is allowed."""
+    """An invalid setting, or a bus that cannot be joined. Names the variable, its value and what is allowed."""
 
 
 class Settings(BaseSettings):
-    """How a process runs and joins the bus. Each field is a variable: `listen` is PALPATE_LISTEN, `domain` is ROS_DOMAIN_ID.
+    """Settings of a process. Each field is an environment variable: `listen` is PALPATE_LISTEN, `domain` is ROS_DOMAIN_ID.
 
-    An empty variable is one that is not set.
+    An empty variable counts as unset.
     """
 
     model_config = SettingsConfigDict(
@@ -64,7 +64,7 @@ class Settings(BaseSettings):
     )
     connect: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(),
-        description="Endpoints of peers, separated by commas. A peer that is not there yet is tried again until it is.",
+        description="Endpoints of peers, separated by commas. A peer that does not answer yet is tried again.",
     )
     router: str | None = Field(
         default=None,
@@ -72,14 +72,14 @@ class Settings(BaseSettings):
     )
     mode: Literal["peer", "client", "router"] = Field(
         default="peer",
-        description="A `client` sends everything through the router: in the secure mode, or behind address translation.",
+        description="A `client` sends everything through the router: in secure mode, or behind address translation.",
     )
     lowlatency: bool = Field(
         default=False,
-        description="Offer zenoh's low-latency transport. `palpate run` decides this; it has no effect by the wall clock.",
+        description="Offer zenoh's low-latency transport. `palpate run` sets it; no effect in wall-clock mode.",
     )
     shared_memory: bool = Field(
-        default=True, description="Send messages over 3 KiB to processes of the same host by shared memory."
+        default=True, description="Send messages over 3 KiB to processes on the same host by shared memory."
     )
     tls: Path | None = Field(
         default=None,
@@ -87,56 +87,56 @@ class Settings(BaseSettings):
     )
     key: Path | None = Field(
         default=None,
-        description="File with the run's key, mode 0600: messages that the contract wants tagged are, and others are set aside.",
+        description="File with the run's key, mode 0600. Topics marked as tagged in the contract carry a tag; "
+        "messages without a valid tag are dropped.",
     )
-    tags: bool | None = Field(
-        default=None, description="Whether `palpate run` makes such a key for its processes; by default it does."
-    )
+    tags: bool | None = Field(default=None, description="Whether `palpate run` creates a run key for its processes (default).")
     zenoh_config: Path | None = Field(
         default=None,
-        description="A zenoh configuration file (JSON5) that is used as it is. The settings above then have no effect.",
+        description="A zenoh configuration file (JSON5), used unchanged. The settings above then have no effect.",
     )
     domain: int = Field(default=0, ge=0, le=DOMAIN_MAX, validation_alias="ROS_DOMAIN_ID", description="ROS domain.")
     runtime: Literal["lockstep", "wallclock"] = Field(
-        default="lockstep", description="Whether services step in lockstep or by the wall clock."
+        default="lockstep", description="Runtime of the services: `lockstep` or `wallclock`."
     )
     rate: float | None = Field(
         default=None,
         gt=0,
         le=1,
-        description="By the wall clock: simulated seconds a second, alike for all; `palpate run` measures what it can keep.",
+        description="Wall-clock mode: simulated seconds per second, the same for all processes. "
+        "`palpate run` measures a sustainable rate.",
     )
-    scenario: Path | None = Field(default=None, description="The scenario file of a service, as `palpate prepare` writes it.")
+    scenario: Path | None = Field(default=None, description="Scenario file of a service, as written by `palpate prepare`.")
     checkpoint: Path | None = Field(
         default=None,
-        description="Where an earlier examination stood that this one goes on with; `palpate run --resume` makes it.",
+        description="Checkpoint of an interrupted examination that this run resumes; written by `palpate run --resume`.",
     )
-    out: Path | None = Field(default=None, description="The run's results folder, for services that write files.")
+    out: Path | None = Field(default=None, description="Results folder of the run, for services that write files.")
     record: Literal["none", "normal", "full"] = Field(
         default="none",
-        description="What the recorder keeps, to which services pass on what they send: `full`, every message; `normal`, of "
-        "topics with `record_ms` in the contract one message in that time, a fifth of the bytes; `none`, there is no recorder.",
+        description="Recorded messages. `full`: all. `normal`: topics with `record_ms` in the contract are reduced "
+        "to one message in that time, about a fifth of the bytes. `none`: no recorder.",
     )
-    record_file_mb: int | None = Field(default=None, ge=1, description="Size [MB] at which the recorder begins a new file.")
+    record_file_mb: int | None = Field(default=None, ge=1, description="Size [MB] at which the recorder starts a new file.")
     viewer: str | None = Field(
-        default=None, description="How the dashboard shows a run live: `serve`, `serve:PORT`, `connect` or `connect:URL`."
+        default=None, description="Live view of the dashboard: `serve`, `serve:PORT`, `connect` or `connect:URL`."
     )
     periods: Annotated[dict[str, int], NoDecode] = Field(
-        default={}, description="Other periods of roles [ms] for an experiment, such as `control=5`, separated by commas."
+        default={}, description="Changed periods of roles [ms], such as `control=5`, separated by commas, for experiments."
     )
     absent: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="Optional roles of the contract that do not take part in the run, separated by commas."
     )
     runs: Path | None = Field(
         default=None,
-        description="Folder where runs are announced; by default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`.",
+        description="Folder of run announcements; default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`.",
     )
     compose: Annotated[tuple[Path, ...], NoDecode] = Field(
-        default=(), description="Compose file that `palpate run` reads, and overrides after it, separated by colons."
+        default=(), description="Compose file of `palpate run` and its overrides, separated by colons."
     )
-    fmu: Path | None = Field(default=None, description="The FMU that plays the role of this service.")
-    fmu_map: Path | None = Field(default=None, description="The file that ties the FMU's variables to topics.")
-    log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = Field(default="INFO", description="What a service logs.")
+    fmu: Path | None = Field(default=None, description="The FMU that implements this service.")
+    fmu_map: Path | None = Field(default=None, description="File that maps the FMU's variables to topics.")
+    log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = Field(default="INFO", description="Log level of a service.")
 
     @field_validator("listen", "connect", "absent", mode="before")
     @classmethod
@@ -161,9 +161,9 @@ class Settings(BaseSettings):
 
     @classmethod
     def read(cls, environ: Mapping[str, str] | None = None) -> Self:
-        """The settings of this process, or those that another environment asks for.
+        """Return the settings of this process, or of another environment.
 
-        Raises BusConfigError that names each wrong variable, its value and what is allowed.
+        Raises BusConfigError that names each invalid variable, its value and what is allowed.
         """
         if environ is None:
             return cls._checked(cls)
@@ -171,22 +171,22 @@ class Settings(BaseSettings):
         return cls._checked(lambda: cls(**(cls._defaults() | values)))
 
     def replaced(self, **changes: Any) -> Self:
-        """These settings with some fields changed. Raises BusConfigError."""
+        """Return a copy with some fields changed. Raises BusConfigError."""
         if unknown := changes.keys() - type(self).model_fields.keys():
             raise BusConfigError(f"there is no setting {', '.join(sorted(unknown))}")
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return self._checked(lambda: type(self)(**(values | changes)))
 
     def required(self, name: str, why: str) -> Any:
-        """The value of a setting that this process cannot do without. Raises BusConfigError that says `why`."""
+        """Return the value of a setting that this process needs. Raises BusConfigError, with `why`, if it is not set."""
         value = getattr(self, name)
         if value is None:
             raise BusConfigError(f"{variable(name)} is not set; {why}")
         return value
 
     def to_env(self) -> dict[str, str]:
-        """The variables that give another process these settings. What is not set is empty, to undo an inherited one."""
-        return {variable(name): _text(getattr(self, name)) for name in type(self).model_fields}
+        """Return the environment variables of these settings. Unset ones are empty, to override inherited values."""
+        return {variable(name): text(getattr(self, name)) for name in type(self).model_fields}
 
     @classmethod
     def _defaults(cls) -> dict[str, Any]:
@@ -201,7 +201,7 @@ class Settings(BaseSettings):
 
 
 def variable(name: str) -> str:
-    """The environment variable of a field of `Settings`."""
+    """Return the environment variable of a field of `Settings`."""
     alias = Settings.model_fields[name].validation_alias
     return alias if isinstance(alias, str) else PREFIX + name.upper()
 
@@ -210,8 +210,8 @@ def _split(value: Any, separator: str) -> Any:
     return tuple(part.strip() for part in value.split(separator) if part.strip()) if isinstance(value, str) else value
 
 
-def _text(value: Any) -> str:
-    """A value as it is written in a variable."""
+def text(value: Any) -> str:
+    """Return a value as it is written in a variable."""
     match value:
         case None:
             return ""
@@ -226,7 +226,7 @@ def _text(value: Any) -> str:
 
 
 def _complaint(settings: type[Settings], error: Any) -> str:
-    """One finding of pydantic, with the variable, its value and what is allowed."""
+    """Return an error of pydantic as text: variable, value, allowed values."""
     place = str(error["loc"][0])
     name = next((name for name in settings.model_fields if place in (name, variable(name))), place)
     problem = error["msg"].removeprefix("Value error, ") + "; " if error["type"] == "value_error" else ""
@@ -234,7 +234,7 @@ def _complaint(settings: type[Settings], error: Any) -> str:
 
 
 def allowed(name: str) -> str:
-    """What a setting may be, in words."""
+    """Return the allowed values of a setting as text."""
     field = Settings.model_fields[name]
     kinds = [field.annotation]
     if isinstance(field.annotation, types.UnionType):
@@ -252,28 +252,6 @@ def allowed(name: str) -> str:
         return "roles" if name == "absent" else "files" if Path in typing.get_args(kinds[0]) else "endpoints"
     words: dict[Any, str] = {Path: "a path", float: "a number above 0, up to 1"}
     return words.get(kinds[0], "text")
-
-
-def page() -> str:
-    """docs/settings.md."""
-    rows = [
-        (variable(name), allowed(name), _text(field.get_default()), field.description or "")
-        for name, field in Settings.model_fields.items()
-    ]
-    rows += [(name, "docker compose only", default, doc) for name, (default, doc) in COMPOSE_VARIABLES.items()]
-    lines = [
-        "# Settings",
-        "",
-        "Every environment variable that the project reads, generated from [`Settings`](../bus/palpate_bus/settings.py) by",
-        "`make docs`. `palpate run` and docker-compose.yml set what a service needs; a user",
-        "rarely sets any. A wrong value is refused with the variable, the value and what is allowed. An empty variable counts as",
-        "not set. What is examined, and how, is in the scenario.",
-        "",
-        "| variable | allowed | default | meaning |",
-        "|---|---|---|---|",
-        *(f"| `{name}` | {kind} | {f'`{default}`' if default else ''} | {doc} |" for name, kind, default, doc in rows),
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def main() -> int:

@@ -6,8 +6,10 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
+from typing import Any
 
 import pytest
 import typer
@@ -17,10 +19,18 @@ from typer.testing import CliRunner
 from palpate import commands
 from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import COMMANDS, app_for, main
-from palpate.reference import walked
 from palpate.run import examine
 from palpate_models.scenario.load import load_scenario
 from palpate_plugins import PluginError
+
+
+def walked(command: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield a Typer command, or its subcommands, each with its path."""
+    if getattr(command, "commands", None):
+        for name, inner in command.commands.items():
+            yield from walked(inner, f"{path} {name}".strip())
+    else:
+        yield path, command
 
 
 def names(word: str) -> set[str]:

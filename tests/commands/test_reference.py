@@ -1,28 +1,15 @@
-"""The pages of reference are those of the code."""
+"""docs/reference/results.md has every column of samples.csv."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from palpate.commands import COMMANDS
-from palpate.reference import commands_page, messages_page
 from palpate.report.results import sample_columns
-from palpate_bus.messages.names import PACKAGES
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 
 
-def test_every_command_and_every_message_has_its_place() -> None:
-    page = commands_page()
-    for word in COMMANDS:
-        assert f"### palpate {word}" in page
-    assert "--record" in page
-    messages = messages_page()
-    for name in PACKAGES["palpation_msgs"]:
-        assert f"## {name}\n" in messages
-
-
-def test_every_column_of_the_samples_is_told() -> None:
+def test_every_column_of_the_samples_is_documented() -> None:
     page = (REFERENCE / "results.md").read_text(encoding="utf-8")
 
     class Empty:

@@ -1,51 +1,46 @@
-"""The page of topics, docs/topics.md, generated from the contract (docs/site.py writes it)."""
+"""docs/topics.md, from the contract."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable
 
-from palpate_bus.contract.rows import Contract, Edge, Qos, Role, Topic, Visibility
-from palpate_bus.messages import codec
+from generate.tables import table
+from palpate_bus.contract import Contract, Edge, Qos, Role, Topic, Visibility, contract
 
 _HEAD = """\
 # Topics
 
 Generated from [the contract](../bus/palpate_bus/contract/contract.yaml) by `make docs`.
 
-A message goes by the key `<domain>/<topic>/<type>/<hash>`, as rmw_zenoh of ROS 2 Jazzy writes it (the domain is
-`ROS_DOMAIN_ID`, 0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID; where the run
-has a key, those marked so carry [a tag](security.md#without-certificates-the-runs-key) after it. Types of `palpation_msgs` are in
-[bus/palpation_msgs](../bus/palpation_msgs/msg). Frames: `world` (on the floor, z up), `abdomen` (origin at the umbilicus,
-x to the patient's left, y to the head, z outward). Units are SI, as REP 103 has them.
+A message is sent on the key `<domain>/<topic>/<type>/<hash>`, as in rmw_zenoh of ROS 2 Jazzy (the domain is `ROS_DOMAIN_ID`,
+0 by default), in CDR, with rmw_zenoh's attachment: sequence number, time stamp, GID. In a run with a key, topics marked as tagged
+carry [a tag](security.md#without-certificates-the-runs-key) after it. Types of `palpation_msgs` are in
+[messages](reference/messages.md). Frames: `world` (on the floor, z up), `abdomen` (origin at the umbilicus, x to the patient's
+left, y to the head, z outward). Units are SI, as in REP 103.
 """
 
 _EDGES = {
-    Edge.SAME_TICK: "of the same tick",
+    Edge.SAME_TICK: "same tick",
     Edge.PREVIOUS: "one period late",
     Edge.LATCHED: "before the first tick",
-    Edge.OBSERVE: "as it comes",
+    Edge.OBSERVE: "on arrival",
 }
 
 _VISIBILITY = {
     Visibility.PUBLIC: "everyone",
-    Visibility.SIM: "the simulation only: physics knows it, hardware has no sensor for it",
+    Visibility.SIM: "the simulation only: hardware has no sensor for it",
     Visibility.TRUTH: "scoring, dashboard, recorder and tests only",
 }
 
 
-def page(rules: Contract) -> str:
-    """The page of topics, in Markdown."""
+def page(rules: Contract | None = None) -> str:
+    """Return the page of a contract, by default the project's."""
+    rules = rules or contract()
     senders = {role.name: role for role in rules.roles.values() if rules.outputs(role.name)}
     parts = [_HEAD, _dataflow(rules), _delays(rules), _secrets(rules), _qos(rules.qos.values())]
     parts += [_roles(rules.roles.values(), senders), *(_producer(rules, role) for role in senders.values())]
     parts.append(_internal(rules))
     return "\n".join(parts)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
 
 
 def _milliseconds(topic: Topic) -> str:
@@ -55,13 +50,13 @@ def _milliseconds(topic: Topic) -> str:
 
 
 def _dataflow(rules: Contract) -> str:
-    """A mermaid diagram of the dataflow between services; observers are left out, they read nearly everything."""
+    """Return a mermaid diagram of the data flow between services, without observers."""
     lines = [
         "## Dataflow\n",
-        "Thick arrows are of the same tick, thin ones arrive one period late, dotted ones make no service wait.",
+        "Thick arrows: same tick. Thin arrows: one period late. Dotted arrows: no service waits for them.",
     ]
     lines += [
-        "The recorder and the dashboard read every topic that they may know and are not drawn.\n",
+        "The recorder and the dashboard read every topic that they may read and are not drawn.\n",
         "```mermaid",
         "flowchart LR",
     ]
@@ -78,7 +73,7 @@ def _dataflow(rules: Contract) -> str:
 
 
 def _delays(rules: Contract) -> str:
-    """Every one-period delay, since users of a co-simulation mistake them for bugs."""
+    """Return every one-period delay, since users of a co-simulation mistake them for bugs."""
     rows = []
     for topic in rules.topics.values():
         period = rules.roles[topic.producer].period_ms
@@ -86,10 +81,10 @@ def _delays(rules: Contract) -> str:
         if readers:
             rows.append((f"`{topic.name}`", topic.producer, ", ".join(readers), f"{period} ms"))
     text = (
-        "## Delays\n\nAn edge that is one period late lets producer and reader run in parallel: at time T the reader has what was"
-        " sent up to T less the producer's period. These delays are part of the model, not of the transport:\n\n"
+        "## Delays\n\nAn edge that is one period late lets producer and reader run in parallel: at time T the reader has the"
+        " messages sent up to T minus the producer's period. These delays belong to the model, not to the transport:\n\n"
     )
-    return text + _table(("topic", "from", "to", "delay"), rows)
+    return text + table(("topic", "from", "to", "delay"), rows)
 
 
 def _secrets(rules: Contract) -> str:
@@ -98,8 +93,11 @@ def _secrets(rules: Contract) -> str:
         for topic in rules.topics.values()
         if topic.visibility is not Visibility.PUBLIC
     ]
-    text = "## Who may know\n\nWhat no real examination could know stays out of it. A test holds the contract to this table.\n\n"
-    return text + _table(("topic", "kind", "from", "to"), rows)
+    text = (
+        "## Restricted topics\n\nServices of the examination get only what a real examination could measure; a test checks this."
+        "\n\n"
+    )
+    return text + table(("topic", "kind", "from", "to"), rows)
 
 
 def _qos(classes: Iterable[Qos]) -> str:
@@ -109,45 +107,45 @@ def _qos(classes: Iterable[Qos]) -> str:
         kept = f"last {qos.depth}{', for late joiners too' if qos.transient_local else ''}"
         rows.append((f"`{qos.name}`", delivery, kept, qos.reason))
     text = (
-        "## Quality of service\n\nIn lockstep every edge is reliable and the barrier bounds what is in flight; a lost message"
-        " ends the run.\n\n"
+        "## Quality of service\n\nIn lockstep every edge is reliable and the barrier bounds the messages in flight; a lost"
+        " message ends the run.\n\n"
     )
-    return text + _table(("class", "zenoh", "keeps", "because"), rows)
+    return text + table(("class", "zenoh", "keeps", "reason"), rows)
 
 
 def _roles(roles: Iterable[Role], senders: Container[str]) -> str:
-    """The roles; those that send have a section of their own."""
+    """Return the table of roles; roles that send link to their section."""
     rows = []
     for role in roles:
         kind = "observer: never slows the run" if role.observer else "critical: its loss ends the run" if role.critical else ""
         name = f"[{role.name}](#{role.name})" if role.name in senders else role.name
         rows.append((name, f"{role.period_ms} ms", role.doc, kind))
-    return "## Roles\n\n" + _table(("role", "steps every", "what it is", ""), rows)
+    return "## Roles\n\n" + table(("role", "steps every", "task", ""), rows)
 
 
 def _producer(rules: Contract, role: Role) -> str:
     parts = [f"## {role.name}\n", f"{role.doc[0].upper()}{role.doc[1:]}; steps every {role.period_ms} ms.\n"]
     inputs = [(f"`{topic.name}`", topic.producer, _EDGES[edge]) for topic, edge in rules.inputs(role.name)]
     if inputs and not role.observer:
-        parts += ["Reads:\n", _table(("topic", "from", "when"), inputs)]
+        parts += ["Reads:\n", table(("topic", "from", "when"), inputs)]
     for topic in rules.outputs(role.name):
-        parts += [f"### `{topic.name}`\n", topic.doc + ".\n", _table(("", ""), _facts(topic))]
+        parts += [f"### `{topic.name}`\n", topic.doc + ".\n", table(("", ""), _facts(topic))]
         if topic.units or topic.ranges:
-            parts.append(_table(("field", "unit", "range"), _fields(topic)))
+            parts.append(table(("field", "unit", "range"), _fields(topic)))
     return "\n".join(parts)
 
 
 def _facts(topic: Topic) -> list[tuple[str, str]]:
     readers = ", ".join(f"{role} ({_EDGES[edge]})" for role, edge in topic.readers.items())
-    rows = [("type", f"`{topic.type}`"), ("hash", f"`{codec.type_hash(topic.type)}`"), ("sent", _milliseconds(topic))]
+    rows = [("type", f"`{topic.type}`"), ("hash", f"`{topic.type_hash}`"), ("sent", _milliseconds(topic))]
     rows += [("frame", f"`{topic.frame}`")] if topic.frame else []
-    rows += [("QoS class", f"`{topic.qos}`"), ("read by", readers), ("may be known to", _VISIBILITY[topic.visibility])]
+    rows += [("QoS class", f"`{topic.qos}`"), ("read by", readers), ("visible to", _VISIBILITY[topic.visibility])]
     rows += [("in the run hash", "yes" if topic.hashed else "no")]
-    rows += [("may be sent by", "anyone: a ROS 2 node too")] if topic.open else []
-    rows += [("tagged", "where the run has a key")] if topic.tagged else []
+    rows += [("may be sent by", "anyone, including a ROS 2 node")] if topic.open else []
+    rows += [("tagged", "in runs with a key")] if topic.tagged else []
     rows += [("--record normal keeps", f"one message in {topic.record_ms} ms")] if topic.record_ms else []
     rows += [("stale after", f"{topic.max_age_ms} ms")] if topic.max_age_ms else []
-    rows += [("expires after", f"{topic.expiry_ms} ms: the receiver then acts safely")] if topic.expiry_ms else []
+    rows += [("expires after", f"{topic.expiry_ms} ms: the receiver then enters its safe state")] if topic.expiry_ms else []
     return rows
 
 
@@ -166,5 +164,5 @@ def _internal(rules: Contract) -> str:
         deadline = "" if row.deadline_ms is None else f"{row.deadline_ms} ms"
         tagged = "yes" if row.tagged else ""
         rows.append((f"`{row.name}`", f"`{row.type}`", row.producer, row.readers, every, deadline, tagged, row.doc))
-    head = ("key", "type", "from", "to", "every", "deadline", "tagged", "what for")
-    return "## Messages of the runtime\n\n" + _table(head, rows)
+    head = ("key", "type", "from", "to", "every", "deadline", "tagged", "purpose")
+    return "## Messages of the runtime\n\n" + table(head, rows)

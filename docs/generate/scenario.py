@@ -7,33 +7,34 @@ from collections.abc import Iterator
 from textwrap import fill
 from typing import Any, Final, get_args, get_origin
 
+from generate.tables import one_line, table
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import UNITS, Section
 
 _HEAD: Final = """# Fields of a scenario
 
-Made from the models in [`palpate_models`](../models/palpate_models/scenario/schema.py) by `make docs`.
+Generated from the models in [`palpate_models`](../models/palpate_models/scenario/schema.py) by `make docs`.
 
-A scenario is a YAML file; what it does not mention has the default. `palpate scenarios` lists those that come with Palpate, and
-`--set` changes a field for one run:
+A scenario is a YAML file; a field that it does not set has its default. `palpate scenarios` lists the scenarios that come with
+Palpate, and `--set` changes a field for one run:
 
     palpate run my_patient.yaml --set exam.depth_m=0.008 --set errors=none
 
 {units}
 
-Without a unit a field is a plain number, a name or a yes or no. An unknown field is refused, with the line it stands on and the
-field that was probably meant. [V] marks a figure that was read in the source named there, [A] one that is assumed.
+A field without a unit is a plain number, a name or a boolean. An unknown field is an error, which names its line and the most
+similar field. [V] marks a figure that was read in the source named next to it, [A] an assumed one.
 """
 _ELSEWHERE: Final = {
     "errors": "All fields with their levels and sources: [errors.md](errors.md).",
     "phantom.anatomy": "It is not set but drawn from the seed, see [reality.md](reality.md#randomly-drawn-persons).",
 }
-"""Sections that are described on a page of their own."""
+"""Sections with a page of their own."""
 _BOUNDS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
 
 
 def page() -> str:
-    """The page's text."""
+    """Return the page."""
     units = ", ".join(f"`_{end}` {unit}" for end, unit in UNITS.items())
     return _HEAD.format(units=fill(f"A field's name ends with its unit: {units}.", 128)) + "".join(
         _section("", Scenario, Scenario())
@@ -41,32 +42,31 @@ def page() -> str:
 
 
 def _section(path: str, model: type[Section], given: Section | None) -> Iterator[str]:
-    """A table of the section's own fields, then the sections within it. `given`: its default; None for an item of a list."""
+    """Yield a table of the section's own fields, then its inner sections. `given`: its default, or None for an item of a list."""
     schema = model.model_json_schema()
-    yield f"\n## {f'`{path}`' if path else 'At the top'}\n\n{_line(model.__doc__ or '')}\n"
+    yield f"\n## {f'`{path}`' if path else 'Top level'}\n\n{one_line(model.__doc__ or '')}\n"
     if path in _ELSEWHERE:
         yield f"\n{_ELSEWHERE[path]}\n"
         return
     inner: list[tuple[str, type[Section], Section | None]] = []
-    yield "\n| field | default | allowed | what it is |\n|---|---|---|---|\n"
+    rows = []
     for name, field in model.model_fields.items():
         where = f"{path}.{name}".strip(".")
-        meaning = _line(field.description or "")
+        meaning = field.description or ""
         default = field.default if given is None else getattr(given, name)
         kind = field.annotation
         if isinstance(kind, type) and issubclass(kind, Section):
             inner.append((where, kind, default))
-            meaning = meaning or _line(kind.__doc__ or "")
-            yield f"| `{name}` | | a section: [`{where}`](#{_anchor(where)}) | {meaning} |\n"
+            rows.append((f"`{name}`", "", f"a section: [`{where}`](#{_anchor(where)})", meaning or kind.__doc__ or ""))
             continue
         inner += [
             (f"{where}[]" if get_origin(kind) is tuple else where, item, None)
             for item in get_args(kind)
             if isinstance(item, type) and issubclass(item, Section)
         ]
-        shown = "has to be given" if given is None and field.is_required() else _default(default)
-        allowed = _allowed(schema["properties"][name], schema.get("$defs", {}))
-        yield f"| `{name}` | {shown} | {allowed} | {meaning} |\n"
+        shown = "required" if given is None and field.is_required() else _default(default)
+        rows.append((f"`{name}`", shown, _allowed(schema["properties"][name], schema.get("$defs", {})), meaning))
+    yield "\n" + table(("field", "default", "allowed", "meaning"), rows)
     for place, section, instance in inner:
         yield from _section(place, section, instance)
 
@@ -80,7 +80,7 @@ def _default(value: Any) -> str:
 
 
 def _allowed(schema: dict[str, Any], parts: dict[str, Any]) -> str:
-    """What a field may be, in words."""
+    """Return the allowed values of a field as text."""
     if "$ref" in schema:
         return _allowed(parts[schema["$ref"].rpartition("/")[2]], parts)
     if "anyOf" in schema:
@@ -101,7 +101,3 @@ def _allowed(schema: dict[str, Any], parts: dict[str, Any]) -> str:
 
 def _anchor(path: str) -> str:
     return path.replace(".", "").replace("[]", "")
-
-
-def _line(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")

@@ -1,0 +1,1 @@
+"""Generators of the reference pages: each module has `page()`, which returns the Markdown of one page."""
