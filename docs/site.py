@@ -1,4 +1,4 @@
-"""Collects the sources of the site: every page of the project with its pictures, in a folder laid out like the repository.
+"""Collects the sources of the site: every page of the project with its pictures, in a folder with the layout of the repository.
 
     python docs/site.py out/site-pages && mkdocs build --strict
 

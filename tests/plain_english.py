@@ -29,7 +29,7 @@ PHRASES = {
     "write 'user-defined', 'custom', 'its own'": r"\bone's own\b",
     "write 'report', 'state', 'publish'": r"\btell\b(?! apart\b)",
     "write 'has an error of'": r"\berr(ed)?\b",
-    "write 'plan', 'place', 'is at'": r"\blay\b",
+    "write 'plan', 'place', 'is at'": r"\b(lay|laid|lain)\b(?! (out|off)\b)",
 }
 COMPILED = {hint: re.compile(pattern) for hint, pattern in PHRASES.items()}
 OPENING = re.compile(r"^(What|Whether|How|Where|Who|Why|Which|So)\b")

@@ -26,15 +26,15 @@ patient = palpate.Patient("clean", seed=1)
 
 # %% [markdown]
 # Lengths are in metres, forces in newtons, times in seconds. The frame is that of the abdomen: the umbilicus is (0, 0), x goes to
-# the patient's left and y to the head. This patient has a lump in the right lower quadrant, about (-55, -55) mm. We press him on
-# it and at the same place of the other side.
+# the patient's left and y to the head. This patient has a lump in the right lower quadrant, about (-55, -55) mm. Press it, and the same
+# place on the opposite side.
 
 # %%
 on_lump = patient.press((-0.055, -0.055), depth=0.010, speed=0.02, hold=3.0)
-beside = patient.press((0.055, -0.055), depth=0.010, speed=0.02, hold=3.0)
+opposite = patient.press((0.055, -0.055), depth=0.010, speed=0.02, hold=3.0)
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.5), layout="constrained")
-for touch, words in ((on_lump, "on the lump"), (beside, "beside it")):
+for touch, words in ((on_lump, "on the lump"), (opposite, "opposite side")):
     left.plot(touch.time - touch.time[0], touch.force, label=words)
     down = ~touch.steady
     right.plot(1e3 * touch.depth[down], touch.force[down], label=words)
@@ -48,14 +48,14 @@ plt.show()
 # force sinks: the wall relaxes.
 
 # %%
-print(f"greatest force: {on_lump.force.max():.1f} N on the lump, {beside.force.max():.1f} N beside it")
-print(f"after 3 s it is {100 * beside.force[-1] / beside.force.max():.0f} % of the greatest beside the lump")
+print(f"greatest force: {on_lump.force.max():.1f} N on the lump, {opposite.force.max():.1f} N on the opposite side")
+print(f"after 3 s it is {100 * opposite.force[-1] / opposite.force.max():.0f} % of the greatest on the opposite side")
 
 # %% [markdown]
 # ## Faster is harder
 #
-# How much force there is depends on how fast the wall is pressed. He remembers what was pressed before, so he has a minute
-# of rest before each press.
+# The force depends on the speed of the press. The tissue recovers slowly from a press, so the patient rests for a minute before
+# each one.
 
 # %%
 speeds = [0.005, 0.02, 0.08]

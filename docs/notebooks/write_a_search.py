@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Write a search
 #
-# A raster presses everywhere. A search looks at what it knows after each press and presses where that tells most. This one is a
+# A raster presses everywhere. A search chooses each press from the ones before. This one is a
 # loop of five lines: **press where the posterior is most uncertain**.
 
 # %%
@@ -42,13 +42,13 @@ found = palpate.assess(touches)
 found
 
 # %% [markdown]
-# `palpate.assess` is the assessment of the system, given what it is given there: the skin as it is seen, and force and depth over
-# time. It is not given the patient.
+# `palpate.assess` is the assessment of the system, with the same inputs: the perceived skin, and force and depth
+# over time, without the patient.
 
 # %% [markdown]
 # ## Search
 #
-# The map holds apparent stiffness with its 90 % band at every place, also where nobody has pressed yet. The next press goes where
+# The map holds apparent stiffness with its 90 % band at every place, also where no press was made. The next press is where
 # the band is widest.
 
 
@@ -106,9 +106,9 @@ final.findings
 # %% [markdown]
 # ## As a policy
 #
-# A search that is a function of a posterior and the budget that is left is a policy: the same function presses a patient here,
-# and with `palpate run --set exam.pattern=search --set search.policy=FILE` it drives the arm. Ours weighs how much each press
-# would tell a second. This patient breathes, and the equipment errs.
+# A search that is a function of posterior and remaining budget is a policy: the same function presses a patient here, and drives
+# the arm with `palpate run --set exam.pattern=search --set search.policy=FILE`. The default policy maximises information per
+# second. This patient breathes, and the equipment has errors.
 
 # %%
 from palpate.search.hand import PatientHand  # noqa: E402
@@ -127,5 +127,5 @@ plt.show()
 # ## Yours
 #
 # Where to press next is a function of the map. Try another: the place where the apparent stiffness is greatest, a press and its
-# uncertainty together, or a line of a `slide` where a line tells more a second. Compare on patients that breathe:
-# `palpate.Patient("lump", seed=7)`. And say when to stop. [Search](../search.md) compares ten policies.
+# uncertainty together, or a `slide` where it gives more information per second. Compare on patients who breathe:
+# `palpate.Patient("lump", seed=7)`, and decide when to stop. [Search](../search.md) compares ten policies.
