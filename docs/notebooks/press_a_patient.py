@@ -25,9 +25,9 @@ import palpate
 patient = palpate.Patient("clean", seed=1)
 
 # %% [markdown]
-# Lengths are in metres, forces in newtons, times in seconds. The frame is that of the abdomen: the umbilicus is (0, 0), x goes to
-# the patient's left and y to the head. This patient has a lump in the right lower quadrant, about (-55, -55) mm. Press it, and the same
-# place on the opposite side.
+# Lengths are in metres, forces in newtons, times in seconds. The frame is that of the abdomen: the umbilicus is (0, 0), x
+# goes to the patient's left and y to the head. This patient has a lump in the right lower quadrant, about (-55, -55) mm.
+# Press it, and the same place on the opposite side.
 
 # %%
 on_lump = patient.press((-0.055, -0.055), depth=0.010, speed=0.02, hold=3.0)
