@@ -1,5 +1,7 @@
-"""The table of commands. Only the module of the command that was asked for is imported: `palpate stop` must not wait for a
-plotting library, and `palpate --help` imports none of them: it reads what each says of itself in its source.
+"""The table of commands.
+
+Only the module of the requested command is imported: `palpate stop` does not wait for a plotting library. `palpate --help`
+imports none of them: it reads their docstrings from the source.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from palpate.command_line import EXIT_BAD_INPUT, say
+from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, say
+from palpate_errors import UserError
 
 HELP = "A robot arm feels for lumps in a simulated abdomen. You can replace each part of it with a program of your own."
 GROUPS = {
@@ -24,28 +27,28 @@ GROUPS = {
         "run": "palpate.run.command:run",
         "plan": "palpate.plan.command:plan",
         "scenarios": "palpate.listings:scenarios",
-        "stop": "palpate.live.operator_command:stop",
-        "release": "palpate.live.operator_command:release",
-        "pause": "palpate.live.operator_command:pause",
-        "resume": "palpate.live.operator_command:resume",
-        "step": "palpate.live.operator_command:step",
+        "stop": "palpate.live.operator:stop",
+        "release": "palpate.live.operator:release",
+        "pause": "palpate.live.operator:pause",
+        "resume": "palpate.live.operator:resume",
+        "step": "palpate.live.operator:step",
     },
     "Look": {
         "dashboard": "palpate.live.dashboard:dashboard",
         "report": "palpate.report.command:report",
         "replay": "palpate.replay.command:replay",
-        "doctor": "palpate.live.doctor_command:doctor",
+        "doctor": "palpate.live.doctor:doctor",
         "topics": "palpate.listings:topics",
-        "topic": "palpate.live.topic_command:app",
-        "node": "palpate.live.node_command:app",
+        "topic": "palpate.live.topic:app",
+        "node": "palpate.live.graph:app",
     },
     "Replace a part, or run in several places": {
         "check": "palpate.check.command:check_command",
         "join": "palpate.run.places:join",
         "takeover": "palpate.run.places:takeover",
         "fmu": "palpate.fmu:app",
-        "keys": "palpate.security.keys_command:app",
-        "router": "palpate.security.router_command:router",
+        "keys": "palpate.security:app",
+        "router": "palpate.security:router",
         "prepare": "palpate.run.command:prepare",
         "conduct": "palpate.run.command:conduct",
     },
@@ -60,7 +63,7 @@ GROUPS = {
         "fuzz": "palpate.fuzz.command:fuzz",
     },
 }
-"""The words of the commands by what they are for, and where each is: a function, or a Typer app of several commands."""
+"""Module and attribute of each command, by group: a function, or a Typer app of several commands."""
 EXTRAS = {
     "dashboard": "dashboard",
     "fmu": "fmu",
@@ -71,39 +74,35 @@ EXTRAS = {
     "faults": "bench",
     "fuzz": "bench",
 }
-"""Extras of the commands that need more than `run`."""
+"""Extra with the libraries of a command that `palpate[run]` does not install."""
 MARGIN = 1
-"""Columns that Typer leaves free on each side of a command's help."""
+"""Columns that Typer leaves free on each side of the help."""
 INDENT = "  "
-"""Of an example."""
-COMMANDS = {word: where for group in GROUPS.values() for word, where in group.items()}
+COMMANDS = {name: where for group in GROUPS.values() for name, where in group.items()}
 
 
 def main() -> None:
     """Runs the command of `sys.argv`."""
-    word = sys.argv[1] if len(sys.argv) > 1 else ""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
     try:
-        app_for(word)(prog_name="palpate")
+        app_for(name)(prog_name="palpate")
     except BrokenPipeError:
-        sys.exit(1)
+        sys.exit(EXIT_TROUBLE)
     except ModuleNotFoundError as error:  # of a library that the command imports late
-        _lacking(word, error)
-    except ValueError as error:
-        from palpate_bus.settings import BusConfigError  # noqa: PLC0415 - it takes two seconds to import
-
-        if not isinstance(error, BusConfigError):
-            raise
+        _exit_for_missing(name, error)
+    except UserError as error:  # a setting or contract that cannot be used, found when the command is imported
         say(error)
         sys.exit(EXIT_BAD_INPUT)
 
 
-def app_for(word: str, columns: int | None = None) -> typer.Typer:
-    """The app that has the command `word` alone; for a word that is not in the table, one that can only list them all.
+def app_for(name: str, columns: int | None = None) -> typer.Typer:
+    """Return a Typer app with only the command `name`; an unknown name gives an app that lists all commands.
 
-    Its help is laid out for so many columns, by default those of the terminal.
+    `columns`: width of the help, by default that of the terminal.
     """
     app = typer.Typer(
         name="palpate",
+        cls=CommandGroup,
         help=HELP,
         callback=_options,
         no_args_is_help=True,
@@ -111,12 +110,12 @@ def app_for(word: str, columns: int | None = None) -> typer.Typer:
         pretty_exceptions_show_locals=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    if word in COMMANDS:
-        _add(app, word, columns or shutil.get_terminal_size().columns)
+    if name in COMMANDS:
+        _add(app, name, columns or shutil.get_terminal_size().columns)
         return app
     for group, commands in GROUPS.items():
-        for name, where in commands.items():
-            app.command(name, help=_summary(where), rich_help_panel=group)(_listed)
+        for listed, where in commands.items():
+            app.command(listed, help=_summary(where), rich_help_panel=group)(_listed)
     return app
 
 
@@ -131,32 +130,29 @@ def _options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """With a callback, an app of one command still wants that command's name."""
+    """With a callback, an app of one command still requires that command's name."""
 
 
 def _listed() -> None:
-    """Stands for a command in the list of commands."""
+    """Placeholder for a command in the list of commands."""
 
 
-def _add(app: typer.Typer, word: str, columns: int) -> None:
-    module, _, attribute = COMMANDS[word].partition(":")
+def _add(app: typer.Typer, name: str, columns: int) -> None:
+    module, _, attribute = COMMANDS[name].partition(":")
     try:
         command = getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
-        _lacking(word, error)
-    except ValueError as error:  # a contract of your own that cannot be used
-        print(f"palpate: {error}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _exit_for_missing(name, error)
     if isinstance(command, typer.Typer):
         for own in command.registered_commands:
             own.help = _flowing(own.callback, columns) or own.help
-        app.add_typer(command, name=word)
+        app.add_typer(command, name=name)
     else:
-        app.command(word, help=_flowing(command, columns))(command)
+        app.command(name, help=_flowing(command, columns))(command)
 
 
 def _flowing(command: object, columns: int) -> str:
-    """A command's docstring with each paragraph on a line of its own, for a terminal of any width to break, and its examples."""
+    """Return a command's docstring with one line per paragraph, which the terminal breaks, and its examples."""
     paragraphs = (getdoc(command) or "").split("\n\n")
     words = [part.replace("\n", " ") for part in paragraphs if not part.startswith(" ")]
     examples = [part.strip() for part in paragraphs if part.startswith(" ")]
@@ -164,29 +160,27 @@ def _flowing(command: object, columns: int) -> str:
 
 
 def _examples(examples: list[str], columns: int) -> str:
-    """Commands with what each does beside it, or below it where so many columns are too few for that."""
+    """Return example commands with their explanations next to them, or below them if `columns` are too few."""
     lines = [example.partition("  ")[::2] for example in examples]
     widest = max(len(line) for line, _ in lines)
-    told = [(line, words.strip()) for line, words in lines]
-    beside = [f"{INDENT}{line:<{widest}}  {words}".rstrip() for line, words in told]
-    if max(map(len, beside)) <= columns - 2 * MARGIN:
-        laid = beside
-    else:
-        laid = [part for line, words in told for part in (INDENT + line, *([3 * INDENT + words] if words else []))]
-    return "\n".join(f"[dim][/]{line}" for line in laid)  # an empty style, since Typer takes the indentation of a paragraph away
+    pairs = [(line, text.strip()) for line, text in lines]
+    rows = [f"{INDENT}{line:<{widest}}  {text}".rstrip() for line, text in pairs]
+    if max(map(len, rows)) > columns - 2 * MARGIN:
+        rows = [part for line, text in pairs for part in (INDENT + line, *([3 * INDENT + text] if text else []))]
+    return "\n".join(f"[dim][/]{row}" for row in rows)  # an empty style, since Typer strips the indentation of a paragraph
 
 
-def _lacking(word: str, error: ModuleNotFoundError) -> NoReturn:
-    """Ends for a library that is not installed; raises the error again where it is one of our own modules that is not there."""
+def _exit_for_missing(name: str, error: ModuleNotFoundError) -> NoReturn:
+    """Exits if a library is not installed. Raises the error again for a missing module of Palpate."""
     if (error.name or "palpate").startswith("palpate"):
         raise error
-    extra = EXTRAS.get(word, "run")
-    print(f"palpate: the command {word} needs the module {error.name}; pip install 'palpate[{extra}]'", file=sys.stderr)
+    extra = EXTRAS.get(name, "run")
+    print(f"palpate: the command {name} needs the module {error.name}; pip install 'palpate[{extra}]'", file=sys.stderr)
     sys.exit(EXIT_BAD_INPUT)
 
 
 def _summary(where: str) -> str:
-    """The first paragraph of a command's docstring, or the `help` of an app, read in the source of its module."""
+    """Return the first paragraph of a command's docstring, or the `help` of an app, from the source of its module."""
     name, _, attribute = where.partition(":")
     package, _, rest = name.partition(".")
     spec = find_spec(package)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from palpate.command_line import refuse
+from palpate.console import refuse
 
 if TYPE_CHECKING:
     from palpate_models.scenario.schema import Scenario

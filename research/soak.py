@@ -13,7 +13,7 @@ import typer
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from palpate.command_line import refuse
+from palpate.console import refuse
 from palpate.run.repeat import Growth, ProcessSample, Soak, read_growths, read_samples
 
 HOUR_S = 3600.0

@@ -33,7 +33,6 @@ NEEDS = {
     "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
     "palpate.live.dashboard": "dashboard",
-    "palpate.live.viewing": "dashboard",
     "palpate.fuzz": "bench",
     "palpate.search": "library",
     "palpate.search.curves": "study",

@@ -18,8 +18,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from palpate.case_display import CaseDisplay
-from palpate.command_line import output_file
+from palpate.console import CaseDisplay, output_file
 from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 if TYPE_CHECKING:

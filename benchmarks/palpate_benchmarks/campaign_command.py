@@ -10,8 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.case_display import CaseDisplay
-from palpate.command_line import EXIT_FAILED, output_file, refuse
+from palpate.console import EXIT_FAILED, CaseDisplay, output_file, refuse
 from palpate.report.files import docs_option, write_part, write_text
 from palpate_benchmarks.fault_kinds import KINDS
 

@@ -10,8 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from palpate.case_display import CaseDisplay
-from palpate.command_line import fail, output_file, output_folder, refuse
+from palpate.console import CaseDisplay, fail, output_file, output_folder, refuse
 from palpate.run.options import Settings
 
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from palpate.case_display import CaseDisplay
-from palpate.command_line import output_file, output_folder, refuse
+from palpate.console import CaseDisplay, output_file, output_folder, refuse
 
 if TYPE_CHECKING:
     from palpate_validation.check import PageSection

@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 from test_dashboard_browser import free_ports, wait_for
 from typer.testing import CliRunner
 
+from palpate.console import CommandGroup
 from palpate.live.dashboard import dashboard
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
@@ -23,7 +24,7 @@ from palpate_dashboard.sinks import Live
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
 
-app = typer.Typer()
+app = typer.Typer(cls=CommandGroup)
 app.command()(dashboard)
 
 
@@ -106,7 +107,7 @@ def test_the_drawing_of_a_lone_file_goes_when_it_was_looked_at(tmp_path: Path, m
         assert drawing.stat().st_size > 10_000
         shown.append(drawing)
 
-    monkeypatch.setattr("palpate.live.viewing.view", look)
+    monkeypatch.setattr("palpate.live.dashboard._view", look)
     assert CliRunner().invoke(app, [str(path)]).exit_code == 0
     assert not shown[0].parent.exists()
 

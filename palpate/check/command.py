@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from palpate.command_line import refuse
-from palpate.live.options import Connect
+from palpate.live.bus import Connect
 
 LISTEN = "tcp/127.0.0.1:7447"
 
@@ -38,22 +37,17 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.check.rig import RigSettings
     from palpate.check.suites import SUITES
     from palpate.check.suites.tissue import STILL
-    from palpate.live.connection import refusing
-    from palpate.live.console import EXIT_TROUBLE, print_json
+    from palpate.console import EXIT_TROUBLE, print_json
     from palpate_bus.runs.joining import NoBus
-    from palpate_models.scenario.load import ScenarioError, load_scenario
-    from palpate_plugins import PluginError
+    from palpate_models.scenario.load import load_scenario
 
-    with refusing():
-        if role not in SUITES:
-            raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
-        try:
-            settings = RigSettings(load_scenario(scenario, STILL), 1e3 * slack, motion or role != "robot" or service is not None)
-            report = None if service is None else check_here(role, service, settings)
-        except (ScenarioError, PluginError) as error:
-            refuse(error)
-        if report is None:
-            report = check_live(role, settings, connect, listen, start, domain, wait)
+    if role not in SUITES:
+        raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
+    settings = RigSettings(load_scenario(scenario, STILL), 1e3 * slack, motion or role != "robot" or service is not None)
+    if service is not None:
+        report = check_here(role, service, settings)
+    else:
+        report = check_live(role, settings, connect, listen, start, domain, wait)
     if as_json:
         print_json(report.as_json())
     else:

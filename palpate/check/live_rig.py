@@ -15,7 +15,7 @@ import zenoh
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, HeardMessage, Rig, RigSettings
-from palpate.live.listening import Listener
+from palpate.live.topic import TopicReader
 from palpate_bus.contract import MS
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
@@ -54,7 +54,7 @@ class LiveRig(Rig):
         key = message_key("palpate/control", CONTROL, domain)
         self._control = Publisher(session, key, self.rules.qos["event"], conductor.node.gid)
         self._reports = Subscription(session, message_key(f"palpate/report/{role}", REPORT, domain))
-        self._ears = {topic.name: Listener(session, topic, domain) for topic in self.rules.outputs(role)}
+        self._ears = {topic.name: TopicReader(session, topic, domain) for topic in self.rules.outputs(role)}
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0
         self._spoke = 0.0
@@ -229,10 +229,10 @@ class LiveRig(Rig):
     def _drain(self) -> None:
         for name, ear in self._ears.items():
             kind = self.rules.topics[name].type
-            while (heard := ear.take()) is not None:
+            while (heard := ear.get()) is not None:
                 try:
                     message = codec.decode(heard.payload, kind)
                 except codec.CodecError as error:
                     self.undecodable.append(f"{name}: {error}")
                     continue
-                self.log[name].append(HeardMessage(self.t, message, heard.sequence, heard.sent))
+                self.log[name].append(HeardMessage(self.t, message, heard.sequence, heard.sent_ns))

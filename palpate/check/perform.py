@@ -12,7 +12,7 @@ from palpate.check.report import ConformanceReport, Verdict
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.starting import started
 from palpate.check.suites import check
-from palpate.live.console import console, table
+from palpate.console import table, wide_console
 from palpate_bus import implementations
 from palpate_bus.wire.zenoh_config import BusOptions, session
 
@@ -49,7 +49,7 @@ def check_live(
 
 def print_report(report: ConformanceReport, failures: bool) -> None:
     """Prints each check, or with `failures` what failed alone, and the verdict."""
-    out = console()
+    out = wide_console()
     rows = table("", "check", "expected", "got")
     group = ""
     for result in report.results:

@@ -8,8 +8,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.case_display import CaseDisplay
-from palpate.command_line import EXIT_FAILED, refuse
+from palpate.console import EXIT_FAILED, CaseDisplay, refuse
 
 
 def fuzz(

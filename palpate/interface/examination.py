@@ -15,7 +15,7 @@ from typing import Any, Final, Literal
 
 import pandas as pd
 
-from palpate.command_line import EXIT_FAILED
+from palpate.console import EXIT_FAILED
 from palpate.environment import FIXED
 from palpate.interface.assessment import StiffnessMap, findings_frame, findings_html, html_of
 from palpate.interface.scenarios import scenario as scenario_of

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import tempfile
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from time import sleep
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from palpate.command_line import refuse
-from palpate.live.options import ChosenRun
+from palpate.live.bus import ChosenRun
+from palpate_errors import UserError
+
+if TYPE_CHECKING:
+    from palpate_bus.runs.announcement import Run
 
 DEFAULT_PORT = 9876
 PICTURE_PX = (1500, 940)
@@ -40,32 +51,123 @@ def dashboard(  # noqa: PLR0913 - the options of a command
     While it shows a live run, keys in its terminal are an operator's controls: s soft stop (the arm retreats and waits),
     e emergency stop (the driver holds), r release.
     """
-    from palpate.live.viewing import NothingToShow, recording, view, watch
-    from palpate_bus.runs.joining import NoBus, named_runs
-    from palpate_bus.settings import BusConfigError
-    from palpate_dashboard.picture import NoPicture, film, take
-    from palpate_models.scenario.load import ScenarioError
+    from palpate_bus.runs.joining import named_runs
+    from palpate_dashboard.picture import film, take
 
-    console = Console(stderr=True)
-
-    def tell(words: str) -> None:
-        console.print(words, highlight=False, soft_wrap=True)
-
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
         if picture or film_file:
             if source is None:
-                raise NothingToShow("--picture and --film need the folder of a run that was recorded")
+                raise UserError("--picture and --film need the folder of a run that was recorded")
             if picture:
-                take(Path(source), picture, at, port, PICTURE_PX, tell)
+                take(Path(source), picture, at, port, PICTURE_PX, console.print)
             if film_file:
-                film(Path(source), film_file, port, PICTURE_PX, tell)
+                film(Path(source), film_file, port, PICTURE_PX, console.print)
         elif source is None:
             run = named_runs(chosen, "or give a results folder, a .rrd or a .mcap file")[-1]
-            watch(run, port, native, show, leave, console)
+            _follow(run, port, native, show, leave, console)
         else:
             with tempfile.TemporaryDirectory(prefix="palpate-dashboard-") as place:
-                view(recording(Path(source), Path(place), console), port, native, show, console)
-    except (NoBus, NothingToShow, NoPicture, BusConfigError, ScenarioError, OSError, ValueError) as error:
-        refuse(error)
+                _view(_drawn(Path(source), Path(place), console), port, native, show, console)
     except KeyboardInterrupt:
         raise typer.Exit from None
+
+
+def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console: Console) -> None:
+    """Follows a run to its end and, unless told to leave, keeps its picture afterwards."""
+    from palpate_bus.runs.operator_keys import HINT, OperatorKeys
+    from palpate_dashboard.follow import follow
+    from palpate_dashboard.service import DashboardService
+    from palpate_dashboard.sinks import Live, address
+    from palpate_models.scenario.load import load_scenario
+
+    scenario = Path(run.out) / "scenario.yaml"
+    if not scenario.is_file():
+        raise UserError(f"{scenario} is not there: the folder of the run {run.name} is not on this machine")
+    service = DashboardService(load_scenario(str(scenario)), None, Live(serve_port=port))
+    viewer = subprocess.Popen(_rerun(f"rerun+http://127.0.0.1:{port}/proxy")) if native else None
+    console.print(f"{run.name} (process {run.pid}): {address(port)}")
+    if show:
+        webbrowser.open(address(port))
+    try:
+        with OperatorKeys() as keys:
+            if keys.attached:
+                console.print(f"[dim]{HINT}[/]")
+            console.print(follow(run, service, console.print, keys))
+        if not leave:
+            console.print("its picture stays until Ctrl+C")
+            while viewer is None or viewer.poll() is None:
+                sleep(0.5)
+    finally:
+        service.finish()
+        if viewer is not None:
+            viewer.terminate()
+
+
+def _drawn(source: Path, place: Path, console: Console) -> Path:
+    """Return the .rrd of a source, drawn from the MCAP recording if there is none (into `place` for a single file)."""
+    from palpate_dashboard import replay
+    from palpate_dashboard.service import FILE, DashboardService
+    from palpate_dashboard.sinks import Live
+    from palpate_models.scenario.load import load_scenario
+
+    if source.suffix == ".rrd" and source.is_file():
+        return source
+    if (source / FILE).is_file():
+        return source / FILE
+    if source.suffix == ".mcap" and source.is_file():
+        scenario = source.parent.parent / "scenario.yaml"
+        if not scenario.is_file():
+            raise UserError(f"{scenario} is not there: a recording is drawn with its run's scenario.yaml, two folders up")
+        drawn = DashboardService(load_scenario(str(scenario)), place / FILE, Live(), paced=False)
+        with _progress(console, (source,)) as advance:
+            replay.replay((source,), drawn, advance)
+        return place / FILE
+    if files := replay.recording_of(source):
+        with _progress(console, files) as advance:
+            return replay.main(source, advance)
+    raise UserError(f"{source}: neither a .rrd nor a .mcap file, nor the folder of a run that was recorded")
+
+
+@contextmanager
+def _progress(console: Console, files: Sequence[Path]) -> Iterator[Callable[[int], None] | None]:
+    """Shows a bar with the remaining time, on a terminal; yields the function that takes the time drawn so far [ns]."""
+    from palpate_dashboard import replay
+
+    if not console.is_terminal:
+        yield None
+        return
+    columns = (TextColumn("drawing"), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("drawing", total=replay.end_of(files))
+        yield lambda t: bar.update(task, completed=t)
+
+
+def _view(recording: Path, port: int, native: bool, show: bool, console: Console) -> None:
+    """Shows a .rrd file until Ctrl+C, or until the native viewer is closed."""
+    from palpate_dashboard.sinks import MEMORY_LIMIT, address
+
+    if native:
+        subprocess.run(_rerun(str(recording)), check=False)
+        return
+    console.print(f"{recording}: {address(port)}  (Ctrl+C ends it)")
+    if show:
+        webbrowser.open(address(port))
+    ports = ("--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(port + 1))
+    server = subprocess.Popen([*_rerun(str(recording)), "--serve-web", *ports, "--server-memory-limit", MEMORY_LIMIT])
+    try:
+        status = server.wait()
+    finally:
+        if server.poll() is None:
+            server.terminate()
+            server.wait()
+    if status:
+        raise UserError(f"rerun left with status {status}: are ports {port} and {port + 1} free? (--port)")
+
+
+def _rerun(*words: str) -> list[str]:
+    """Return the command line of rerun's own viewer."""
+    found = find_spec("rerun_cli")
+    if found is None or found.origin is None:
+        raise UserError("rerun's own command is not installed: pip install rerun-sdk")
+    return [str(Path(found.origin).with_name("rerun.exe" if os.name == "nt" else "rerun")), *words]

@@ -1,4 +1,4 @@
-"""Topics and nodes of a live bus, from its liveliness tokens."""
+"""Topics and nodes of a live bus, from its liveliness tokens; `palpate node list`."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from time import monotonic
 
-from palpate.live.connection import Joined
-from palpate_bus.contract import Contract
+import typer
+
+from palpate.console import print_json, table, wide_console
+from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, Joined, joined
+from palpate_bus.contract import Contract, contract
 from palpate_bus.runs.announcement import Run
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 
 
 @dataclass
 class LiveTopic:
-    """A topic as it is on the bus."""
+    """A topic on the bus."""
 
     name: str
     types: set[tuple[str, str]] = field(default_factory=set)
-    """(type, hash) by which it is sent or wanted; more than one is a mismatch."""
+    """(type, hash) of its endpoints; more than one is a mismatch."""
     publishers: list[str] = field(default_factory=list)
     subscribers: list[str] = field(default_factory=list)
     qos: set[str] = field(default_factory=set)
@@ -26,7 +29,7 @@ class LiveTopic:
 
 @dataclass
 class LiveNode:
-    """A node as it is on the bus."""
+    """A node on the bus."""
 
     name: str
     zids: set[str] = field(default_factory=set)
@@ -36,16 +39,16 @@ class LiveNode:
 
 
 QUIET_S = 0.3
-"""Everyone's tokens come in one burst; after this long without a new one they are taken to be all."""
-PATIENCE_S = 3.0
+"""Tokens arrive in a burst; after this long without a new one the list is taken as complete."""
+DISCOVERY_TIMEOUT_S = 3.0
 
 
 def present(bus: Joined) -> list[Entity]:
-    """Who is there, sorted by token: waits for the roles that the run is known to have, and until nothing new comes."""
+    """Return the entities on the bus, sorted by token. Waits for the run's roles and until no new token arrives."""
     expected = set(bus.target.run.endpoints) if bus.target.run is not None else set()
     watch = GraphWatch(bus.session, bus.domain)
     try:
-        end = monotonic() + PATIENCE_S
+        end = monotonic() + DISCOVERY_TIMEOUT_S
         quiet = monotonic()
         while monotonic() < end:
             if watch.changes(timeout=0.05):
@@ -58,7 +61,7 @@ def present(bus: Joined) -> list[Entity]:
 
 
 def topics(found: Iterable[Entity]) -> dict[str, LiveTopic]:
-    """Topics by name, sorted."""
+    """Return topics by name, sorted."""
     by_name: dict[str, LiveTopic] = {}
     for entity in found:
         end = entity.endpoint
@@ -75,7 +78,7 @@ def topics(found: Iterable[Entity]) -> dict[str, LiveTopic]:
 
 
 def nodes(found: Iterable[Entity]) -> dict[str, LiveNode]:
-    """Nodes by name, sorted."""
+    """Return nodes by name, sorted."""
     by_name: dict[str, LiveNode] = {}
     for entity in found:
         node = by_name.setdefault(entity.node, LiveNode(entity.node))
@@ -89,7 +92,7 @@ def nodes(found: Iterable[Entity]) -> dict[str, LiveNode]:
 
 
 def processes(found: Iterable[Entity]) -> list[tuple[str, ...]]:
-    """The nodes of each process, sorted: those with a session in common. On a secure bus each node has its own session."""
+    """Return the nodes of each process, sorted: those that share a session. On a secure bus each node has its own session."""
     by_session: dict[str, set[str]] = {}
     for entity in found:
         by_session.setdefault(entity.zid, set()).add(entity.node)
@@ -97,9 +100,9 @@ def processes(found: Iterable[Entity]) -> list[tuple[str, ...]]:
 
 
 def missing(rules: Contract, found: Iterable[Entity], run: Run | None) -> list[str]:
-    """Roles that are not on the bus, the critical ones first.
+    """Return the roles that are not on the bus, critical ones first.
 
-    They are those that `run` has, or where it is not known, those that every run has; and all observers.
+    Expected are all observers and the roles of `run`, or, if the run is unknown, the roles of every run.
     """
     there = {entity.node for entity in found}
     absent = [
@@ -108,3 +111,37 @@ def missing(rules: Contract, found: Iterable[Entity], run: Run | None) -> list[s
         if role.name not in there and (role.observer or (role.name in run.endpoints if run is not None else not role.optional))
     ]
     return [role.name for role in sorted(absent, key=lambda role: (role.observer, not role.critical))]
+
+
+app = typer.Typer(help="Nodes on a live bus.", no_args_is_help=True)
+
+
+@app.callback()
+def _group() -> None:
+    """Nodes on a live bus."""
+
+
+@app.command("list")
+def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
+    """List the nodes on the bus, with what each publishes and subscribes to, and the roles that are missing."""
+    with joined(ChosenBus(connect, run, domain)) as bus:
+        found = present(bus)
+        rules = contract()
+        absent = missing(rules, found, bus.target.run)
+    rows = nodes(found).values()
+    if as_json:
+        listed = [
+            {"node": n.name, "role": n.name in rules.roles, "sessions": sorted(n.zids), "publishes": sorted(n.publishes),
+             "subscribes": sorted(n.subscribes), "services": sorted(n.services)}
+            for n in rows
+        ]  # fmt: skip
+        print_json({"nodes": listed, "missing": absent})
+        return
+    out = table("node", "what", ">publishes", ">subscribes", "session")
+    for node in rows:
+        role = rules.roles.get(node.name)
+        what = role.doc if role is not None else "[dim]not a role of the contract[/]"
+        out.add_row(node.name, what, str(len(node.publishes)), str(len(node.subscribes)), " ".join(sorted(node.zids)))
+    wide_console().print(out)
+    if absent:
+        wide_console().print(f"[dim]not there: {', '.join(absent)}[/]")

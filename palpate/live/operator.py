@@ -1,56 +1,91 @@
-"""What an operator asks of a run from another terminal."""
+"""`palpate stop`, `release`, `pause`, `resume`, `step`: control of a run from another terminal."""
 
 from __future__ import annotations
 
 from time import monotonic, sleep
+from typing import Annotated
 
 import typer
 import zenoh
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.command_line import EXIT_FAILED, refuse, say
-from palpate_bus.runs.joining import NoBus, find, find_all
-from palpate_bus.runs.operator_requests import NotAnswered, ask
-from palpate_bus.settings import BusConfigError
+from palpate.console import EXIT_FAILED, say
+from palpate.live.bus import ChosenRun
+from palpate_bus.runs.joining import find, find_all
+from palpate_bus.runs.operator_requests import NoConductorError, ask
 from palpate_bus.wire.zenoh_config import session
+from palpate_errors import PalpateError
 
-MEET_S = 1.0
-"""How long a run may take to be met on the bus."""
+DISCOVERY_TIMEOUT_S = 1.0
 
 
-def request(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
-    """Sends a request to the run that is meant, or to every one, and prints the answers.
+def stop(
+    reason: Annotated[str, typer.Argument(help="Why, for the record.")] = "palpate stop",
+    soft: Annotated[
+        bool, typer.Option("--soft", help="Retreat along the normal and wait, instead of holding where it is.")
+    ] = False,
+    run: ChosenRun = None,
+) -> None:
+    """Stop a run at once: the arm holds safely until `palpate release`. Without --run, every run on this machine stops."""
+    _request("soft-stop" if soft else "stop", reason, run, everyone=True)
 
-    Raises typer.Exit where there is no such run, or one does not answer.
+
+def release(
+    end: Annotated[bool, typer.Option("--end", help="End the examination: the arm goes home.")] = False,
+    reason: Annotated[str, typer.Option(help="Why, for the record.")] = "palpate release",
+    run: ChosenRun = None,
+) -> None:
+    """Release a stop: the examination continues where it was, or with --end the arm goes home and the run ends."""
+    _request("end" if end else "release", reason, run)
+
+
+def pause(run: ChosenRun = None) -> None:
+    """Pause simulated time, within half a simulated second. No safety stop: the arm does not retreat. Not with --wallclock."""
+    _request("pause", "palpate pause", run)
+
+
+def resume(run: ChosenRun = None) -> None:
+    """Resume a paused run."""
+    _request("resume", "palpate resume", run)
+
+
+def step(
+    ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milliseconds.")] = 1,
+    run: ChosenRun = None,
+) -> None:
+    """Advance a paused run by some milliseconds."""
+    _request("step", "palpate step", run, ms=ms)
+
+
+def _request(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
+    """Sends a request to one run, or to all, and prints the answers.
+
+    Raises UserError if there is no such run, typer.Exit if a run does not answer.
     """
     console = Console(stderr=True)
-    try:
-        buses = find_all(chosen=name) if everyone else [find(chosen=name)]
-    except (NoBus, BusConfigError, OSError) as error:
-        refuse(error)
     failed = False
-    for bus in buses:
+    for bus in find_all(chosen=name) if everyone else [find(chosen=name)]:
         try:
             with session(bus.operator()) as joined:
-                answer, after_ms = _met(joined, bus.domain, word, reason, ms)
-        except (NotAnswered, BusConfigError) as error:
+                answer, after_ms = _answer(joined, bus.domain, word, reason, ms)
+        except PalpateError as error:
             failed = True
             say(f"{bus.title}: {error}")
         else:
-            words = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
-            console.print(escape(words), highlight=False, soft_wrap=True)
+            text = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
+            console.print(escape(text), highlight=False, soft_wrap=True)
     if failed:
         raise typer.Exit(EXIT_FAILED)
 
 
-def _met(joined: zenoh.Session, domain: int, word: str, reason: str, ms: int) -> tuple[str, float]:
-    """Asks until the run has been met: links to its peers come up one by one."""
+def _answer(joined: zenoh.Session, domain: int, word: str, reason: str, ms: int) -> tuple[str, float]:
+    """Return the answer to a request; asks again until the run is discovered, since links to its peers come up one by one."""
     begin = monotonic()
     while True:
         try:
             return ask(joined, domain, word, reason, ms)
-        except NotAnswered as error:
-            if "does not answer" not in str(error) or monotonic() - begin > MEET_S:
+        except NoConductorError:
+            if monotonic() - begin > DISCOVERY_TIMEOUT_S:
                 raise
             sleep(0.05)

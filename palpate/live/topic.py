@@ -1,110 +1,115 @@
-"""What `palpate topic` does with the topics on a live bus."""
+"""`palpate topic list|info|echo|hz|bw`: topics on a live bus."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from math import inf
+from queue import Empty, SimpleQueue
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import numpy as np
+import typer
 import yaml
+import zenoh
 from rich.console import Console
 
+from palpate.console import bandwidth, print_json, print_line, table, wide_console
 from palpate.live import graph
-from palpate.live.connection import command, joined
-from palpate.live.console import bandwidth, console, print_json, print_line, table
-from palpate.live.listening import Heard, Listener, plain
-from palpate.live.options import ChosenBus
-from palpate.live.statistics import Spacing
+from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, joined
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec
+from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.joining import NoBus
+from palpate_bus.wire.rmw import WireError, topic_key, unpack
 
-EVERY_S = 1.0
-BANDWIDTH_OVER = 5
-"""Bandwidth is the mean over so many seconds."""
+REPORT_PERIOD_S = 1.0
+BANDWIDTH_PERIODS = 5
+"""Bandwidth is the mean over this many report periods."""
+SPACING_MESSAGES = 10_000
+"""Messages over which rate and spacing are computed at most."""
+SHOWN_ITEMS = 12
+"""Longer arrays are shortened for people."""
+
+app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
+Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
+Seconds = Annotated[float | None, typer.Option("--seconds", min=0, help="Stop after this long; by default Ctrl-C ends it.")]
 
 
-def list_topics(chosen: ChosenBus, as_json: bool) -> None:
-    """Prints the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
-    with command(), joined(chosen) as bus:
+@app.command("list")
+def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
+    """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
+    with joined(ChosenBus(connect, run, domain)) as bus:
         found = graph.topics(graph.present(bus))
-        rules = contract().topics
-        if as_json:
-            print_json([_topic_facts(topic) for topic in found.values()])
-            return
-        out = table("topic", "type", "published by", "subscribed by", "in the contract")
-        for topic in found.values():
-            row = rules.get(topic.name)
-            known = "[yellow]no[/]" if row is None else _period(row)
-            if row is not None and {(row.type, row.type_hash)} != topic.types:
-                known = "[bold red]other type or hash[/]"
-            types = ", ".join(sorted(name.replace("/msg/", "/") for name, _ in topic.types))
-            who = ", ".join(sorted(topic.publishers)) or "[yellow]none[/]"
-            out.add_row(topic.name, types, who, ", ".join(sorted(topic.subscribers)), known)
-        console().print(out)
+    if as_json:
+        print_json([_topic_row(topic) for topic in found.values()])
+        return
+    rules = contract().topics
+    out = table("topic", "type", "published by", "subscribed by", "in the contract")
+    for topic in found.values():
+        row = rules.get(topic.name)
+        known = "[yellow]no[/]" if row is None else _period(row)
+        if row is not None and {(row.type, row.type_hash)} != topic.types:
+            known = "[bold red]other type or hash[/]"
+        types = ", ".join(sorted(name.replace("/msg/", "/") for name, _ in topic.types))
+        publishers = ", ".join(sorted(topic.publishers)) or "[yellow]none[/]"
+        out.add_row(topic.name, types, publishers, ", ".join(sorted(topic.subscribers)), known)
+    wide_console().print(out)
 
 
-def show_topic(name: str, chosen: ChosenBus, as_json: bool) -> None:
-    """Prints a topic's row of the contract, and who publishes and subscribes on the bus with which type hash."""
-    with command(), joined(chosen) as bus:
-        name = name.strip("/")
+@app.command()
+def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
+    """Show a topic: its row of the contract, and who publishes and subscribes on the bus with which type hash."""
+    name = name.strip("/")
+    with joined(ChosenBus(connect, run, domain)) as bus:
         found = [e for e in graph.present(bus) if e.endpoint is not None and e.endpoint.topic == name]
-        row = contract().topics.get(name)
-        if not found and row is None:
-            raise NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
-        if as_json:
-            ends = [
-                {
-                    "node": e.node,
-                    "kind": e.kind.name.lower(),
-                    "type": e.endpoint.type,
-                    "hash": e.endpoint.type_hash,
-                    "qos": e.endpoint.qos,
-                }
-                for e in found
-                if e.endpoint is not None
-            ]
-            print_json({"topic": name, "contract": None if row is None else row.model_dump(mode="json"), "endpoints": ends})
-            return
-        out = table("", "")
-        out.show_header = False
-        for key, value in _facts(row):
-            out.add_row(f"[bold]{key}[/]", value)
-        console().print(out)
-        ends_table = table("node", "", "type", "hash")
-        for entity in found:
-            end = entity.endpoint
-            if end is not None:
-                same = row is None or (end.type, end.type_hash) == (row.type, row.type_hash)
-                shown = end.type_hash[:24] + "…" if same else f"[bold red]{end.type_hash[:24]}… differs[/]"
-                ends_table.add_row(entity.node, f"{entity.kind.name.lower()}", end.type, shown)
-        console().print()
-        console().print(ends_table)
+    row = contract().topics.get(name)
+    if not found and row is None:
+        raise _unknown(name)
+    ends = [(entity, entity.endpoint) for entity in found if entity.endpoint is not None]
+    if as_json:
+        endpoints = [
+            {"node": e.node, "kind": e.kind.name.lower(), "type": end.type, "hash": end.type_hash, "qos": end.qos}
+            for e, end in ends
+        ]
+        print_json({"topic": name, "contract": None if row is None else row.model_dump(mode="json"), "endpoints": endpoints})
+        return
+    out = table("", "")
+    out.show_header = False
+    for key, value in _contract_rows(row):
+        out.add_row(f"[bold]{key}[/]", value)
+    ends_table = table("node", "", "type", "hash")
+    for entity, end in ends:
+        same = row is None or (end.type, end.type_hash) == (row.type, row.type_hash)
+        shown = end.type_hash[:24] + "…" if same else f"[bold red]{end.type_hash[:24]}… differs[/]"
+        ends_table.add_row(entity.node, entity.kind.name.lower(), end.type, shown)
+    for part in (out, "", ends_table):
+        wide_console().print(part)
 
 
-class Echo(NamedTuple):
-    """What of the messages of a topic is printed, and for how long."""
-
-    field: str | None = None
-    """Only this field."""
-    at_most: int | None = None
-    full: bool = False
-    """Long arrays in full."""
-    seconds: float | None = None
-
-
-def print_messages(name: str, chosen: ChosenBus, wanted: Echo, as_json: bool) -> None:
-    """Prints the messages of a topic as they come."""
-    left = wanted.at_most
-    with command(), _listening(name, chosen) as (topic, listener):
-        for heard in _until(listener, wanted.seconds):
-            message = _message(heard, topic)
-            value = plain(message, full=wanted.full or as_json, path=wanted.field)
+@app.command()
+def echo(  # noqa: PLR0913 - the options of a command
+    name: Name,
+    connect: Connect = None,
+    run: ChosenRun = None,
+    domain: Domain = None,
+    as_json: AsJson = False,
+    field: Annotated[str | None, typer.Option(help="Only this field, e.g. wrench.force.")] = None,
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after N messages.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Print long arrays in full.")] = False,
+    seconds: Seconds = None,
+) -> None:
+    """Print the messages of a topic as they come."""
+    left = 1 if once else count
+    with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
+        for received in _until(reader, seconds):
+            value = plain(_message(received, topic), full=full or as_json, path=field)
             if as_json:
-                print_line({"topic": topic.name, "sequence": heard.sequence, "sent_ns": heard.sent, "message": value})
+                print_line({"topic": topic.name, "sequence": received.sequence, "sent_ns": received.sent_ns, "message": value})
             else:
                 print(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=120), end="---\n", flush=True)
             left = None if left is None else left - 1
@@ -112,132 +117,254 @@ def print_messages(name: str, chosen: ChosenBus, wanted: Echo, as_json: bool) ->
                 return
 
 
-def measure_rate(name: str, chosen: ChosenBus, seconds: float | None, as_json: bool) -> None:
-    """Measures a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
-    with command(), _listening(name, chosen) as (topic, listener):
+@app.command()
+def hz(
+    name: Name,
+    connect: Connect = None,
+    run: ChosenRun = None,
+    domain: Domain = None,
+    as_json: AsJson = False,
+    seconds: Seconds = None,
+) -> None:
+    """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
+    with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
         spacing = Spacing()
-        for heard in _each_second(listener, seconds):
-            for one in heard:
-                spacing.add(one.sent, _stamp(one, topic))
-            _say_rate(spacing, topic, as_json)
+        for received in _each_period(reader, seconds):
+            for one in received:
+                spacing.add(one.sent_ns, _stamp_ns(one, topic))
+            _print_rate(spacing, topic, as_json)
         if spacing.messages > 1:
-            _say_rate(spacing, topic, as_json, whole=True)
+            _print_rate(spacing, topic, as_json, whole=True)
 
 
-def measure_bandwidth(name: str, chosen: ChosenBus, seconds: float | None, as_json: bool) -> None:
-    """Measures a topic's bandwidth, once a second: payload bytes per second and per message."""
-    with command(), _listening(name, chosen) as (topic, listener):
-        window: deque[list[int]] = deque(maxlen=BANDWIDTH_OVER)
-        for heard in _each_second(listener, seconds):
-            window.append([len(one.payload) for one in heard])
-            _say_bandwidth(window, topic, as_json)
+@app.command()
+def bw(
+    name: Name,
+    connect: Connect = None,
+    run: ChosenRun = None,
+    domain: Domain = None,
+    as_json: AsJson = False,
+    seconds: Seconds = None,
+) -> None:
+    """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
+    with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
+        window: deque[list[int]] = deque(maxlen=BANDWIDTH_PERIODS)
+        for received in _each_period(reader, seconds):
+            window.append([len(one.payload) for one in received])
+            _print_bandwidth(window, topic, as_json)
+
+
+class Received(NamedTuple):
+    """A message from the wire."""
+
+    sequence: int
+    sent_ns: int
+    """Source time, wall clock."""
+    gid: bytes
+    payload: bytes
+
+
+class TopicReader:
+    """Receives every message of a topic from any sender; of a latched topic also the last one sent before."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
+        self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        self.invalid = 0
+        """Messages without a valid attachment."""
+        key = topic_key(topic, domain)
+        handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
+        if topic.latched:
+            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                session, key, handler, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            )
+        else:
+            self._subscriber = session.declare_subscriber(key, handler)
+
+    def get(self, timeout: float = 0.0) -> Received | None:
+        """Return the next message, or None after `timeout` [s]; 0 does not wait."""
+        while True:
+            try:
+                sample = self._queue.get(timeout=timeout) if timeout else self._queue.get_nowait()
+            except Empty:
+                return None
+            try:
+                attachment: Any = sample.attachment
+                sequence, sent_ns, gid = unpack(attachment.to_bytes())
+            except (WireError, AttributeError):
+                self.invalid += 1
+                continue
+            return Received(sequence, sent_ns, gid, sample.payload.to_bytes())
+
+    def close(self) -> None:
+        """Unsubscribes."""
+        self._subscriber.undeclare()
+
+
+class Spacing:
+    """Source times and stamps of the last messages of a stream."""
+
+    def __init__(self) -> None:
+        self._sent_ns: deque[int] = deque(maxlen=SPACING_MESSAGES)
+        self._stamps_ns: deque[int | None] = deque(maxlen=SPACING_MESSAGES)
+        self.messages = 0
+        self._reported = 0
+
+    def add(self, sent_ns: int, stamp_ns: int | None) -> None:
+        """Adds a message by its source time (wall clock) and its stamp."""
+        self._sent_ns.append(sent_ns)
+        self._stamps_ns.append(stamp_ns)
+        self.messages += 1
+
+    def summary(self, whole: bool = False) -> dict[str, Any]:
+        """Return rates and spacing since the last summary, or over all messages that are kept; by the sender's clocks."""
+        new = len(self._sent_ns) if whole else min(self.messages - self._reported + 1, len(self._sent_ns))
+        self._reported = self.messages
+        sent = np.array(list(self._sent_ns)[-new:], dtype=np.int64)
+        stamps = [stamp for stamp in list(self._stamps_ns)[-new:] if stamp is not None]
+        steps_ms = np.diff(sent) / 1e6
+        if steps_ms.size == 0 or not sent[-1] > sent[0]:
+            return {"messages": max(new - 1, 0), "wall_hz": None, "simulated_hz": None}
+        passed_ns = stamps[-1] - stamps[0] if len(stamps) > 1 else 0
+        return {
+            "messages": new if whole else new - 1,
+            "wall_hz": 1e3 * steps_ms.size / steps_ms.sum(),
+            "simulated_hz": 1e9 * (len(stamps) - 1) / passed_ns if passed_ns > 0 else None,
+            "mean_ms": float(steps_ms.mean()),
+            "least_ms": float(steps_ms.min()),
+            "most_ms": float(steps_ms.max()),
+            "std_ms": float(steps_ms.std()),
+        }
 
 
 @contextmanager
-def _listening(name: str, chosen: ChosenBus) -> Iterator[tuple[Topic, Listener]]:
-    """Joins the bus and listens to a topic: the contract's, or any that is there with a message type that we know."""
+def _subscribed(name: str, chosen: ChosenBus) -> Iterator[tuple[Topic, TopicReader]]:
+    """Joins the bus and subscribes to a topic: the contract's, or any that is there with a known message type."""
     with joined(chosen) as bus:
         name = name.strip("/")
         row = contract().topics.get(name)
         if row is None:
             live = graph.topics(graph.present(bus)).get(name)
             if live is None:
-                raise NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
-            types = sorted(kind for kind, _ in live.types)
+                raise _unknown(name)
+            kind = min(kind for kind, _ in live.types)
             try:
-                codec.message_type(types[0])
+                codec.message_type(kind)
             except codec.CodecError as error:
                 raise NoBus(f"topic {name}: {error}") from error
-            row = Topic(name=name, type=types[0], producer="", readers={}, qos="event", event=True, doc="")
-        listener = Listener(bus.session, row, bus.domain)
+            row = Topic(name=name, type=kind, producer="", readers={}, qos="event", event=True, doc="")
+        reader = TopicReader(bus.session, row, bus.domain)
         try:
-            yield row, listener
+            yield row, reader
         finally:
-            listener.close()
+            reader.close()
 
 
-def _until(listener: Listener, seconds: float | None) -> Iterator[Heard]:
-    """Messages as they come, until the time is over."""
+def _unknown(name: str) -> NoBus:
+    return NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
+
+
+def _until(reader: TopicReader, seconds: float | None) -> Iterator[Received]:
+    """Yields messages until the time is over."""
     end = None if seconds is None else monotonic() + seconds
     while end is None or monotonic() < end:
-        if (heard := listener.get(0.1)) is not None:
-            yield heard
+        if (received := reader.get(0.1)) is not None:
+            yield received
 
 
-def _each_second(listener: Listener, seconds: float | None) -> Iterator[list[Heard]]:
-    """The messages of each second, until the time is over."""
+def _each_period(reader: TopicReader, seconds: float | None) -> Iterator[list[Received]]:
+    """Yields the messages of each report period until the time is over."""
     left = inf if seconds is None else seconds
     while left > 0:
-        yield list(_until(listener, min(left, EVERY_S)))
-        left -= EVERY_S
+        yield list(_until(reader, min(left, REPORT_PERIOD_S)))
+        left -= REPORT_PERIOD_S
 
 
-def _message(heard: Heard, topic: Topic) -> Any:
+def _message(received: Received, topic: Topic) -> Any:
     try:
-        return codec.decode(heard.payload, topic.type)
+        return codec.decode(received.payload, topic.type)
     except codec.CodecError as error:
-        raise NoBus(f"{topic.name}: a message of {len(heard.payload)} bytes is not {topic.type}: {error}") from error
+        raise NoBus(f"{topic.name}: a message of {len(received.payload)} bytes is not {topic.type}: {error}") from error
 
 
-def _stamp(heard: Heard, topic: Topic) -> int | None:
-    header = getattr(_message(heard, topic), "header", None)
-    return None if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+def _stamp_ns(received: Received, topic: Topic) -> int | None:
+    header = getattr(_message(received, topic), "header", None)
+    return None if header is None else nanoseconds(header.stamp)
 
 
-def _say_rate(spacing: Spacing, topic: Topic, as_json: bool, whole: bool = False) -> None:
+def plain(message: Any, *, full: bool, path: str | None = None) -> Any:
+    """Return a message, or its field `path`, as values for YAML and JSON. Without `full` long arrays are shortened.
+
+    Raises NoBus naming the fields when there is no such field.
+    """
+    for name in (path or "").split(".") if path else []:
+        names = [field.name for field in fields(message)] if is_dataclass(message) else []
+        if name not in names:
+            raise NoBus(f"no field {path!r}: no {name!r} among {', '.join(names) or 'nothing (it is a value)'}")
+        message = getattr(message, name)
+    return _plain(message, full)
+
+
+def _plain(value: Any, full: bool) -> Any:
+    if is_dataclass(value):
+        # constants of the message type are fields of its dataclass, in capitals
+        names = [field.name for field in fields(value) if not field.name.isupper() and field.name != "__msgtype__"]
+        return {name: _plain(getattr(value, name), full) for name in names}
+    if isinstance(value, np.ndarray | list | tuple):
+        items = [_plain(item, full) for item in (value if full else value[:SHOWN_ITEMS])]
+        return items if len(items) == len(value) else [*items, f"... {len(value)} items"]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _print_rate(spacing: Spacing, topic: Topic, as_json: bool, whole: bool = False) -> None:
     facts = spacing.summary(whole)
-    wanted = None if topic.latched or topic.event else 1000 / topic.period_ms
+    contract_hz = None if topic.latched or topic.event else 1000 / topic.period_ms
     if as_json:
-        print_line({"topic": topic.name, "contract_hz": wanted, **facts})
+        print_line({"topic": topic.name, "contract_hz": contract_hz, **facts})
         return
     if facts["messages"] < 2:
         Console(highlight=False).print("[dim]no messages[/]")
         return
-    simulated = "" if facts["simulated_hz"] is None else f", {facts['simulated_hz']:.4g} Hz of simulated time"
-    text = f"{facts['wall_hz']:.4g} Hz{simulated}"
-    text += f" (contract {wanted:g} Hz)" if wanted else ""
-    text += (
-        f"; spacing {facts['mean_ms']:.3g} ms mean, {facts['least_ms']:.3g} to {facts['most_ms']:.3g}, std {facts['std_ms']:.2g}"
-    )
-    print(("in all: " if whole else "") + text + f"; {facts['messages']} messages", flush=True)
+    text = "in all: " if whole else ""
+    text += f"{facts['wall_hz']:.4g} Hz"
+    text += "" if facts["simulated_hz"] is None else f", {facts['simulated_hz']:.4g} Hz of simulated time"
+    text += f" (contract {contract_hz:g} Hz)" if contract_hz else ""
+    text += f"; spacing {facts['mean_ms']:.3g} ms mean, {facts['least_ms']:.3g} to {facts['most_ms']:.3g}"
+    print(f"{text}, std {facts['std_ms']:.2g}; {facts['messages']} messages", flush=True)
 
 
-def _say_bandwidth(window: Collection[list[int]], topic: Topic, as_json: bool) -> None:
-    """`window` has the sizes of the messages of the last seconds."""
-    sizes = [size for second in window for size in second]
-    rate = sum(sizes) / (len(window) * EVERY_S)
+def _print_bandwidth(window: Collection[list[int]], topic: Topic, as_json: bool) -> None:
+    """`window`: the message sizes of the last periods."""
+    sizes = [size for period in window for size in period]
+    rate, mean = sum(sizes) / (len(window) * REPORT_PERIOD_S), sum(sizes) / max(len(sizes), 1)
     if as_json:
-        print_line(
-            {"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": sum(sizes) / max(len(sizes), 1)}
-        )
+        print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
     elif not sizes:
         Console(highlight=False).print("[dim]no messages[/]")
     else:
-        mean = sum(sizes) / len(sizes)
-        print(f"{bandwidth(rate)}; {mean:.0f} B a message, {min(sizes)} to {max(sizes)}; {len(sizes)} messages", flush=True)
+        size = f"{mean:.0f} B per message, {min(sizes)} to {max(sizes)}"
+        print(f"{bandwidth(rate)}; {size}; {len(sizes)} messages", flush=True)
 
 
 def _period(row: Topic) -> str:
     return "latched" if row.latched else f"{row.period_ms} ms{' event' if row.event else ''}"
 
 
-def _facts(row: Topic | None) -> list[tuple[str, str]]:
+def _contract_rows(row: Topic | None) -> list[tuple[str, str]]:
     if row is None:
         return [("contract", "does not have it")]
     facts = [("topic", row.name), ("", row.doc), ("type", row.type), ("hash", row.type_hash), ("producer", row.producer)]
     facts += [("sent", _period(row)), ("QoS", row.qos), ("may be known to", str(row.visibility))]
     facts += [("frame", row.frame)] if row.frame else []
     for path in dict.fromkeys([*row.units, *row.ranges]):
-        least, most = row.ranges.get(path, (None, None))
-        facts.append(
-            (path, f"[{row.units.get(path, '1')}]".replace("[", r"\[") + ("" if least is None else f" {least:g} .. {most:g}"))
-        )
+        low, high = row.ranges.get(path, (None, None))
+        unit = f"[{row.units.get(path, '1')}]".replace("[", r"\[")
+        facts.append((path, unit + ("" if low is None else f" {low:g} .. {high:g}")))
     facts += [("stale after", f"{row.max_age_ms} ms")] if row.max_age_ms else []
     facts += [("expires after", f"{row.expiry_ms} ms")] if row.expiry_ms else []
     return facts
 
 
-def _topic_facts(topic: graph.LiveTopic) -> dict[str, Any]:
+def _topic_row(topic: graph.LiveTopic) -> dict[str, Any]:
     row = contract().topics.get(topic.name)
     return {
         "topic": topic.name,

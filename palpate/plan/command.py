@@ -33,7 +33,7 @@ def plan(
     """
     from rich.console import Console
 
-    from palpate.command_line import refuse
+    from palpate.console import refuse
     from palpate.plan.prospect import NoPathError, draw, prospect, summary
     from palpate.run.inputs import usable
     from palpate_models.patient.phantom import build_phantom

@@ -46,7 +46,7 @@ def replay(  # noqa: PLR0913 - the options of a command
 
       palpate replay tissue.mcap --service tissue --update-refs tissue.mcap      renews it
     """
-    from palpate.command_line import refuse
+    from palpate.console import refuse
     from palpate.replay.perform import Passage, Playing, play, run_again, write_reference
 
     on_the_bus: dict[str, object] = {

@@ -12,11 +12,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from palpate.command_line import fail, refuse
+from palpate.console import TimeLeft, fail, refuse
 from palpate.replay.compare import RELATIVE, Tolerance, TopicResult
 from palpate.replay.golden import GoldenCase, make_reference, prepare, replay_service
 from palpate.replay.play import Player, PlayError
-from palpate.time_left import TimeLeft
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordingError, open_recording

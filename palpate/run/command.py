@@ -99,7 +99,7 @@ def run(  # noqa: PLR0913 - the options of a command
 
     The exit status is 0 when the examination came to its end, 2 when it was not begun, 3 when it was broken off, by Ctrl-C, too.
     """
-    from palpate.command_line import refuse
+    from palpate.console import refuse
     from palpate.run.inputs import usable
 
     unchanged = (scenario, out, seed, settings, services, repeat, overwrite) == (
@@ -156,7 +156,7 @@ def prepare(
     scenario.yaml is for tissue, observers and scoring, plant.yaml for robot and camera, exam.yaml for all others. Results of an
     earlier run are kept, in a folder within this one.
     """
-    from palpate.command_line import refuse, say
+    from palpate.console import refuse, say
     from palpate.run.folder import FolderError, apart
     from palpate.run.inputs import usable
     from palpate.run.roles import write_scenario_files

@@ -11,7 +11,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
-from palpate.command_line import EXIT_FAILED, SteadyConsole, say
+from palpate.console import EXIT_FAILED, SteadyConsole, say
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report

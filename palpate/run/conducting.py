@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from palpate.command_line import SteadyConsole, refuse
+from palpate.console import SteadyConsole, refuse
 from palpate.run.conclusion import conclude
 from palpate.run.interrupts import all_is_measured, results_first
 from palpate.run.progress import RunDisplay

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from palpate.command_line import EXIT_BAD_INPUT, EXIT_FAILED, SteadyConsole, fail, refuse, say
+from palpate.console import EXIT_BAD_INPUT, EXIT_FAILED, SteadyConsole, fail, refuse, say
 from palpate.environment import given
 from palpate.report.archive import EvidenceError
 from palpate.report.resumption import Resumption, going_on, resumption

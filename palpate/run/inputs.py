@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.command_line import refuse
+from palpate.console import refuse
 from palpate.run.roles import NONE, checked, settings_of
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_models.patient.mesh import MeshError

@@ -17,7 +17,7 @@ from typing import Annotated, NamedTuple, NoReturn
 
 import typer
 
-from palpate.command_line import refuse
+from palpate.console import refuse
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run

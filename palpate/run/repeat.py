@@ -25,7 +25,7 @@ import psutil
 from pydantic import TypeAdapter
 from scipy import stats
 
-from palpate.command_line import refuse, say
+from palpate.console import refuse, say
 from palpate.report.files import write_text
 from palpate.run.group import members
 from palpate.run.interrupts import SIGNALS

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from palpate.command_line import output_folder, refuse
+from palpate.console import output_folder, refuse
 from palpate.run.options import ServiceChoices, Settings
 
 SPLITS = ("tune", "test")

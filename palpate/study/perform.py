@@ -13,8 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from palpate.case_display import CaseDisplay
-from palpate.command_line import EXIT_FAILED, fail, refuse
+from palpate.console import EXIT_FAILED, CaseDisplay, fail, refuse
 from palpate.run.roles import settings_of
 from palpate.study.digest import RunRecord, Session
 from palpate.study.folder import Manifest, add_session, conclude, usual_folder

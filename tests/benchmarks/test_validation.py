@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from typer.testing import CliRunner
 
-from palpate.command_line import EXIT_BAD_INPUT
+from palpate.console import EXIT_BAD_INPUT
 from palpate_models.patient.remus2024 import relaxed_people
 from palpate_models.patient.schema import Stiffness
 from palpate_validation import (

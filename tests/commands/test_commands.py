@@ -17,8 +17,8 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from palpate import commands
-from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import COMMANDS, app_for, main
+from palpate.console import EXIT_BAD_INPUT
 from palpate.run import examine
 from palpate_models.scenario.load import load_scenario
 from palpate_plugins import PluginError
@@ -58,14 +58,11 @@ def test_the_list_of_commands_imports_none_and_says_what_each_is_for() -> None:
 SLOW_TO_IMPORT = (
     *("casadi", "coal", "dartpy", "distributed", "fmpy", "jinja2", "matplotlib", "mcap", "mujoco", "numba", "ompl", "open3d"),
     *(
-        "palpate_bus.contract",
-        "palpate_bus.messages",
         "pandas",
         "PIL",
         "pinocchio",
         "plotly",
         "pyarrow",
-        "pydantic_settings",
         "rerun",
         "ruckig",
         "scipy",

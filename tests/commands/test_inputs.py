@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
+from palpate.console import EXIT_BAD_INPUT
 
 
 @pytest.fixture(autouse=True)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
+from palpate.console import EXIT_BAD_INPUT
 from palpate.environment import given
 from palpate.run.placement import PlacementError, placement
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, read_processes

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
+from palpate.console import EXIT_BAD_INPUT
 from palpate.run.inputs import scan_over
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import load_scenario, scenario_names

@@ -6,8 +6,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
+from palpate.console import EXIT_BAD_INPUT
 from palpate.run.processes import ProcessListError, compose_file, how, override_files, read_processes
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers
 from palpate.study.spec import load_study

@@ -6,7 +6,7 @@ import pytest
 import typer
 from toy_runs import run_toys
 
-from palpate.command_line import EXIT_BAD_INPUT
+from palpate.console import EXIT_BAD_INPUT
 from palpate.run import examine
 from palpate.run.self_test import RATES, Kept, measure
 from palpate_bus.messages.stamps import NS

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 import palpate_plugins
-from palpate.command_line import EXIT_BAD_INPUT
 from palpate.commands import app_for
+from palpate.console import EXIT_BAD_INPUT
 from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
 from palpate_bus.implementations import check, check_libraries, create, create_for, names

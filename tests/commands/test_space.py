@@ -12,7 +12,7 @@ import typer
 from conductor_messages import SETTINGS, collected, result
 from rich.console import Console
 
-from palpate.command_line import EXIT_FAILED
+from palpate.console import EXIT_FAILED
 from palpate.run.conclusion import conclude
 from palpate.run.folder import FolderError, WatchedRoom, another_folder, check_room, what_it_takes
 from palpate.run.outlook import Outlook

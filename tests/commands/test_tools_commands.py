@@ -18,14 +18,15 @@ import typer
 from small_bus import RULES, SmallRobot, small_bus
 from typer.testing import CliRunner, Result
 
-from palpate.live.doctor_command import doctor
+from palpate.console import CommandGroup, TimeLeft
+from palpate.live.doctor import doctor
+from palpate.live.graph import app as node
 from palpate.live.graph import missing
-from palpate.live.node_command import app as node
-from palpate.live.topic_command import app as topic
+from palpate.live.topic import app as topic
 from palpate_bus.runs.announcement import Announcement, Run, live
 from palpate_bus.wire.liveliness import NodeTokens
 
-tools = typer.Typer()
+tools = typer.Typer(cls=CommandGroup)
 tools.add_typer(topic, name="topic")
 tools.add_typer(node, name="node")
 tools.command("doctor")(doctor)
@@ -132,7 +133,7 @@ def test_doctor_finds_what_is_wrong(robot: SmallRobot) -> None:
 
 
 def test_ctrl_c_ends_a_tool_with_status_0_and_whole_lines(robot: SmallRobot) -> None:
-    words = [sys.executable, "-c", "from palpate.live.topic_command import app; app()", "echo", "joint_states", "--json"]
+    words = [sys.executable, "-c", "from palpate.live.topic import app; app()", "echo", "joint_states", "--json"]
     # A shell lets what it starts in the background ignore SIGINT, and that is inherited.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -190,3 +191,11 @@ def test_only_roles_that_the_run_has_are_missed() -> None:
     assert "search" not in unknown, "it is optional"
     run = Run("hardware", {"robot": "tcp/127.0.0.1:1", "search": "tcp/127.0.0.1:2"})
     assert set(missing(RULES, [], run)) == {"robot", "search", *observers}
+
+
+def test_the_bar_follows_the_position_and_is_silent_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with TimeLeft("playing", 10.0, 30.0) as bar:
+        bar.reach(15.0)
+        list(bar.get_renderables())
+        assert bar.tasks[0].percentage == pytest.approx(25.0)
+    assert capsys.readouterr().err == ""

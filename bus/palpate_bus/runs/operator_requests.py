@@ -29,6 +29,10 @@ class NotAnswered(RunError):
     """No run answered the request, or it was refused. The message says which."""
 
 
+class NoConductorError(NotAnswered):
+    """No conductor answered: it has not been discovered yet, has not started, or has left."""
+
+
 def request_key(domain: int) -> str:
     """The key of the query."""
     return f"{domain}/palpate/operator"
@@ -47,7 +51,7 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
         if not answer["done"]:
             raise NotAnswered(answer["words"])
         return answer["words"], float(answer["after_ms"])
-    raise NotAnswered("the run does not answer: its conductor is gone, or has not started it yet")
+    raise NoConductorError("the run does not answer: its conductor has left, or has not started it yet")
 
 
 def order(session: zenoh.Session, domain: int, word: str, reason: str) -> str:

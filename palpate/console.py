@@ -1,0 +1,199 @@
+"""Console output, exit statuses, output options and progress bars of the `palpate` commands."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NoReturn
+
+import typer
+from rich.console import Console, RenderableType
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from typer.core import TyperGroup
+
+from palpate_errors import RunError, UserError
+
+EXIT_TROUBLE = 1
+"""A check found something wrong."""
+EXIT_BAD_INPUT = 2
+"""The command refused its input and started nothing."""
+EXIT_FAILED = 3
+"""The command failed after it had started."""
+WIDE_COLUMNS = 140
+"""Width of tables in a pipe."""
+
+
+class SteadyConsole(Console):
+    """Console that tolerates a closed pipe."""
+
+    def on_broken_pipe(self) -> None:
+        """Discards further output."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
+class CommandGroup(TyperGroup):
+    """The commands. Every exception that Palpate raises on purpose becomes one line and an exit status here."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the chosen command."""
+        try:
+            return super().invoke(ctx)
+        except UserError as error:
+            refuse(error)
+        except RunError as error:
+            fail(error)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            refuse(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else error)
+
+
+def say(why: object) -> None:
+    """Prints a message to standard error, without markup."""
+    SteadyConsole(stderr=True).print(f"[bold red]palpate:[/] {escape(str(why))}", highlight=False, soft_wrap=True)
+
+
+def refuse(why: object) -> NoReturn:
+    """Prints a message and exits with the status of bad input."""
+    say(why)
+    raise typer.Exit(EXIT_BAD_INPUT) from None
+
+
+def fail(why: object) -> NoReturn:
+    """Prints a message and exits with the status of a failure after the start."""
+    say(why)
+    raise typer.Exit(EXIT_FAILED) from None
+
+
+def output_file(text: str, *names: str) -> typer.models.OptionInfo:
+    """Return the option for a file that the command writes at its end; its folder is made when the options are read.
+
+    `text`: the help; `names`: names of the option, if not that of its parameter.
+    """
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None:
+            _make(path.parent)
+            if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+                raise typer.BadParameter(f"{path}: is not a writable file")
+        return path
+
+    return _option(text, check, *names)
+
+
+def output_folder(text: str, *names: str) -> typer.models.OptionInfo:
+    """Return the option for a folder that the command writes into; as `output_file`."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None:
+            _make(path)
+            if not os.access(path, os.W_OK):
+                raise typer.BadParameter(f"{path}: is not a writable folder")
+        return path
+
+    return _option(text, check, *names)
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(f"{folder}: cannot be made a folder: {error.strerror}") from None
+
+
+def _option(text: str, check: Callable[[Path | None], Path | None], *names: str) -> typer.models.OptionInfo:
+    option: typer.models.OptionInfo = typer.Option(*names, help=text, callback=check)
+    return option
+
+
+def wide_console() -> Console:
+    """Return a console on standard output, wide if that is not a terminal, so that tables stay whole in a pipe."""
+    plain = Console(highlight=False)
+    return plain if plain.is_terminal else Console(highlight=False, width=max(WIDE_COLUMNS, plain.width))
+
+
+def print_json(value: Any) -> None:
+    """Prints one JSON document to standard output."""
+    print(json.dumps(value, indent=2), flush=True)
+
+
+def print_line(value: Any) -> None:
+    """Prints one line of JSON, for streams."""
+    print(json.dumps(value), flush=True)
+
+
+def table(*columns: str) -> Table:
+    """Return an empty table; columns that start with `>` are right-aligned."""
+    made = Table(box=None, pad_edge=False, header_style="bold")
+    for name in columns:
+        made.add_column(name.lstrip(">"), justify="right" if name.startswith(">") else "left", overflow="fold")
+    return made
+
+
+def number(value: float | None, unit: str = "", digits: int = 4) -> str:
+    """Return a figure with its unit; a dash for None."""
+    return "-" if value is None else f"{value:.{digits}g}{' ' if unit else ''}{unit}"
+
+
+def bandwidth(bytes_per_s: float) -> str:
+    """Return a bandwidth in B/s, kB/s or MB/s."""
+    for factor, unit in ((1e6, "MB/s"), (1e3, "kB/s")):
+        if bytes_per_s >= factor:
+            return f"{bytes_per_s / factor:.4g} {unit}"
+    return f"{bytes_per_s:.0f} B/s"
+
+
+class CaseDisplay(Progress):
+    """A bar over many cases on a terminal; one line per case otherwise; nothing when quiet."""
+
+    def __init__(self, console: Console, quiet: bool, unit: str = "examinations") -> None:
+        self._lines = not (quiet or console.is_terminal)
+        columns = (SpinnerColumn(), TextColumn(unit), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn())
+        super().__init__(
+            *(*columns, TextColumn("{task.fields[last]}")),
+            console=console,
+            transient=True,
+            disable=quiet or self._lines,
+            speed_estimate_period=3600.0,  # one case may take minutes
+        )
+        self._task = self.add_task(unit, total=None, last="")
+
+    def tell(self, done: int, total: int, last: str) -> None:
+        """Shows the number of finished cases and the name of the last one."""
+        self.update(self._task, completed=done, total=total, last=last)
+        if self._lines and done:
+            self.console.print(f"{done} of {total}  {last}", highlight=False)
+
+
+class TimeLeft(Progress):
+    """A bar from `begin` to `end`, in any unit, for a `with` block; nothing if standard error is not a terminal."""
+
+    def __init__(self, description: str, begin: float, end: float) -> None:
+        console = Console(stderr=True)
+        columns = (TextColumn(description), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
+        super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=10.0)
+        self._begin = self._reached = begin
+        self._shown = self.add_task(description, total=end - begin)
+
+    def reach(self, where: float) -> None:
+        """Sets the position. Cheap: the bar is drawn ten times per second only."""
+        self._reached = where
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Updates the bar; rich calls this at each refresh."""
+        if self.task_ids:  # rich draws before the task exists, too
+            self.update(self._shown, completed=self._reached - self._begin)
+        yield from super().get_renderables()

@@ -1,0 +1,80 @@
+"""Options that choose a live bus, and how a tool joins it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import monotonic, sleep
+from typing import Annotated, NamedTuple
+
+import typer
+import zenoh
+
+from palpate_bus.contract import Contract
+from palpate_bus.runs.joining import BusTarget, NoBus, find
+from palpate_bus.security.access import public
+from palpate_bus.wire.zenoh_config import BusOptions, session
+
+Connect = Annotated[
+    list[str] | None,
+    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Endpoint to join, e.g. tcp/10.0.0.5:7447; may be repeated."),
+]
+ChosenRun = Annotated[str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")]
+Domain = Annotated[int | None, typer.Option(help="ROS domain; by default the run's, else ROS_DOMAIN_ID.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+LINK_TIMEOUT_S = 1.0
+
+
+class ChosenBus(NamedTuple):
+    """The bus to join: endpoints, or a run, or by default the only run on this machine."""
+
+    connect: Sequence[str] | None = None
+    run: str | None = None
+    domain: int | None = None
+
+
+@dataclass(frozen=True)
+class Joined:
+    """A zenoh session on the bus of a run."""
+
+    session: zenoh.Session
+    target: BusTarget
+
+    @property
+    def domain(self) -> int:
+        """ROS domain."""
+        return self.target.domain
+
+    def readable_topics(self, rules: Contract) -> list[str]:
+        """Return the topics that may be subscribed to: all, or the public ones on a secure bus."""
+        return list(rules.topics) if self.target.options.tls is None else public(rules)
+
+
+@contextmanager
+def joined(chosen: ChosenBus) -> Iterator[Joined]:
+    """Joins a bus for a `with` block. Ctrl-C ends the command with status 0.
+
+    Raises UserError when there is no such bus.
+    """
+    target = find(*chosen)
+    try:
+        with session(target.options) as bus:
+            _wait_for_links(bus, target.options)
+            yield Joined(bus, target)
+    except KeyboardInterrupt:
+        sys.stdout.flush()
+        raise typer.Exit(0) from None
+
+
+def _wait_for_links(bus: zenoh.Session, options: BusOptions) -> None:
+    """Waits until every endpoint has answered, at most `LINK_TIMEOUT_S`. Raises NoBus if none has."""
+    wanted = len(options.connect) + bool(options.router)
+    end = monotonic() + LINK_TIMEOUT_S
+    while (links := len(bus.info.peers_zid()) + len(bus.info.routers_zid())) < wanted and monotonic() < end:
+        sleep(0.02)
+    if wanted and not links:
+        tried = ", ".join((*options.connect, *([options.router] if options.router else [])))
+        raise NoBus(f"no answer at {tried}")

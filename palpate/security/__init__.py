@@ -1,1 +1,0 @@
-"""Commands of the secure mode: certificates and the router."""
