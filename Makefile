@@ -1,14 +1,13 @@
-# `make run` and `make test` do all the set-up they need: Python 3.11 to 3.13 with venv is enough. PYTHON=... says which. `make run`
-# installs what the default examination needs; everything else installs all of it, and the tools of the workspace.
+# `make run` and `make test` install what they need: Python 3.11 to 3.13 with venv is enough; PYTHON=... selects it. `make run` installs the
+# libraries of the default examination; every other target installs all libraries and the development tools.
 VENV := .venv
 BIN := $(VENV)/bin
-# What pip says of packages that are there already is of no use to anybody.
 PIP = $(BIN)/python -m pip install --disable-pip-version-check --progress-bar on -c constraints.txt
 PYTHON ?= python3
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export PYTHONHASHSEED := 0
-# Two processes share the tests out; what belongs together, tests/conftest.py says.
+# Two processes share the tests; tests/conftest.py keeps related tests together.
 TWO_WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: run test test-slow test-docker test-browser lint format bench docs install venv clean
@@ -51,10 +50,10 @@ docs: install  ## the site with its generated reference pages: out/site/index.ht
 
 install: $(VENV)/.installed
 
-# Where all is installed, what the examination needs is, too.
+# A full installation includes the libraries of the default examination.
 $(VENV)/.examines: pyproject.toml constraints.txt $(wildcard $(VENV)/.installed)
 	@test -e $(VENV)/.installed || { $(MAKE) --no-print-directory venv && \
-	echo "installing what an examination needs, about 1.5 GB; the dashboard by: $(BIN)/pip install -c constraints.txt -e '.[dashboard]'" && \
+	echo "installing the libraries of an examination, about 1.5 GB; for the dashboard: $(BIN)/pip install -c constraints.txt -e '.[dashboard]'" && \
 	$(PIP) -e '.[run]'; }
 	@touch $@
 
