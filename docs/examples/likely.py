@@ -1,10 +1,10 @@
-"""A search policy of your own: press the most probable place of a lump among those not felt yet."""
+"""A search policy: press the most probable place of a lump that has not been pressed yet."""
 
 import numpy as np
 
 
 def next_press(posterior, budget):
-    """Place [m], xy in the abdomen frame, and depth [m] of the next press."""
+    """Return place [m], xy in the abdomen frame, and depth [m] of the next press."""
     places, probability = posterior.task.places, posterior.by_place.copy()
     for press in posterior.presses:
         probability[np.linalg.norm(places - press.xy, axis=1) < 0.015] = 0.0

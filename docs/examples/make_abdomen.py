@@ -1,4 +1,4 @@
-"""Your own mesh: half an ellipsoid on a flat back, in metres and in the abdomen frame."""
+"""Write a mesh: half an ellipsoid on a flat back, in metres and in the abdomen frame."""
 
 import sys
 

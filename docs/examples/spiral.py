@@ -1,4 +1,4 @@
-"""A scan pattern of your own: a spiral from the centre of the region outwards, in one stroke."""
+"""A scan pattern: a spiral from the centre of the region outwards, in one stroke."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from palpate_models.scenario.patterns import Scan
 
 
 def scan(exam, surface):
-    """Lines of targets in the abdomen frame [m]."""
+    """Return lines of targets in the abdomen frame [m]."""
     turns = min(exam.region_m) / 2 / exam.spacing_m
     count = int(np.pi * turns**2)
     angle = 2 * np.pi * np.sqrt(np.linspace(0, turns**2, count))  # evenly over the disc

@@ -1,4 +1,4 @@
-"""A tissue of your own: a bed of independent springs, one under each point of the skin."""
+"""A tissue: a bed of independent springs, one under each point of the skin."""
 
 import numpy as np
 
@@ -16,9 +16,9 @@ class Springs(TissueBackend):
     """A point of modulus k and area A, displaced by u along its normal, pushes back with k A u."""
 
     def step(self, t_s, p_A, v_A, radius, w_A=None):
-        """Force on the sphere at p_A [N] and its torque about the centre [N m], abdomen frame."""
+        """Return force [N] and torque about the centre [N m] on the sphere at p_A, abdomen frame."""
         normals = self.model.normals
-        lifted = self.excursion(t_s) * self.model.breathing  # outward, by the breath
+        lifted = self.excursion(t_s) * self.model.breathing  # outward, by breathing
         from_centre = self.model.vertices + lifted[:, None] * normals - p_A
         along = np.einsum("ij,ij->i", from_centre, normals)
         inside = radius**2 - np.einsum("ij,ij->i", from_centre, from_centre)
@@ -28,11 +28,11 @@ class Springs(TissueBackend):
         self._inward, self._contacts = pressed - lifted, np.flatnonzero(held)
         self.touching = bool(len(self._contacts))
         force = self.model.stiffness * self.model.areas * pressed / np.where(held, below, 1.0)
-        to_centre = pressed[:, None] * normals - from_centre  # no friction: it pushes this way
+        to_centre = pressed[:, None] * normals - from_centre  # without friction the force points to the centre
         return force @ to_centre, np.zeros(3)
 
     def idle(self, t_s):
-        """No sphere anywhere: it only breathes."""
+        """Without a sphere the surface only breathes."""
         self._inward = -self.excursion(t_s) * self.model.breathing
         self._contacts, self.touching = np.empty(0, np.intp), False
 
@@ -41,7 +41,7 @@ class Springs(TissueBackend):
         self.idle(0.0)
 
     def press(self, places, normals, radius):
-        """The standard presses of the scoring. Without memory only their full depth matters."""
+        """Return apparent stiffness of standard presses; without memory only their full depth matters."""
         still = np.zeros(3)
         spheres = places + (radius - press.DEPTH_M) * normals
         forces = [self.step(0.0, p, still, radius)[0] @ n for p, n in zip(spheres, normals, strict=True)]
@@ -52,13 +52,13 @@ class Springs(TissueBackend):
 
     @property
     def deepest(self):
-        """The point in contact that is displaced most, and by how much [m]."""
+        """Return the contact vertex of largest displacement and its displacement [m]."""
         vertex = int(self._contacts[np.argmax(self._inward[self._contacts])])
         return vertex, float(self._inward[vertex])
 
 
 def create(scenario):
-    """The service of the role `tissue`."""
+    """Return the service of the role `tissue`."""
     model = build_phantom(scenario.phantom, scenario.seed)
     breathing = BreathingCurve(scenario.phantom.breathing, scenario.seed)
     springs = Springs(model, breathing, dt=contract().roles["tissue"].period / NS)

@@ -1,4 +1,4 @@
-"""Your own assessment: what takes more than twice the force of the softest tenth is stiff."""
+"""An assessment: places with more than twice the force of the softest tenth are stiff."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from palpate_models.section import quadrant
 
 
 class Threshold(Service):
-    """Force at depth over that of the softest places."""
+    """Force at depth divided by that of the softest places."""
 
     role = "assessment"
 
@@ -20,7 +20,7 @@ class Threshold(Service):
         self.places, self.forces, self.done = [], [], False
 
     def step(self, t, inbox):
-        """Listens to the examination; once it is over, says what was stiff."""
+        """Collect samples; publish the findings when the scan is over."""
         for state in inbox.new("exam/state"):
             if state.steady:  # in contact, at depth
                 point = state.surface_point
@@ -33,7 +33,7 @@ class Threshold(Service):
         return {}
 
     def findings(self):
-        """One finding: all places that took more than twice the force of the softest tenth."""
+        """Return one finding: all places with more than twice the force of the softest tenth."""
         places = apply(self.X_AW, np.array(self.places))
         ratio = np.array(self.forces) / np.quantile(self.forces, 0.1)
         stiff = places[ratio > 2.0]
@@ -46,5 +46,5 @@ class Threshold(Service):
 
 
 def create(scenario):
-    """The service of a scenario."""
+    """Return the service of a scenario."""
     return Threshold(exam_input(scenario))

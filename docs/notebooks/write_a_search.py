@@ -126,6 +126,6 @@ plt.show()
 # %% [markdown]
 # ## Yours
 #
-# Where to press next is a function of the map. Try another: the place where the apparent stiffness is greatest, a press and its
+# Try another function of the map: the place where the apparent stiffness is greatest, a press and its
 # uncertainty together, or a `slide` where it gives more information per second. Compare on patients who breathe:
 # `palpate.Patient("lump", seed=7)`, and decide when to stop. [Search](../search.md) compares ten policies.
