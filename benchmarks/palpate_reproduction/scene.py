@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.messages.geometry import transform_matrix
-from palpate_dashboard import arrays, palette, patient
-from palpate_dashboard.geometry import Carry, VertexNormals, creased
+from palpate_dashboard import arrays, palette
+from palpate_dashboard.geometry import Carry, VertexNormals, shaded
 from palpate_dashboard.replay import RecordedInbox, messages
-from palpate_models.numerics.frames import apply, inverse
+from palpate_models.numerics.frames import apply
 from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.load import exam_input
@@ -70,17 +70,13 @@ class Stage:
         given = exam_input(scenario)
         self._X_WA = np.array(given.X_WA)
         self._links = {
-            link: [(*creased(mesh.vertices, mesh.triangles), mesh.rgba) for mesh in meshes]
+            link: [(*shaded(mesh.vertices, mesh.triangles), mesh.rgba) for mesh in meshes]
             for link, meshes in visual_meshes(given.robot).items()
         }
         self._triangles = arrays.triples(rest.surface.triangles).astype(np.uint32)
         vertices = arrays.triples(rest.surface.vertices).astype(np.float64)
         self._rest = vertices
         self._still = [_box(box) for box in table.boxes(given.robot)]
-        bed = patient.Bed(table.TABLE_TOP_M - float(self._X_WA[2, 3]), (table.TABLE_X_M[1] - table.TABLE_X_M[0]) / 2)
-        for part in patient.parts(apply(inverse(self._X_WA), vertices), bed, given.exam.region_m, given.exam.centre_m):
-            normals = part.normals @ self._X_WA[:3, :3].T
-            self._still.append(_body(apply(self._X_WA, part.vertices.astype(np.float64)), part.triangles, normals, part.color))
 
     def bodies(self, moment: Moment) -> list[Body]:
         """All that is seen at a moment."""
@@ -120,6 +116,6 @@ def _box(box: table.Box) -> Body:
     corner = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * box.size
     sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     faces = np.array([face for a, b, c, d in sides for face in ((a, b, c), (a, c, d))])
-    vertices, triangles, normals = creased(corner, faces)
+    vertices, triangles, normals = shaded(corner, faces)
     color = palette.PLINTH if box.name == "robot_base" else palette.SHEET
     return _body(apply(box.X_WB, vertices.astype(np.float64)), triangles, normals @ box.X_WB[:3, :3].T, color)

@@ -1,1 +1,1 @@
-"""Dashboard: what happens on the bus, drawn in rerun."""
+"""Dashboard: draws a run in rerun."""

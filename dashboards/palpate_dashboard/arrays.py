@@ -1,4 +1,4 @@
-"""Messages as the arrays that the drawing takes."""
+"""Converts messages to arrays for drawing."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from palpate_models.numerics.frames import Array
 
 
 def points(items: Any) -> Array:
-    """Points or Vector3s, shape (n, 3)."""
+    """Return Points or Vector3s as an array, shape (n, 3)."""
     return np.array([(p.x, p.y, p.z) for p in items], dtype=np.float64).reshape(-1, 3)
 
 
 def transform(message: Transform) -> Array:
-    """A Transform as x y z [m] qx qy qz qw, shape (7,)."""
+    """Return a Transform as x y z [m] qx qy qz qw, shape (7,)."""
     p, q = message.translation, message.rotation
     return np.array((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
 
 
 def triples(flat: NDArray[Any]) -> NDArray[Any]:
-    """x0 y0 z0 x1 ... as shape (n, 3), a view."""
+    """Return x0 y0 z0 x1 ... as a view of shape (n, 3)."""
     return flat.reshape(-1, 3)
 
 
 def cloud(message: Message) -> NDArray[np.float32]:
-    """The x y z of a PointCloud2 of 32-bit floats [m], shape (n, 3), without invalid points."""
+    """Return the x y z of a PointCloud2 of 32-bit floats [m], shape (n, 3), without invalid points."""
     offsets = {field.name: field.offset for field in message.fields}
     layout = np.dtype({
         "names": ["x", "y", "z"],

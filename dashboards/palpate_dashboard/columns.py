@@ -1,4 +1,4 @@
-"""Rows of a recording, collected and sent as columns: one call for many rows, so that drawing stays cheap."""
+"""Batches rows of a recording and sends them as columns: one call for many rows keeps drawing cheap."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TIMELINE = "sim_time"
 
 Row = Any
 Kind = Callable[[Sequence[Row]], Any]
-"""Makes the columns of an entity from its rows."""
+"""Builds the columns of an entity from its rows."""
 
 
 def scalars(rows: Sequence[Array]) -> Any:
@@ -46,14 +46,14 @@ def arrows(rows: Sequence[tuple[Array, Array]]) -> Any:
 
 
 class Columns:
-    """Collects rows by entity; `send` hands them to the recording."""
+    """Collects rows by entity; `send` writes them to the recording."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._recording = recording
         self._rows: dict[str, tuple[Kind, list[int], list[Row]]] = {}
 
     def add(self, entity: str, kind: Kind, t: int, row: Row) -> None:
-        """A row of `entity` at simulated time `t` [ns]. An entity has one kind."""
+        """Adds a row of `entity` at simulated time `t` [ns]. An entity has one kind."""
         try:
             _, times, rows = self._rows[entity]
         except KeyError:
@@ -62,7 +62,7 @@ class Columns:
         rows.append(row)
 
     def send(self) -> None:
-        """Sends all rows collected so far, in one chunk an entity."""
+        """Sends the collected rows, one chunk per entity."""
         for entity, (kind, times, rows) in self._rows.items():
             if times:
                 index = rr.TimeColumn(TIMELINE, duration=np.array(times, dtype="timedelta64[ns]"))

@@ -1,4 +1,4 @@
-"""How the viewer is laid out: the scene large, maps and depth image under it, words and curves to its right."""
+"""Viewer layout: large scene, maps and depth image below it, text and plots to its right."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _whole_past() -> Any:
 
 
 _HIDDEN = rrb.EntityBehavior(visible=False)
-"""Shown when the user clicks the eye beside its name in the viewer. Until then the picture shows nothing of the truth."""
+"""Hidden until the user clicks the eye next to its name: the picture shows no ground truth by default."""
 
 
 def _scene() -> Any:
@@ -40,13 +40,13 @@ def _scene() -> Any:
     )
 
 
-BESIDE_M = 0.08
-"""What a map's view shows beside the region [m]: the map's margin on both sides, and the legend, whose size is fixed."""
+MAP_MARGIN_M = 0.08
+"""Space around the region in the map views: margins and the legend, whose size is fixed."""
 
 
 def _map(layer: str, name: str, region_m: tuple[float, float], centre_m: tuple[float, float]) -> Any:
     x, y = centre_m[0] + 0.025, centre_m[1]
-    distance = 0.93 * (max(region_m) + BESIDE_M)
+    distance = 0.93 * (max(region_m) + MAP_MARGIN_M)
     return rrb.Spatial3DView(
         name=name,
         origin=f"/map/{layer}",
@@ -58,11 +58,11 @@ def _map(layer: str, name: str, region_m: tuple[float, float], centre_m: tuple[f
 
 
 PAST_S, LEGEND_S = 60.0, 35.0
-"""How much of the past a curve shows [s], and the room to its right [s], where the legend stands beside the traces."""
+"""Plot window before the cursor, and space for the legend after it."""
 
 
 def _plot(name: str, origin: str, bounds: tuple[float, float] | None = None, hidden: Sequence[str] = ()) -> Any:
-    """The curves below `origin` over the last minute, without those that are `hidden` at first.
+    """Return a plot of the series below `origin` over the last minute; `hidden` ones are initially off.
 
     Without `bounds` the axis fits the data.
     """
@@ -94,9 +94,9 @@ def _force_depth(bounds: Bounds) -> Any:
 
 
 def blueprint(region_m: tuple[float, float], centre_m: tuple[float, float], depth_m: float, plane: Bounds) -> Any:
-    """The layout for an exam of `region_m` about `centre_m` at `depth_m`.
+    """Return the layout for an examination of `region_m` around `centre_m` at `depth_m`.
 
-    `plane`: what of the force-depth plane is shown.
+    `plane`: visible bounds of the force-depth plane.
     """
     left = rrb.Vertical(
         _scene(),

@@ -17,10 +17,10 @@ LAYERS: Final = ("mean", "band")
 
 
 class MapView:
-    """Draws the map into a recording. Positions are in A, metres; the third coordinate is dropped: it is seen from above."""
+    """Draws the map seen from above: positions are in A [m], z is dropped."""
 
     def __init__(self, recording: rr.RecordingStream, region_m: tuple[float, float], centre_m: tuple[float, float]) -> None:
-        """`region_m`: width and height of the examined region about `centre_m`."""
+        """`region_m`: width and height of the examined region around `centre_m`."""
         self._recording = recording
         self._shape: tuple[NDArray[np.float32], Indices] | None = None
         (w, h), (x, y) = region_m, centre_m
@@ -53,14 +53,14 @@ class MapView:
         places = self._corner + np.outer((np.arange(len(labels)) + 0.5) * step, (0.0, 1.0, 0.0))
         swatches = rr.Boxes3D(centers=places, half_sizes=[(0.006, step / 2, 0.0005)], colors=colors, fill_mode="solid")
         self._recording.log(f"map/{layer}/legend", swatches, static=True)
-        beside = places + np.array((0.03, 0.0, 0.0))
-        words = rr.Points3D(beside, labels=labels, radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
-        self._recording.log(f"map/{layer}/legend/words", words, static=True)
+        label_places = places + np.array((0.03, 0.0, 0.0))
+        names = rr.Points3D(label_places, labels=labels, radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
+        self._recording.log(f"map/{layer}/legend/labels", names, static=True)
 
     def update(
         self, t: int, vertices: NDArray[np.float32], triangles: Indices, ratio: Array, spread: Array, scanned: NDArray[np.bool_]
     ) -> None:
-        """The map: stiffness over background [1] and half width of its 90 % band over its mean [1], at the vertices."""
+        """Draws stiffness over background [1] and half width of the 90 % band over the mean [1], at the vertices."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
         flat = vertices * np.array((1, 1, 0), dtype=np.float32)
         shape = self._shape
@@ -75,13 +75,13 @@ class MapView:
             self._recording.log(f"map/{layer}/surface", mesh)
 
     def lesions(self, segments: Iterable[Array]) -> None:
-        """True outlines of the lesions, one (k, 2, 3) array of segments each."""
+        """Draws true lesion outlines, one (k, 2, 3) array of segments each."""
         strips = [segment * (1, 1, 0) + (0, 0, 0.003) for outline in segments for segment in outline]
         shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
         self._recording.log("map/mean/truth", shape, static=True)
 
     def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
-        """Centroids of the findings, shape (n, 3)."""
+        """Draws centroids of the findings, shape (n, 3)."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
         places = centroids * (1, 1, 0) + (0, 0, 0.004)
         shape = rr.Points3D(places, colors=[palette.FINDING], radii=[0.003], labels=labels, show_labels=True)

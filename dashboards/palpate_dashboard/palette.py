@@ -1,4 +1,4 @@
-"""Colours: what stiffness looks like, and one colour for each thing that is drawn."""
+"""Colour scales of the maps, and the colour of each drawn item."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ Rgba = tuple[int, int, int, int]
 SKIN: Final[Rgba] = (226, 180, 150, 255)
 SHEET: Final[Rgba] = (96, 128, 150, 255)
 STEEL: Final[Rgba] = (150, 156, 164, 255)
-DRAPE: Final[Rgba] = (52, 118, 122, 255)
-LINEN: Final[Rgba] = (214, 220, 224, 255)
 PLINTH: Final[Rgba] = (70, 74, 82, 255)
 POINTS: Final[Rgba] = (90, 200, 250, 255)
 TARGETS: Final[Rgba] = (255, 255, 255, 255)
@@ -30,11 +28,11 @@ _RAMP: Final = np.array(
 )
 
 LEGEND: Final = (0.5, 1.0, 2.0, 4.0)
-"""Ratios that the legend names."""
+"""Ratios shown in the legend."""
 
 
 def stiffness_colors(ratio: NDArray[np.floating[Any]]) -> NDArray[np.uint32]:
-    """Colours of stiffness over background [1]: blue softer, pale as the background, red stiffer.
+    """Return colours of stiffness over background [1]: blue softer, pale equal, red stiffer.
 
     The scale is logarithmic and saturates at 0.4 and 5. Returns 0xRRGGBBAA, the shape of `ratio`.
     """
@@ -46,7 +44,7 @@ def stiffness_colors(ratio: NDArray[np.floating[Any]]) -> NDArray[np.uint32]:
 
 
 def spread_colors(spread: NDArray[np.floating[Any]]) -> NDArray[np.uint32]:
-    """Colours of the half width of the 90 % band over the mean [1]: dark where sure, light from 0.6 on. 0xRRGGBBAA."""
+    """Return colours of the half width of the 90 % band over the mean [1]: dark if narrow, light from 0.6. 0xRRGGBBAA."""
     x = np.clip(spread / 0.6, 0.0, 1.0)
     low, high = np.array((30, 60, 70)), np.array((250, 235, 130))
     channels = [(low[i] + x * (high[i] - low[i])).astype(np.uint32) for i in range(3)]
@@ -55,6 +53,6 @@ def spread_colors(spread: NDArray[np.floating[Any]]) -> NDArray[np.uint32]:
 
 
 def packed(color: Rgba) -> int:
-    """A colour as 0xRRGGBBAA."""
+    """Return a colour as 0xRRGGBBAA."""
     r, g, b, a = color
     return (r << 24) | (g << 16) | (b << 8) | a

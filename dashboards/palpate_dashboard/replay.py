@@ -1,35 +1,48 @@
-"""Draws a run again from the recorder's MCAP file, without simulating it again.
+"""Draws a run from the recorder's MCAP file, finished or live.
 
 python -m palpate_dashboard.replay DIR            # writes DIR/recording.rrd from DIR/recording_mcap and DIR/scenario.yaml
+
+`follow` draws a live run: its past from the recording, then live messages. It is a separate node; no service waits for it.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from contextlib import AbstractContextManager, nullcontext
 from heapq import heappop, heappush
 from itertools import groupby
 from pathlib import Path
+from time import monotonic, sleep
 
+import zenoh
 from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import codec
+from palpate_bus.messages import RunControl, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.recordings import BROKEN, complete_records
+from palpate_bus.runs.announcement import Run, live
+from palpate_bus.runs.operator_keys import OperatorKeys
+from palpate_bus.runs.operator_requests import order
+from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.observer import IDLE_S, ObservedService
+from palpate_bus.security.access import OPERATOR
 from palpate_bus.settings import RECORDING
+from palpate_bus.wire.zenoh_config import session
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.scenario.load import load_scenario
 
 DISORDER = 2_000_000_000
-"""Messages in a recording are at most so far out of order [ns]."""
+"""Greatest disorder of messages in a recording [ns]."""
 
 
 class RecordedInbox:
-    """The inbox that the dashboard would have had: the latest message of each topic, decoded when looked at."""
+    """Inbox over a recording: the latest message of each topic, decoded on access."""
 
     def __init__(self) -> None:
         self._types = {topic.name: topic.type for topic, _ in contract().inputs("dashboard")}
@@ -38,39 +51,39 @@ class RecordedInbox:
         self._stamps: dict[str, int] = {}
 
     def put(self, topic: str, payload: bytes, stamp: int) -> None:
-        """Takes one message."""
+        """Stores one message."""
         self._payloads[topic] = payload
         self._messages.pop(topic, None)
         self._stamps[topic] = stamp
 
     def latest(self, topic: str) -> Message | None:
-        """The newest message, or None before the first."""
+        """Return the latest message, or None before the first."""
         if topic not in self._messages and topic in self._payloads:
             self._messages[topic] = codec.decode(self._payloads[topic], self._types[topic])
         return self._messages.get(topic)
 
     def new(self, topic: str) -> list[Message]:
-        """The newest message alone: the dashboard wants no other."""
+        """Return at most the latest message: the dashboard uses no other."""
         message = self.latest(topic)
         return [] if message is None else [message]
 
     def stamp(self, topic: str) -> int | None:
-        """The simulated time [ns] of the newest message."""
+        """Return the simulated time [ns] of the latest message."""
         return self._stamps.get(topic)
 
     def lost(self, role: str) -> bool:
-        """Whether that role's service is gone; a recording does not say."""
+        """Return False: a recording does not contain this."""
         return False
 
 
 def recording_of(folder: Path) -> tuple[Path, ...]:
-    """The MCAP files of the run in `folder`, in order; empty when there are none. A long recording has several."""
+    """Return the MCAP files of the run in `folder`, in order; a long recording has several."""
     files = (folder / RECORDING).glob(f"{RECORDING}_*.mcap")
     return tuple(sorted(files, key=lambda path: int(path.stem.rpartition("_")[2])))
 
 
 def end_of(files: Sequence[Path]) -> int | None:
-    """The time of a recording's last message [ns]; None where its last file is not complete. Raises OSError."""
+    """Return the time of the last message [ns]; None if the last file is incomplete. Raises OSError."""
     with files[-1].open("rb") as stream:
         try:
             summary = make_reader(stream).get_summary()
@@ -80,10 +93,10 @@ def end_of(files: Sequence[Path]) -> int | None:
 
 
 def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
-    """Time [ns], topic and payload of what the dashboard observes, in order of time: all that is complete in the files.
+    """Yields time [ns], topic and payload of all complete messages on observed topics, ordered by time.
 
-    The last one may still be written, or be cut off. Chunks of the services come as they were sent, so the order of time is
-    restored within `DISORDER`. Raises OSError.
+    The last file may still be written or be truncated. Services send messages in chunks, so order is restored within `DISORDER`.
+    Raises OSError.
     """
     topics = {f"/{topic.name}" for topic, _ in contract().inputs("dashboard")}
     waiting: list[tuple[int, int, str, bytes]] = []
@@ -107,10 +120,12 @@ def _records(files: Sequence[Path], topics: Set[str]) -> Iterator[tuple[str, Mca
                 yield names[record.channel_id], record
 
 
-def draw(source: Iterable[tuple[int, str, bytes]], service: DashboardService, tell: Callable[[int], None] | None = None) -> int:
-    """Steps `service` through messages in order of time, every period of its role; returns the last time [ns], -1 if none.
+def draw(
+    source: Iterable[tuple[int, str, bytes]], service: DashboardService, progress: Callable[[int], None] | None = None
+) -> int:
+    """Steps `service` through time-ordered messages at its period; returns the last time [ns], -1 without messages.
 
-    `tell` hears the simulated time [ns] that is reached.
+    `progress` receives the simulated time [ns].
     """
     period = contract().roles[service.role].period
     inbox = RecordedInbox()
@@ -120,28 +135,28 @@ def draw(source: Iterable[tuple[int, str, bytes]], service: DashboardService, te
             inbox.put(topic, payload, stamp)
         last = tick * period
         service.step(last, inbox)
-        if tell is not None:
-            tell(last)
+        if progress is not None:
+            progress(last)
     return last
 
 
-def replay(files: Sequence[Path], service: DashboardService, tell: Callable[[int], None] | None = None) -> None:
+def replay(files: Sequence[Path], service: DashboardService, progress: Callable[[int], None] | None = None) -> None:
     """Steps `service` through the messages of a recording and finishes it. Raises OSError."""
-    draw(messages(files), service, tell)
+    draw(messages(files), service, progress)
     service.finish()
 
 
-def main(folder: Path, tell: Callable[[int], None] | None = None) -> Path:
-    """Draws the run in `folder` again; returns the file. Raises FileNotFoundError naming what is missing."""
+def main(folder: Path, progress: Callable[[int], None] | None = None) -> Path:
+    """Draws the run in `folder`; returns the file. Raises FileNotFoundError naming the missing file."""
     files, scenario = recording_of(folder), folder / "scenario.yaml"
     if not files or not scenario.is_file():
         needed = scenario if files else folder / RECORDING
-        raise FileNotFoundError(f"{needed}: not there; give the folder of a run that was recorded")
+        raise FileNotFoundError(f"{needed}: not found; give the folder of a recorded run")
     target = folder / FILE
     try:
-        replay(files, DashboardService(load_scenario(str(scenario)), target, Live(), paced=False), tell)
+        replay(files, DashboardService(load_scenario(str(scenario)), target, Live(), paced=False), progress)
     except BaseException:
-        target.unlink(missing_ok=True)  # half a drawing would be taken for the whole
+        target.unlink(missing_ok=True)  # a partial file would pass for a complete one
         raise
     return target
 
@@ -153,3 +168,48 @@ if __name__ == "__main__":
         print(main(Path(sys.argv[1])))
     except (OSError, ValueError) as error:
         sys.exit(str(error))
+
+
+CHECK_S = 1.0
+"""Interval of checking that the run is still announced."""
+
+
+def _operator(run: Run, bus: zenoh.Session) -> AbstractContextManager[zenoh.Session]:
+    """Return the session that carries operator requests: in a secure run it has the operator's certificate."""
+    return nullcontext(bus) if run.keys is None else session(run.options(OPERATOR))
+
+
+def follow(run: Run, service: DashboardService, report: Callable[[str], None], keys: OperatorKeys) -> str:
+    """Draws `run` until it ends, and forwards operator `keys`. Returns how the run ended."""
+    rules = contract()
+    with session(run.options()) as bus, _operator(run, bus) as operator:
+        member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)
+        control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
+        decode = codec.decoder("palpation_msgs/msg/RunControl")
+        observed = ObservedService(service, member)  # collects live messages while the past is drawn
+        recording = recording_of(Path(run.out))
+        if recording:
+            report(f"drawing the run's recording from {recording[0].parent}")
+            until = draw(messages(recording), service)
+            report(f"joined at {max(until, 0) / 1e9:.1f} s of simulated time")
+        checked = monotonic()
+        end = ""
+        while not end:
+            if not observed.drain_and_step():
+                sleep(IDLE_S)
+            for word in keys.pressed():
+                report(order(operator, run.domain, word, "a key of palpate dashboard"))
+            while (sample := control.get(0)) is not None:
+                message = decode(sample.payload)
+                if message.command == RunControl.END:
+                    end = "the run has ended"
+                elif message.command == RunControl.ABORT:
+                    end = f"the run was aborted: {message.reason}"
+            if monotonic() - checked > CHECK_S:
+                checked = monotonic()
+                if all((other.pid, other.started) != (run.pid, run.started) for other in live()):
+                    end = "the run disappeared"
+        observed.drain_and_step()
+        service.flush()
+        member.leave()
+    return end

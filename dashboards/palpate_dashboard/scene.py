@@ -13,26 +13,25 @@ from palpate_bus.messages.geometry import quaternion
 from palpate_dashboard import palette
 from palpate_dashboard.columns import TIMELINE, Columns, arrows, deformations, transforms
 from palpate_dashboard.geometry import Array, Carry, Indices, VertexNormals
-from palpate_dashboard.patient import Part
 
 METRES_PER_NEWTON: Final = 0.03
-"""Length of the force arrow: 5 N are 15 cm."""
-BESIDE_M: Final = np.array((0.035, -0.035, 0.0))
-"""The arrow stands so far beside the tool, in world, on the viewer's side: in its place the tool would hide it."""
+"""Scale of the force arrow: 5 N are 15 cm."""
+FORCE_OFFSET_W_M: Final = np.array((0.035, -0.035, 0.0))
+"""Offset of the force arrow towards the viewer, in world: the tool would hide it."""
 RESOLUTION_M: Final = 2e-4
-"""Vertices move in steps of this, so that what stands still is bit for bit the same and compresses to nothing."""
+"""Vertices are rounded to this, so that resting ones are bit-identical and compress to nothing."""
 CLOUD_POINTS: Final = 6000
-"""At most so many points of the perceived cloud are drawn."""
+"""Greatest number of drawn points of the perceived cloud."""
 CARRY_M: Final = 0.012
-"""A vertex of the abdomen takes its colour from a vertex of the map within this distance [m]."""
+"""Greatest distance from a vertex of the abdomen to the map vertex that colours it."""
 AXES_M: Final = 0.15
 """Length of the axes of the patient's true pose."""
 TRAIL_STEP_M: Final = 0.001
-"""The travelled path gets a new point when the tool has moved so far."""
+"""Distance between points of the travelled path."""
 
 
 class Shaded(NamedTuple):
-    """A mesh ready to be drawn: positions [m] and unit normals, shapes (n, 3); triangles, shape (m, 3)."""
+    """A mesh for drawing: positions [m] and unit normals, shapes (n, 3); triangles, shape (m, 3)."""
 
     positions: NDArray[np.float32]
     triangles: Indices
@@ -60,31 +59,18 @@ class SceneView:
         recording.log("world/tool/force", red, static=True)
 
     def at(self, t: int) -> None:
-        """Sets the simulated time [ns] of what is logged row by row."""
+        """Sets the simulated time [ns] of the following rows."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
 
     def box(self, name: str, X_WB: Array, size: tuple[float, float, float], color: palette.Rgba) -> None:
-        """A box that stands still: centre pose, shape (4, 4), and edge lengths [m]."""
+        """Draws a static box: centre pose, shape (4, 4), and edge lengths [m]."""
         path = f"world/furniture/{name}"
         self._recording.log(path, rr.Transform3D(translation=X_WB[:3, 3], mat3x3=X_WB[:3, :3]), static=True)
         shape = rr.Boxes3D(sizes=[size], colors=[color], fill_mode="solid")
         self._recording.log(path, shape, static=True)
 
-    def patient(self, X_WA: Array, shapes: Iterable[Part]) -> None:
-        """The patient about the abdomen, in A at `X_WA`, shape (4, 4). For display only."""
-        path = "world/patient"
-        self._recording.log(path, rr.Transform3D(translation=X_WA[:3, 3], mat3x3=X_WA[:3, :3]), static=True)
-        for part in shapes:
-            shape = rr.Mesh3D(
-                vertex_positions=part.vertices,
-                triangle_indices=part.triangles,
-                vertex_normals=part.normals,
-                albedo_factor=part.color,
-            )
-            self._recording.log(f"{path}/{part.name}", shape, static=True)
-
     def link_shape(self, link: str, meshes: Iterable[Shaded]) -> None:
-        """The shape of a robot link, in its own frame."""
+        """Draws the shape of a robot link, in its own frame."""
         for i, mesh in enumerate(meshes):
             shape = rr.Mesh3D(
                 vertex_positions=mesh.positions,
@@ -95,7 +81,7 @@ class SceneView:
             self._recording.log(f"world/robot/{link}/shape_{i}", shape, static=True)
 
     def link_poses(self, t: int, poses: Mapping[str, Array]) -> None:
-        """Poses of links by name: x y z [m] qx qy qz qw, shape (7,). A link that stands still is not written again."""
+        """Draws link poses by name: x y z [m] qx qy qz qw, shape (7,). A resting link is not repeated."""
         for link, pose in poses.items():
             before = self._poses.get(link)
             if before is None or np.abs(pose - before).max() > 2e-5:
@@ -103,7 +89,7 @@ class SceneView:
                 self._columns.add(f"world/robot/{link}", transforms, t, pose)
 
     def abdomen(self, t: int, vertices: NDArray[np.float32], triangles: Indices | None) -> None:
-        """The deformed surface: vertices, shape (n, 3); `triangles`, shape (m, 3), are needed the first time only."""
+        """Draws the deformed surface: vertices, shape (n, 3); `triangles`, shape (m, 3), only on the first call."""
         if self._normals is None:
             if triangles is None:
                 return
@@ -114,7 +100,7 @@ class SceneView:
             self._recording.log(path, rr.Mesh3D.from_fields(triangle_indices=triangles), static=True)
             self.at(t)
             self._recording.log(path, rr.Mesh3D.from_fields(vertex_colors=skin))
-            self._recording.flush()  # a viewer that reads along must not meet vertices before triangles
+            self._recording.flush()  # a live viewer must receive the triangles before the vertices
         rounded = np.round(vertices / RESOLUTION_M).astype(np.float32) * np.float32(RESOLUTION_M)
         if self._drawn is not None and np.array_equal(rounded, self._drawn):
             return
@@ -123,7 +109,7 @@ class SceneView:
         self._columns.add("world/abdomen", deformations, t, (rounded, normals))
 
     def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Array, scanned: NDArray[np.bool_]) -> None:
-        """Colours the abdomen by the map: its vertices, shape (k, 3), stiffness over background [1] and where it knows."""
+        """Colours the abdomen by the map: vertices, shape (k, 3), stiffness over background [1], and a mask of assessed ones."""
         if self._rest is None:
             return
         if self._carry is None or self._map_vertices is None or not np.array_equal(vertices, self._map_vertices):
@@ -135,14 +121,14 @@ class SceneView:
         self._recording.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)))
 
     def body(self, t: int, X_WA: NDArray[np.float64], excursion: float) -> None:
-        """The patient's true pose, shape (4, 4), and how far the breath has lifted the skin [m]; `world/truth` goes along."""
+        """Moves `world/truth` by the patient's true pose, shape (4, 4), and breathing excursion [m]."""
         lifted = np.concatenate((X_WA[:3, 3] + excursion * X_WA[:3, 2], quaternion(X_WA[:3, :3])))
         if self._lifted is None or np.abs(lifted - self._lifted).max() > RESOLUTION_M:
             self._lifted = lifted
             self._columns.add("world/truth", transforms, t, lifted)
 
     def lesions(self, segments: Iterable[Array]) -> None:
-        """True outlines of the lesions in A, one (k, 2, 3) array of segments each; with A's axes, hidden at first."""
+        """Draws true lesion outlines in A, one (k, 2, 3) array of segments each, and A's axes; initially hidden."""
         axes = rr.Arrows3D(vectors=AXES_M * np.eye(3), colors=[palette.TRUTH], labels=list("xyz"), radii=[0.001])
         self._recording.log("world/truth/axes", axes, static=True)
         strips = [segment for outline in segments for segment in outline]
@@ -150,13 +136,13 @@ class SceneView:
         self._recording.log("world/truth/lesions", shape, static=True)
 
     def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
-        """Centroids of the findings, shape (n, 3), with what to say of each."""
+        """Draws centroids of the findings, shape (n, 3), with labels."""
         self.at(t)
         shape = rr.Points3D(centroids, colors=[palette.FINDING], radii=[0.006], labels=labels, show_labels=True)
         self._recording.log("world/findings", shape)
 
     def camera(self, X_WC: Array) -> None:
-        """Pose of the camera's optical frame, shape (4, 4), as calibrated; with its body, and its tripod down to the floor."""
+        """Draws the camera at the calibrated pose of its optical frame, shape (4, 4), with its tripod."""
         pose = rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3])
         self._recording.log("world/camera", pose, static=True)
         self._recording.log("world/furniture/camera", pose, static=True)
@@ -171,33 +157,33 @@ class SceneView:
         self._recording.log("world/furniture/tripod", legs, static=True)
 
     def lens(self, k: Array, width: int, height: int) -> None:
-        """Intrinsics of the camera, shape (3, 3) [px]."""
+        """Sets the camera intrinsics, shape (3, 3) [px]."""
         view = rr.Pinhole(
             image_from_camera=k, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.2
         )
         self._recording.log("world/camera", view, static=True)
 
     def depth(self, t: int, image: NDArray[np.float32]) -> None:
-        """A depth image [m], shape (height, width), NaN where invalid; kept in whole millimetres."""
+        """Draws a depth image [m], shape (height, width), NaN where invalid; stored in whole millimetres."""
         self.at(t)
         millimetres = np.nan_to_num(image * 1000.0, nan=0.0).astype(np.uint16)
         shape = rr.DepthImage(millimetres, meter=1000.0, colormap="viridis", depth_range=(500.0, 1700.0))
         self._recording.log("world/camera/depth", shape)
 
     def cloud(self, t: int, points: NDArray[np.float32]) -> None:
-        """The perceived point cloud, shape (n, 3), thinned to what can be seen."""
+        """Draws the perceived point cloud, shape (n, 3), thinned to `CLOUD_POINTS`."""
         self.at(t)
         thinned = points[:: max(1, -(-len(points) // CLOUD_POINTS))]
         shape = rr.Points3D(thinned, colors=[palette.POINTS], radii=[0.0012])
         self._recording.log("world/perception/points", shape)
 
     def clear_cloud(self, t: int) -> None:
-        """Takes the cloud away: it would hide the abdomen's colours."""
+        """Removes the cloud: it would hide the abdomen's colours."""
         self.at(t)
         self._recording.log("world/perception/points", rr.Points3D([]))
 
     def perceived(self, t: int, vertices: NDArray[np.float32], triangles: Indices) -> None:
-        """The perceived rest surface."""
+        """Draws the perceived rest surface."""
         self.at(t)
         normals = VertexNormals(triangles, len(vertices))(vertices)
         shape = rr.Mesh3D(
@@ -206,7 +192,7 @@ class SceneView:
         self._recording.log("world/perception/surface", shape)
 
     def targets(self, t: int, positions: Array, normals: Array) -> None:
-        """Palpation points and outward normals, shapes (n, 3)."""
+        """Draws palpation targets and outward normals, shapes (n, 3)."""
         self.at(t)
         points = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.001])
         self._recording.log("world/perception/targets", points)
@@ -214,13 +200,13 @@ class SceneView:
         self._recording.log("world/perception/normals", needles)
 
     def planned(self, t: int, positions: Array) -> None:
-        """The planned path of the tool, shape (n, 3)."""
+        """Draws the planned path of the tool, shape (n, 3)."""
         self.at(t)
         shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(0.5)])
         self._recording.log("world/plan/path", shape)
 
     def tool(self, t: int, position: Array, in_contact: bool) -> None:
-        """The tool's position, shape (3,): extends the travelled path."""
+        """Extends the travelled path by the tool's position, shape (3,)."""
         if self._trail and np.abs(position - self._trail[-1]).max() < TRAIL_STEP_M:
             return
         self._trail.append(position)
@@ -228,7 +214,7 @@ class SceneView:
             self.extend_trail(t, in_contact)
 
     def extend_trail(self, t: int, in_contact: bool) -> None:
-        """Draws the piece of the travelled path since the last."""
+        """Draws the travelled path since the last call."""
         if len(self._trail) < 2:
             return
         self.at(t)
@@ -238,9 +224,9 @@ class SceneView:
         del self._trail[:-1]
 
     def force(self, t: int, position: Array, force: Array) -> None:
-        """The contact force [N], shape (3,), that presses on the indenter at `position`; drawn beside the tool."""
+        """Draws the contact force [N], shape (3,), on the indenter at `position`, next to the tool."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:
             vector = METRES_PER_NEWTON * force if shown else np.zeros(3)
-            self._columns.add("world/tool/force", arrows, t, (position + BESIDE_M, vector))
+            self._columns.add("world/tool/force", arrows, t, (position + FORCE_OFFSET_W_M, vector))
         self._force_shown = shown

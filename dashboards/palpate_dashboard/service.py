@@ -1,6 +1,6 @@
-"""The dashboard as a service: it takes the latest of every topic it observes and draws what changed.
+"""Dashboard service: takes the latest message of every observed topic and draws what changed.
 
-It sends nothing, so nothing that it does can change a run; it skips what it is too late for.
+It sends nothing, so it cannot change a run. Late messages are skipped.
 """
 
 from __future__ import annotations
@@ -22,17 +22,16 @@ from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.run_name import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
-from palpate_dashboard import arrays, palette, patient, plots, truth, words
+from palpate_dashboard import arrays, palette, plots, text
 from palpate_dashboard.columns import Columns
-from palpate_dashboard.force_depth import ForceDepth, ForceDepthPlane
-from palpate_dashboard.geometry import VertexNormals, creased
+from palpate_dashboard.geometry import VertexNormals, shaded
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.map import MapView
-from palpate_dashboard.plots import Plots
+from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots
 from palpate_dashboard.scene import SceneView, Shaded
 from palpate_dashboard.sinks import Live, open_recording
 from palpate_models.numerics.band import half_width
-from palpate_models.numerics.frames import apply, inverse
+from palpate_models.numerics.frames import apply
 from palpate_models.numerics.level_lines import level_lines
 from palpate_models.robot import lbr, table
 from palpate_models.robot.visual import visual_meshes
@@ -46,26 +45,26 @@ PLOT_PERIOD: Final = 50 * MS
 TEXT_PERIOD: Final = 500 * MS
 IMAGE_PERIOD: Final = 500 * MS
 MAP_PERIOD: Final = 1000 * MS
-SELDOM: Final = 2000 * MS
-"""Meshes and images of a recording that is not full."""
+SPARSE_PERIOD: Final = 2000 * MS
+"""Period of meshes and images in a sparse recording."""
 POSE_PERIOD: Final = 100 * MS
-"""The arm of such a recording."""
-AHEAD: Final = 4
-"""Which forecast of the wall is drawn: that of 0.2 s ahead, about what planning needs."""
+"""Period of link poses in a sparse recording."""
+FORECAST_INDEX: Final = 4
+"""The drawn forecast of the breathing motion: 0.2 s ahead, about what planning uses."""
 SEND_PERIOD: Final = 1000 * MS
-"""Simulated time that is collected into one chunk of the file."""
+"""Simulated time per chunk of the file."""
 SEND_PERIOD_LIVE: Final = 200 * MS
-"""The same while someone watches."""
+"""The same with a live viewer."""
 ABOVE_SKIN_M: Final = 0.002
-"""Outlines are drawn so far outside the surface."""
+"""Height of outlines above the surface."""
 FURNITURE: Final = {"table_top": palette.SHEET, "table_column": palette.STEEL, "robot_base": palette.PLINTH}
 
 
 @cache
 def _shapes(robot: Robot) -> dict[str, list[Shaded]]:
-    """The robot's links as they are drawn."""
+    """Return the robot's link shapes by name."""
     return {
-        link: [Shaded(*creased(mesh.vertices, mesh.triangles), _rgba(mesh.rgba)) for mesh in meshes]
+        link: [Shaded(*shaded(mesh.vertices, mesh.triangles), _rgba(mesh.rgba)) for mesh in meshes]
         for link, meshes in visual_meshes(robot).items()
     }
 
@@ -76,14 +75,14 @@ def _rgba(color: tuple[float, float, float, float]) -> palette.Rgba:
 
 
 class DashboardService(Service):
-    """Draws a run into `path`, and into a viewer as `live` says."""
+    """Draws a run into the file `path`, and into a viewer as given by `live`."""
 
     role = "dashboard"
 
     def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True, full: bool = True) -> None:
-        """Of the truth in `scenario` it makes a page, no more; `paced`: whether its speed is worth showing.
+        """The truth in `scenario` is used for one page only. `paced`: show the real-time factor.
 
-        Without a `path` nothing is written to a file. Unless `full`, meshes and images come seldom while no viewer is connected.
+        Without a `path` no file is written. Unless `full`, meshes and images are sparse while no viewer is connected.
 
         Raises OSError if `path` is not writable.
         """
@@ -96,42 +95,40 @@ class DashboardService(Service):
         layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, plane.bounds)
         self._recording = open_recording(path, live, layout, scenario.name, "" if path is None else run_of(path.parent))
         self._force_depth = ForceDepth(self._recording, plane)
-        self._region = (exam.region_m, exam.centre_m)
         self._send_period = SEND_PERIOD_LIVE if paced and live != Live() else SEND_PERIOD
         self._columns = Columns(self._recording)
         self._scene = SceneView(self._recording, self._columns)
         self._map = MapView(self._recording, exam.region_m, exam.centre_m)
-        self._plots = Plots(self._recording, self._columns, limit, words.LEGEND, truth.page(scenario))
+        self._plots = Plots(self._recording, self._columns, limit, text.LEGEND, text.truth_page(scenario))
         self._shapes = dict(_shapes(given.robot))
         for box in table.boxes(given.robot):
             self._scene.box(box.name, box.X_WB, box.size, FURNITURE.get(box.name, palette.STEEL))
         lens = given.camera
         k = np.array(((lens.focal_px, 0, lens.width_px / 2), (0, lens.focal_px, lens.height_px / 2), (0, 0, 1)))
-        self._scene.lens(k, lens.width_px, lens.height_px)  # the messages' own follows; who joins late has missed them
+        self._scene.lens(k, lens.width_px, lens.height_px)  # for viewers that join after the camera_info message
         self._waits = np.zeros(len(plots.AWAITED))
         self._producers = {topic.name: topic.producer for topic in contract().topics.values()}
-        self._undressed = True
         self._seen: dict[str, Message] = {}
         self._due: dict[str, int] = {}
         self._in_contact = False
-        self._lay: NDArray[np.float64] | None = None
+        self._X_WA_initial: NDArray[np.float64] | None = None
         """True pose of the patient before any motion, shape (4, 4)."""
         self._pressed_n = 0.0
         self._found: list[str] = []
         self._unassessed: list[str] = []
         self._robot = "no status yet"
-        self._tells_speed = paced
+        self._shows_speed = paced
         self._speed: float | None = None
         self._speed_mark = (0, perf_counter())
         self._steps = 0
         self._busy_s = 0.0
         often = full or live != Live()
         self._drawing: tuple[tuple[str, int, Callable[[int, Message], None]], ...] = (
-            ("sim/surface", MESH_PERIOD if often else SELDOM, self._surface),
+            ("sim/surface", MESH_PERIOD if often else SPARSE_PERIOD, self._surface),
             ("truth/phantom", 0, self._phantom),
             ("tf_static", 0, self._tf_static),
             ("camera/depth/camera_info", IMAGE_PERIOD, self._camera_info),
-            ("camera/depth/image_raw", IMAGE_PERIOD if often else SELDOM, self._depth),
+            ("camera/depth/image_raw", IMAGE_PERIOD if often else SPARSE_PERIOD, self._depth),
             ("perception/points", IMAGE_PERIOD, self._points),
             ("perception/surface", IMAGE_PERIOD, self._perceived),
             ("perception/targets", 0, self._targets),
@@ -148,7 +145,7 @@ class DashboardService(Service):
         )
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Draws what is new and due at `t` [ns]. The outbox is empty."""
+        """Draws new messages that are due at `t` [ns]. Returns an empty outbox."""
         start = perf_counter()
         for topic, period, draw in self._drawing:
             if inbox.stamp(topic) is not None and self._is_due(topic, t, period):
@@ -157,7 +154,7 @@ class DashboardService(Service):
                     self._seen[topic] = message
                     self._due[topic] = t + period
                     draw(t, message)
-        if self._tells_speed and self._is_due("speed", t, 1000 * MS):
+        if self._shows_speed and self._is_due("speed", t, 1000 * MS):
             self._due["speed"] = t + 1000 * MS
             self._measure_speed(t)
         if self._is_due("send", t, self._send_period):
@@ -168,7 +165,7 @@ class DashboardService(Service):
         return {}
 
     def flush(self) -> None:
-        """Sends what is collected so far."""
+        """Sends the collected rows."""
         self._columns.send()
         self._recording.flush()
 
@@ -187,7 +184,7 @@ class DashboardService(Service):
         return period == 0 or t >= self._due.get(key, 0)
 
     def _measure_speed(self, t: int) -> None:
-        """Simulated over wall time since the last call: the only use of a wall clock, and it goes to the screen alone."""
+        """Measures simulated over wall time since the last call; the only use of a wall clock, for display."""
         before, then = self._speed_mark
         now = perf_counter()
         self._speed_mark = (t, now)
@@ -208,13 +205,7 @@ class DashboardService(Service):
             self._scene.force(t, X_WI[:3, 3], -self._pressed_n * X_WI[:3, 2])
 
     def _surface(self, t: int, message: Message) -> None:
-        vertices = arrays.triples(message.vertices)
-        if self._undressed:
-            self._undressed = False
-            bed = patient.Bed(table.TABLE_TOP_M - float(self._X_WA[2, 3]), (table.TABLE_X_M[1] - table.TABLE_X_M[0]) / 2)
-            in_A = apply(inverse(self._X_WA), vertices.astype(np.float64))
-            self._scene.patient(self._X_WA, patient.parts(in_A, bed, *self._region))
-        self._scene.abdomen(t, vertices, arrays.triples(message.triangles))
+        self._scene.abdomen(t, arrays.triples(message.vertices), arrays.triples(message.triangles))
 
     def _phantom(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.surface.vertices)
@@ -225,20 +216,20 @@ class DashboardService(Service):
         outlines = []
         for index in range(int(lesion.max(initial=-1)) + 1):
             inside = lesion == index
-            if inside.any():  # half contrast, on the part of the field that is not another lesion's
+            if inside.any():  # half contrast, ignoring other lesions
                 own = np.where(inside | (lesion < 0), ratio, 1.0)
                 outlines.append(level_lines(raised, triangles, own, (1.0 + float(own[inside].max())) / 2.0))
         self._map.lesions(outlines)
         self._scene.lesions(outlines)
-        self._lay = pose_matrix(message.pose)
-        self._scene.body(t, self._lay, 0.0)
+        self._X_WA_initial = pose_matrix(message.pose)
+        self._scene.body(t, self._X_WA_initial, 0.0)
 
     def _patient(self, t: int, message: Message) -> None:
         X_WA = pose_matrix(message.pose)
-        if self._lay is None:
-            self._lay = X_WA
+        if self._X_WA_initial is None:
+            self._X_WA_initial = X_WA
         self._scene.body(t, X_WA, message.excursion)
-        self._plots.true_patient(t, message.excursion, float(np.linalg.norm(X_WA[:3, 3] - self._lay[:3, 3])))
+        self._plots.true_patient(t, message.excursion, float(np.linalg.norm(X_WA[:3, 3] - self._X_WA_initial[:3, 3])))
 
     def _tf_static(self, _t: int, message: Message) -> None:
         for item in message.transforms:
@@ -260,13 +251,13 @@ class DashboardService(Service):
     def _targets(self, t: int, message: Message) -> None:
         self._scene.targets(t, arrays.points(message.positions), arrays.points(message.normals))
         count, frames = len(message.positions), message.frames_fused
-        self._plots.say(t, "log/perception", message.message or f"{count} targets from {frames} frames")
+        self._plots.log(t, "log/perception", message.message or f"{count} targets from {frames} frames")
 
     def _wall(self, _t: int, message: Message) -> None:
         if message.state != SurfaceMotion.LOST:
             exposed = nanoseconds(message.header.stamp)
-            ahead = AHEAD * SurfaceMotion.FORECAST_STEP_MS * MS
-            self._plots.wall(exposed, message.displacement, float(message.forecast[AHEAD]), ahead)
+            ahead = FORECAST_INDEX * SurfaceMotion.FORECAST_STEP_MS * MS
+            self._plots.wall(exposed, message.displacement, float(message.forecast[FORECAST_INDEX]), ahead)
 
     def _path_planned(self, t: int, message: Message) -> None:
         self._scene.planned(t, arrays.points(pose.pose.position for pose in message.poses))
@@ -278,8 +269,8 @@ class DashboardService(Service):
             if phase == "approach":
                 self._scene.clear_cloud(t)
         self._in_contact = bool(message.in_contact)
-        self._plots.say(t, "log/exam", message.message, "ERROR" if phase == "aborted" else "INFO")
-        self._pressed_n = message.normal_force if message.depth > words.FREE_M else 0.0
+        self._plots.log(t, "log/exam", message.message, "ERROR" if phase == "aborted" else "INFO")
+        self._pressed_n = message.normal_force if message.depth > text.FREE_M else 0.0
         self._plots.force(t, message.normal_force)
         self._force_depth.add(t, message.depth, message.normal_force, self._in_contact)
         self._plots.depth(t, message.depth, message.depth_setpoint)
@@ -287,7 +278,7 @@ class DashboardService(Service):
         if not self._is_due("text", t, TEXT_PERIOD):
             return
         self._due["text"] = t + TEXT_PERIOD
-        self._plots.document(t, "text/status", words.status(self._name, phase, message, self._robot, self._speed))
+        self._plots.document(t, "text/status", text.status(self._name, phase, message, self._robot, self._speed))
 
     def _indentation(self, t: int, message: Message) -> None:
         self._plots.true_contact(t, message.depth, message.normal_force)
@@ -298,13 +289,13 @@ class DashboardService(Service):
         self._robot = f"{mode}: {message.reason}" if message.reason else mode
         level = "ERROR" if message.mode == RobotStatus.MODE_SAFE_HOLD else "INFO"
         self._plots.state(t, "state/driver", mode)
-        self._plots.say(t, "log/robot", self._robot, level)
+        self._plots.log(t, "log/robot", self._robot, level)
 
     def _stiffness(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.vertices)
         reached, codes = np.asarray(message.scanned, dtype=bool), np.asarray(message.unassessed)
         scanned = reached & (codes == StiffnessMap.ASSESSED)
-        self._unassessed = words.unassessed(codes[reached])
+        self._unassessed = text.unassessed(codes[reached])
         apparent = np.asarray(message.apparent, dtype=np.float64)
         if not scanned.any():
             return
@@ -315,7 +306,7 @@ class DashboardService(Service):
         self._scene.stiffness(t, apply(self._X_WA, vertices.astype(np.float64)).astype(np.float32), ratio, scanned)
 
     def _findings(self, t: int, message: Message) -> None:
-        lines = [words.finding(f) for f in message.findings]
+        lines = [text.finding(f) for f in message.findings]
         if lines != self._found:
             self._found = lines
             centroids = arrays.points(f.centroid for f in message.findings)
@@ -323,7 +314,7 @@ class DashboardService(Service):
             self._map.findings(t, centroids, labels)
             self._scene.findings(t, apply(self._X_WA, centroids), labels)
         if message.final:
-            self._plots.say(
+            self._plots.log(
                 t,
                 "log/findings",
                 "; ".join(self._unassessed + (lines or ["no area found"])),
@@ -331,26 +322,26 @@ class DashboardService(Service):
             )
 
     def _diagnostics(self, t: int, message: Message) -> None:
-        rows = [words.Health.of(status) for status in message.status]
+        rows = [text.Health.of(status) for status in message.status]
         for row in rows:
             self._count_wait(row.values.get("waiting_for", ""))
             self._plots.health(t, row)
         share = self._waits / max(1.0, self._waits.sum())
         self._plots.waits(t, share)
-        self._plots.document(t, "text/services", words.services(rows, zip(plots.AWAITED, share, strict=True)))
+        self._plots.document(t, "text/services", text.services(rows, zip(plots.AWAITED, share, strict=True)))
 
     def _count_wait(self, what: str) -> None:
-        """A service was seen waiting for a topic, or for the grant; a wait of observers says nothing."""
+        """Counts an observed wait for a topic or for the grant; waits for observers are ignored."""
         role = self._producers.get(what, what)
         if role in plots.AWAITED:
             self._waits[plots.AWAITED.index(role)] += 1
 
 
 def create(scenario: Scenario) -> DashboardService:
-    """The dashboard of a run.
+    """Return the dashboard of a run.
 
-    The setting `out` is the run's folder; `viewer` says how to show it live (see `Live.parse`). Raises ValueError if the first is
-    missing or the second not understood.
+    Setting `out` is the folder of the run, `viewer` the live view (see `Live.parse`). Raises ValueError if `out` is missing or
+    `viewer` is invalid.
     """
     settings = Settings.read()
     out = settings.required("out", f"the dashboard writes $PALPATE_OUT/{FILE}, so give it the run's folder")

@@ -1,4 +1,4 @@
-"""Where a recording goes: into a file, to a viewer that runs, or to viewers that will come, in a browser too."""
+"""Recording sinks: a file, a running viewer, or a server for viewers and browsers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ log = logging.getLogger(__name__)
 
 APPLICATION = "palpate"
 MEMORY_LIMIT = "512MiB"
-"""What a served recording keeps for viewers that join late; then the oldest data goes, static data never."""
+"""Buffer for viewers that join late; the oldest data is dropped first, static data never."""
 
 
 @dataclass(frozen=True)
 class Live:
-    """How to show a run while it runs.
+    """Live view of a run.
 
     `serve:PORT` hosts the recording for viewers of this machine, in the browser at PORT + 1; with `serve:0.0.0.0:PORT` every
     machine that reaches the port sees the run. `connect:URL` sends it to a viewer that listens, by default one on this machine.
@@ -28,12 +28,12 @@ class Live:
 
     serve_port: int | None = None
     serve_at: str = "127.0.0.1"
-    """The address of the interface on which it is served."""
+    """Address of the serving interface."""
     connect_url: str | None = None
 
     @staticmethod
     def parse(text: str) -> Live:
-        """From the value of PALPATE_VIEWER; empty is no live view. Raises ValueError that says what is allowed."""
+        """Parses PALPATE_VIEWER; an empty value means no live view. Raises ValueError naming the allowed forms."""
         kind, _, rest = text.partition(":")
         if not text:
             return Live()
@@ -48,17 +48,17 @@ class Live:
 
 
 def address(port: int) -> str:
-    """Where a browser on this machine sees the recording that is served at `port`.
+    """Return the browser address of the recording served at `port` on this machine.
 
-    The theme is dark whatever the browser prefers: the colours of the scene and of the curves are chosen for it.
+    The theme is always dark: the colours are chosen for it.
     """
     return f"http://localhost:{port + 1}/?url={quote(f'rerun+http://localhost:{port}/proxy', safe='')}&theme=dark"
 
 
 def _serve(at: str, port: int) -> Any:
-    """A sink that hosts the recording at `port` of the interface `at`, and the web viewer at `port` + 1 of all of them.
+    """Return a sink that serves the recording at `port` of the interface `at`, and the web viewer at `port` + 1.
 
-    That is a page without data. Raises OSError if one is taken.
+    The web viewer itself holds no data. Raises OSError if a port is in use.
     """
     try:
         server = rr.GrpcServerSink(bind_ip=at, port=port, server_memory_limit=MEMORY_LIMIT)
@@ -70,9 +70,9 @@ def _serve(at: str, port: int) -> Any:
 
 
 def open_recording(path: Path | None, live: Live, blueprint: Any, name: str, run: str = "") -> rr.RecordingStream:
-    """A recording named `name`, of the run `run`, that goes to the file `path`, if there is one, and to viewers as `live` says.
+    """Return a recording named `name` of the run `run`, written to the file `path` if given, and to viewers as given by `live`.
 
-    Its rows carry simulated time and nothing else. Raises OSError if the file cannot be written.
+    Its only timeline is simulated time. Raises OSError if the file cannot be written.
     """
     recording = rr.RecordingStream(APPLICATION, recording_id=uuid4())
     recording.set_log_tick_enabled(False)

@@ -7,7 +7,7 @@ import pytest
 from dashboard_messages import dome, look
 
 from palpate_dashboard import arrays, palette
-from palpate_dashboard.geometry import Carry, VertexNormals, creased
+from palpate_dashboard.geometry import Carry, VertexNormals, shaded
 from palpate_dashboard.sinks import Live
 from palpate_models.numerics.level_lines import level_lines
 
@@ -78,12 +78,12 @@ def test_viewer_setting() -> None:
 def test_a_cube_keeps_its_edges_and_a_sphere_none() -> None:
     trimesh = pytest.importorskip("trimesh")
     cube = trimesh.creation.box()
-    positions, triangles, normals = creased(cube.vertices, cube.faces)
+    positions, triangles, normals = shaded(cube.vertices, cube.faces)
     assert len(positions) == 24
     faces = np.cross(*(np.diff(positions[triangles], axis=1)[:, i] for i in (0, 1)))
     for corner in range(3):
         assert np.einsum("ij,ij->i", faces, normals[triangles[:, corner]]) == pytest.approx(1.0)
     sphere = trimesh.creation.icosphere(subdivisions=3)
-    positions, triangles, normals = creased(sphere.vertices, sphere.faces)
+    positions, triangles, normals = shaded(sphere.vertices, sphere.faces)
     assert len(positions) == len(sphere.vertices)
     assert np.einsum("ij,ij->i", normals, positions).min() > 0.999

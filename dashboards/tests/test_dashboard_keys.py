@@ -20,7 +20,7 @@ from test_dashboard_browser import free_ports, start
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
-from palpate_dashboard import follow as following
+from palpate_dashboard import replay
 
 KEYS_PROGRAM = """
 import sys, time
@@ -134,9 +134,9 @@ def test_keys_go_to_a_secure_run_with_the_operators_certificate(monkeypatch: pyt
         (tmp_path / "operator" / name).parent.mkdir(exist_ok=True)
         (tmp_path / "operator" / name).touch()
     opened: list[BusOptions] = []
-    monkeypatch.setattr(following, "session", opened.append)
+    monkeypatch.setattr(replay, "session", opened.append)
     bus: Any = object()
-    with following._operator(Run("healthy", {}), bus) as operator:
+    with replay._operator(Run("healthy", {}), bus) as operator:
         assert operator is bus
-    following._operator(Run("healthy", {"router": "tls/127.0.0.1:17998"}, keys=str(tmp_path)), bus)
+    replay._operator(Run("healthy", {"router": "tls/127.0.0.1:17998"}, keys=str(tmp_path)), bus)
     assert [options.tls for options in opened] == [tmp_path / "operator"]

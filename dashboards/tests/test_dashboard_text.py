@@ -1,4 +1,4 @@
-"""The page on the truth: it tells what the tissue, the robot and the camera draw."""
+"""Text of the dashboard: the truth page states what tissue, robot and camera draw, findings state what is unassessed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import re
 
 import numpy as np
 
-from palpate_dashboard.truth import page
+from palpate_bus.messages import StiffnessMap
+from palpate_dashboard import text
+from palpate_dashboard.text import truth_page
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.patient.schema import Phantom
@@ -15,11 +17,11 @@ from palpate_models.scenario.schema import Scenario
 
 
 def numbers(scenario: Scenario, row: str) -> list[float]:
-    (line,) = [line for line in page(scenario).splitlines() if line.startswith(f"| {row} |")]
+    (line,) = [line for line in truth_page(scenario).splitlines() if line.startswith(f"| {row} |")]
     return [float(found) for found in re.findall(r"[-+]?\d+\.?\d*", line.removeprefix(f"| {row} |"))]
 
 
-def test_it_tells_what_was_drawn() -> None:
+def test_truth_page_states_the_drawn_values() -> None:
     phantom = Phantom(breathing=Breathing(kind="quiet"), motion=Motion(kind="shift"))
     scenario = Scenario(seed=7, phantom=phantom, errors=Errors(level="poor"))
     drawn = draw_errors(scenario.errors, 7)
@@ -34,11 +36,18 @@ def test_it_tells_what_was_drawn() -> None:
     np.testing.assert_allclose(numbers(scenario, "moved [mm]"), 1e3 * motion.pose(1e3)[:3, 3], atol=0.006)
 
 
-def test_another_seed_has_another_truth_and_a_clean_world_has_none() -> None:
+def test_truth_page_depends_on_the_seed_and_is_empty_without_errors() -> None:
     errors = Errors(level="typical")
-    assert page(Scenario(seed=1, errors=errors)) != page(Scenario(seed=2, errors=errors))
+    assert truth_page(Scenario(seed=1, errors=errors)) != truth_page(Scenario(seed=2, errors=errors))
     still = Phantom(breathing=Breathing(kind="none"))
     clean = Scenario(seed=1, phantom=still, errors=Errors(level="none"))
     for unit in ("mm", "degrees"):
         assert numbers(clean, f"patient, off by [{unit}]") == [0] * 3
     assert numbers(clean, "breathing") == numbers(clean, "motion") == []
+
+
+def test_unassessed_places_are_listed_by_reason() -> None:
+    codes = np.array([StiffnessMap.ASSESSED] * 6 + [StiffnessMap.CONTRADICTED] * 3 + [StiffnessMap.YIELDED], dtype=np.uint8)
+    lines = text.unassessed(codes)
+    assert [line.split(" %")[0] for line in lines] == ["not assessed: 30", "not assessed: 10"]
+    assert text.unassessed(codes[:6]) == []
