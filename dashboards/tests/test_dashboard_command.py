@@ -25,6 +25,7 @@ from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
 
 app = typer.Typer(cls=CommandGroup)
+app.callback()(lambda: None)
 app.command()(dashboard)
 
 
@@ -50,10 +51,10 @@ def record(folder: Path, seconds: float) -> Path:
 
 def test_nothing_to_show_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
-    done = CliRunner().invoke(app, [])
+    done = CliRunner().invoke(app, ["dashboard"])
     assert done.exit_code == 2
     assert "start one with `palpate run`, or give a results folder" in done.output
-    done = CliRunner().invoke(app, [str(tmp_path / "nothing")])
+    done = CliRunner().invoke(app, ["dashboard", str(tmp_path / "nothing")])
     assert done.exit_code == 2
     assert "neither a .rrd nor a .mcap file" in done.output
 
@@ -108,7 +109,7 @@ def test_the_drawing_of_a_lone_file_goes_when_it_was_looked_at(tmp_path: Path, m
         shown.append(drawing)
 
     monkeypatch.setattr("palpate.live.dashboard._view", look)
-    assert CliRunner().invoke(app, [str(path)]).exit_code == 0
+    assert CliRunner().invoke(app, ["dashboard", str(path)]).exit_code == 0
     assert not shown[0].parent.exists()
 
 
