@@ -1,6 +1,6 @@
-"""What every camera sends: depth images, whole and small, with their intrinsics.
+"""Messages of every camera: full-size and small depth images with their intrinsics.
 
-The small image is every k-th pixel of the whole one. Perception follows the wall by it.
+The small image has every k-th pixel of the full-size one. Perception tracks the wall with it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SMALL_WIDTH_PX: Final = 96
 
 
 def apart(width: int) -> int:
-    """How many pixels of a whole image of that width [px] those of the small one are apart: k."""
+    """Return the pixel spacing k of the small image for a full-size image of that width [px]."""
     return max(round(width / SMALL_WIDTH_PX), 1)
 
 
@@ -47,7 +47,7 @@ def every_few(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str,
 
 
 def pinhole_of(info: Message) -> Pinhole:
-    """The camera that a `sensor_msgs/CameraInfo` without distortion tells of."""
+    """Return the camera of a `sensor_msgs/CameraInfo` without distortion."""
     K = np.asarray(info.k, np.float64).reshape(3, 3)
     return Pinhole(int(info.width), int(info.height), *(float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 

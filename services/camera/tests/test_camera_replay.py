@@ -40,8 +40,8 @@ def record(folder: Path, log: dict[str, list[HeardMessage]], topics: tuple[str, 
     recorder = RecorderService(folder)
     rows = contract().topics
     for topic in topics:
-        for heard in log[topic]:
-            recorder.record(rows[topic], encode(heard.message, rows[topic].type), heard.t, heard.sequence)
+        for received in log[topic]:
+            recorder.record(rows[topic], encode(received.message, rows[topic].type), received.t, received.sequence)
     recorder.finish()
     return folder
 
@@ -62,13 +62,13 @@ def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: P
     assert not rig.log[IMAGE], "nothing unasked"
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES + 1))
     shown = rig.run(1.0, {})
-    recorded = [heard.message for heard in seen[IMAGE]]
+    recorded = [received.message for received in seen[IMAGE]]
     assert len(recorded) == FRAMES
     assert len(shown[IMAGE]) == len(shown[INFO]) == FRAMES + 1
-    for heard, info, then in zip(shown[IMAGE], shown[INFO], [*recorded, recorded[0]], strict=True):
-        np.testing.assert_array_equal(heard.message.data, then.data)
-        assert nanoseconds(heard.message.header.stamp) == nanoseconds(info.message.header.stamp) == heard.t
-        assert heard.t >= 2000 * MS
+    for received, info, then in zip(shown[IMAGE], shown[INFO], [*recorded, recorded[0]], strict=True):
+        np.testing.assert_array_equal(received.message.data, then.data)
+        assert nanoseconds(received.message.header.stamp) == nanoseconds(info.message.header.stamp) == received.t
+        assert received.t >= 2000 * MS
     assert rig.last(POSE) == seen[POSE][-1].message
 
 
@@ -76,9 +76,9 @@ def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, s
     rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
     shown = rig.run(0.5, {})
     assert len(shown[SMALL_IMAGE]) == len(shown[SMALL_INFO]) >= 5
-    for heard, then in zip(shown[SMALL_IMAGE], seen[SMALL_IMAGE], strict=False):
-        np.testing.assert_array_equal(heard.message.data, then.message.data)
-        assert nanoseconds(heard.message.header.stamp) == heard.t
+    for received, then in zip(shown[SMALL_IMAGE], seen[SMALL_IMAGE], strict=False):
+        np.testing.assert_array_equal(received.message.data, then.message.data)
+        assert nanoseconds(received.message.header.stamp) == received.t
 
 
 def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(seen: dict[str, list[HeardMessage]], tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(seen: dict[
     (pose,) = seen[POSE]
     stranger = copy.deepcopy(pose.message)
     stranger.transforms[0].child_frame_id = "gripper"
-    late = [heard._replace(t=heard.t + 120_000) for heard in seen[INFO]]
+    late = [received._replace(t=received.t + 120_000) for received in seen[INFO]]
     poses = [pose._replace(message=stranger), pose._replace(t=pose.t + 1, sequence=pose.sequence + 1)]
     folder = record(tmp_path / "recording_mcap", {**seen, INFO: late, POSE: poses})
     camera = ReplayedCamera(open_recording(folder))
@@ -107,7 +107,7 @@ def test_a_recording_without_small_images_has_those_of_its_whole_ones(
 
 def test_frames_differ_as_their_noise_does(seen: dict[str, list[HeardMessage]]) -> None:
     """Else the order would not be tested."""
-    first, second = (np.asarray(heard.message.data) for heard in seen[IMAGE][:2])
+    first, second = (np.asarray(received.message.data) for received in seen[IMAGE][:2])
     assert not np.array_equal(first, second)
 
 

@@ -79,7 +79,7 @@ class Port(CameraPort):
 
 
 def asked(frames: int) -> HandInbox:
-    """An inbox with a trigger for so many frames."""
+    """Return an inbox with a trigger for this number of frames."""
     return HandInbox().put("planning/camera_trigger", CameraTrigger(header(0), frames))
 
 
@@ -103,8 +103,8 @@ def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
     assert service.finish() == {"bursts": 1, "frames": 2, "frames_rejected": 0, "frames_repeated": 0, "problem": ""}
 
 
-@pytest.mark.parametrize(("age_ms", "told_ms"), [(80, 920), (0, 1000), (5000, 1000), (-40, 1000)])
-def test_an_image_has_the_time_of_its_exposure_unless_its_clock_is_another(age_ms: int, told_ms: int) -> None:
+@pytest.mark.parametrize(("age_ms", "stamped_ms"), [(80, 920), (0, 1000), (5000, 1000), (-40, 1000)])
+def test_an_image_has_the_time_of_its_exposure_unless_its_clock_is_another(age_ms: int, stamped_ms: int) -> None:
     """A camera's image is some 50 to 120 ms old when it comes, in which a wall that breathes moves by half a millimetre."""
     port = Port()
     image = ros_image()
@@ -112,7 +112,7 @@ def test_an_image_has_the_time_of_its_exposure_unless_its_clock_is_another(age_m
     service = RosCameraService(port, now=lambda: now)
     port.waiting = [image]
     (depth, info) = service.step(1000 * MS, HandInbox()).values()
-    assert nanoseconds(depth.header.stamp) == nanoseconds(info.header.stamp) == told_ms * MS
+    assert nanoseconds(depth.header.stamp) == nanoseconds(info.header.stamp) == stamped_ms * MS
 
 
 def test_an_image_that_is_repeated_is_not_passed_on_as_new() -> None:
@@ -133,7 +133,7 @@ def test_the_pose_is_the_whole_chain() -> None:
     assert violations(contract().topics["tf_static"], TFMessage([pose]), 0) == []
 
 
-def test_a_pose_that_nobody_publishes_is_named_with_what_there_is() -> None:
+def test_a_missing_pose_is_reported_with_the_available_ones() -> None:
     with pytest.raises(CameraError, match=r"no way from 'world'.*world -> stand"):
         RosCameraService(Port(TREE[:1]), wait_s=0.0)
 
@@ -150,7 +150,7 @@ def test_a_distorted_image_is_refused_and_said_so() -> None:
 
 
 def intrinsics(rectified: bool, info: Any) -> Any:
-    """What the bridge says of an image that came with these; None where it refuses."""
+    """Return the intrinsics that the bridge publishes for these; None if it refuses."""
     port = Port()
     port.rectified, port.intrinsics = rectified, info
     service = RosCameraService(port)
@@ -209,7 +209,7 @@ def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/ros.sock"
     node = RosNode("realsense", 0, BusOptions(listen=(endpoint,)))
     tf = node.publisher("tf_static", "tf2_msgs/msg/TFMessage", latched=True)
-    tf.publish(TFMessage(TREE))  # long before anybody listens
+    tf.publish(TFMessage(TREE))  # before anyone subscribes
     images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
     infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
     camera = ZenohCamera(RosCamera(router=endpoint))

@@ -127,16 +127,16 @@ def test_an_ideal_camera_measures_the_plate_and_the_table() -> None:
     assert heights.max() < Scenario().robot.base_height_m + 1e-4  # the highest thing without an arm
 
 
-def test_the_calibrated_pose_is_told_and_the_true_one_takes_the_picture() -> None:
-    """A camera that truly stands 4 cm farther back sees the plate 4 cm farther away, and tells the same pose."""
+def test_images_use_the_true_pose_and_messages_the_calibrated_one() -> None:
+    """A camera that is truly 4 cm farther back measures the plate 4 cm farther away, and publishes the same pose."""
     calm = {"camera": {"noise_scale": 0.0}}
     error = {"hand_eye": {"offset": Pose(xyz_m=(0.0, 0.0, -0.04))}}
     good, bad = (CameraService(plant_input(scenario(**calm, **more))) for more in ({}, error))
-    (told,), (other,) = good.start()["tf_static"].transforms, bad.start()["tf_static"].transforms
-    assert (told.header.frame_id, told.child_frame_id) == ("world", FRAME)
-    p = told.transform.translation
+    (nominal,), (other,) = good.start()["tf_static"].transforms, bad.start()["tf_static"].transforms
+    assert (nominal.header.frame_id, nominal.child_frame_id) == ("world", FRAME)
+    p = nominal.transform.translation
     np.testing.assert_allclose((p.x, p.y, p.z), Scenario().camera.position_m)
-    assert other == told
+    assert other == nominal
     asked = {"sim/surface": plate(), "planning/camera_trigger": trigger(1)}
     near, far = (depth(service.step(0, HandInbox().receive(asked))["camera/depth/image_raw"]) for service in (good, bad))
     middle = near.shape[0] // 2, near.shape[1] // 2  # the optical axis

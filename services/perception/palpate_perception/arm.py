@@ -1,4 +1,4 @@
-"""Which pixels may show the arm instead of the wall: its nominal kinematics with a margin for what those err by."""
+"""Mask of pixels that may show the arm: nominal kinematics with a margin for their error."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from palpate_models.robot.kinematics import link_transforms
 from palpate_models.scenario.schema import Robot
 
 MARGIN_M: Final = 0.02
-"""Hand-eye calibration, arm and camera agree to about so much, each its own way (docs/errors.md)."""
+"""Combined error of hand-eye calibration, arm and camera [m] (docs/errors.md)."""
 DENT_M: Final = 0.06
-"""So far about the indenter the wall may be dented: it is not looked at."""
+"""Radius around the indenter in which the wall may be dented, and is ignored [m]."""
 
 
 class ArmMask:
@@ -27,9 +27,9 @@ class ArmMask:
         self._capsules = lbr.capsules(robot)
 
     def hides(self, q: Array, p_WC: Array, r_W: Array, z: Array) -> NDArray[np.bool_]:
-        """Which of the wall's points p_WC + z r_W may be hidden, or dented, at joint positions `q` [rad], shape (n,).
+        """Return the mask of wall points p_WC + z r_W that may be hidden or dented at joint positions `q` [rad], shape (n,).
 
-        `r_W`: viewing directions, shape (n, 3); `z` [m]: where the wall is along them, shape (n,).
+        `r_W`: viewing directions, shape (n, 3); `z` [m]: distance of the wall along them, shape (n,).
         """
         starts, ends, radii = self._segments(q)
         towards = z[:, np.newaxis] * r_W  # from the camera to the wall
@@ -53,7 +53,7 @@ class ArmMask:
 
 @compiled
 def passes(a: Array, p: Array, q: Array, reach: Array) -> NDArray[np.bool_]:
-    """Which segments from the origin to `a`, shape (n, 3), pass nearer than `reach`, (m,), to those from `p` to `q`, (m, 3).
+    """Return the mask of segments from 0 to `a`, shape (n, 3), nearer than `reach`, (m,), to those from `p` to `q`, (m, 3).
 
     Ericson, Real-Time Collision Detection, section 5.1.9: the nearest points s a and p + t (q - p), with s and t in [0, 1].
     """

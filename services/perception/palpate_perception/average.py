@@ -1,12 +1,12 @@
-"""Where the wall lies by the mean of all small images, relative to the surface that a burst showed.
+"""Surface from the mean of all small images, relative to the surface of a burst.
 
-A burst lasts two seconds, and what the camera gets wrong for a few seconds is frozen into the surface it shows. The small
-images go on for minutes. Pixel i, which saw the wall at the outward displacement y_i, tells of the wall without its breath
+A burst lasts two seconds, so camera errors of a few seconds are part of its surface. Small images continue for minutes. Pixel i,
+with the outward displacement y_i of the wall, gives the displacement of the wall without breathing
 
     r_i = mean of (y_i - m_i d)
 
-over the watch and all images since in which the arm did not hide it. Its point lies outward of the burst's surface by so much as
-is fitted over x and y of A by the same smoothing spline as the surface itself.
+over all images in which the arm does not hide it. These displacements are fitted over x and y of A by the smoothing spline of
+the surface.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from palpate_perception.surface import HeightField
 from palpate_perception.wall import SeenWall
 
 FEWEST: Final = 30
-"""A pixel that was seen in fewer images tells nothing."""
+"""Least number of images of a pixel."""
 LEAST_PIXELS: Final = 12
 """Fewer pixels over the surface correct nothing."""
 KEPT_M: Final = 2e-4
-"""What the mean of a pixel errs by [A]; it is the same everywhere, so that it sets no weight."""
+"""Error of a pixel's mean [m] [A]; uniform, so it does not change weights."""
 
 
 class WallAverage:
@@ -44,7 +44,7 @@ class WallAverage:
         self._sum += np.where(seen, still, 0.0)
 
     def outward_of(self, field: HeightField, X_AW: Array) -> HeightField | None:
-        """How far outward of a surface the wall lies [m], over the surface's rectangle; None where too little was seen."""
+        """Return the outward offset of the wall from a surface [m], over its rectangle; None with too few pixels."""
         wall = self._wall
         z = wall.depth + wall.gain * self._sum / self._images
         x, y, height = apply(X_AW, wall.camera.X_WC[:3, 3] + z[:, np.newaxis] * wall.r_W).T

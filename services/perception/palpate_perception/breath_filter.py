@@ -1,6 +1,6 @@
-"""Where the wall will be in a moment: a Kalman filter of quasi-periodic motion.
+"""Short-term forecast of the wall's displacement: a Kalman filter of quasi-periodic motion.
 
-The displacement is a level and two stochastic oscillators, one at the breaths' rate w and one at twice that (Solin and Sarkka
+The displacement is a level and two stochastic oscillators, one at the breathing rate w and one at twice that (Solin and Sarkka
 2014, "Explicit link between periodic covariance functions and state space models"). Over h, with the rotation R by an angle,
 
     level(t + h) = exp(-h / T_0) level(t) + noise
@@ -22,12 +22,12 @@ from palpate_models.numerics.frames import Array
 RATES_PER_MIN: Final = (4.0, 40.0)
 """Breaths a minute that are looked for."""
 LEAST_S: Final = 5.0
-"""What is remembered tells rate and amplitude when it is of so long at least."""
+"""Least history for an estimate of rate and amplitude [s]."""
 MEMORY_S: Final = 30.0
-"""So much of the past tells rate and amplitude."""
+"""History from which rate and amplitude are estimated [s]."""
 RENEWAL_S: Final = 1.0
 COHERENCE_S: Final = 8.0
-"""T: for so long phase and amplitude keep: two breaths, which differ by a fifth in length and a third in depth."""
+"""T, coherence time of phase and amplitude: two breaths, which differ by a fifth in length and a third in depth."""
 LEVEL_S: Final = 20.0
 """T_0."""
 SHARES: Final = (0.5, 0.5, 0.125)
@@ -41,7 +41,7 @@ class BreathFilter:
     """Follows one displacement."""
 
     def __init__(self, t_s: Array, d: Array) -> None:
-        """What was seen before: displacements `d` [m] at times `t_s` [s], shape (n,) each, evenly spaced."""
+        """Initialise from earlier displacements `d` [m] at times `t_s` [s], shape (n,) each, evenly spaced."""
         self._times, self._seen = t_s.tolist(), d.tolist()
         self._x, self._mean = np.zeros(5), float(d.mean())
         self._stationary: Array = np.eye(5)
@@ -69,7 +69,7 @@ class BreathFilter:
         self._P = self._P - np.outer(gain, self._H @ self._P)
 
     def remember(self, d: float) -> None:
-        """Counts a displacement [m], of the time last predicted to, among those that tell rate and amplitude."""
+        """Add a displacement [m], at the time last predicted to, to the history of rate and amplitude."""
         self._times.append(self._t_s)
         self._seen.append(d)
         if self._t_s - self._renewed_s > RENEWAL_S:
@@ -80,12 +80,12 @@ class BreathFilter:
                 self._learn()
 
     def forget(self, d: float) -> None:
-        """Begins anew at a displacement [m]: what it was going to do is not known."""
+        """Reset to a displacement [m] with unknown phase."""
         self._x = np.array((d - self._mean, 0.0, 0.0, 0.0, 0.0))
         self._P = self._stationary.copy()
 
     def forecast(self, ahead_s: Array) -> Array:
-        """Displacement [m] expected so long [s] after the time last predicted to, shape (n,) of both."""
+        """Return the expected displacement [m] at `ahead_s` after the time last predicted to, shape (n,) of both."""
         return np.asarray(self._mean + self._transition(ahead_s) @ self._x @ self._H)
 
     @property

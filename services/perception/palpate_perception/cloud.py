@@ -58,7 +58,7 @@ class RegionBox:
         return np.stack([axis.ravel() for axis in grid], axis=1)
 
     def holds(self, p_A: Array) -> NDArray[np.bool_]:
-        """Which points in A, shape (n, 3), lie in the box."""
+        """Return the mask of points in A, shape (n, 3), inside the box."""
         return np.asarray(np.all((p_A >= self.low) & (p_A <= self.high), axis=1))
 
 

@@ -1,11 +1,11 @@
-"""How far the camera's depth has drifted, by the table, which stands still.
+"""Drift of the camera's depth, measured on the table, which does not move.
 
-A camera that warms up sees everything farther away, or nearer, than it did before: by millimetres in minutes, the same at every
-pixel (docs/errors.md). A wall that is followed by it seems to sink or to rise. The table's pixels show that drift alone,
+The depth of a camera that warms up changes by millimetres in minutes, equally at every pixel (docs/errors.md), so a tracked wall
+seems to sink or to rise. The table's pixels show the drift alone,
 
     z_i(t) = z_i + b(t) + noise,
 
-and what comes more slowly than `SLOWNESS_S` is taken off all depths.
+and its part slower than `SLOWNESS_S` is subtracted from all depths.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from palpate_perception.views import Intrinsics
 from palpate_perception.wall import EDGE, steady
 
 NEAR_M: Final = 0.04
-"""So near to the height of the table's top a point is the table's: camera and its calibration err by centimetres."""
+"""Distance from the table's top within which a point belongs to the table [m]: camera calibration has errors of centimetres."""
 SLOWNESS_S: Final = 10.0
-"""What neighbouring pixels get wrong together lasts for some seconds, warming up for many minutes."""
+"""Time constant of the drift [s]: errors shared by neighbouring pixels last for seconds, warming up for minutes."""
 LEAST_PIXELS: Final = 50
-"""Fewer pixels of the table in view tell nothing, and the drift is taken to stay what it was."""
+"""Least number of table pixels in view; with fewer the drift estimate is kept."""
 
 
 class CameraDrift:
@@ -42,7 +42,7 @@ class CameraDrift:
         self.pixel: NDArray[np.intp] = pixel[table]
         """Flat indices of the pixels that show the table, shape (n,)."""
         self.depth: Array = depth[table]
-        """Where they showed it [m], shape (n,)."""
+        """Their first depth [m], shape (n,)."""
         self.r_W: Array = r_W[table]
         """Viewing rays of unit z in world axes, shape (n, 3)."""
         self.drift = 0.0

@@ -32,16 +32,16 @@ class Follower:
         self._tracker: Tracker | None = None
         self._drift: CameraDrift | None = None
         self.shift = np.zeros(2)
-        """How far the patient, as the latest look shows, lies from where the first did, along the table in A [m]."""
+        """Shift of the patient in the latest scan from the first one, along the table in A [m]."""
         self.counts = dict.fromkeys(("quiet", "spoiled", "moved", "lost"), 0)
-        """How many images said so."""
+        """Number of images of each state."""
 
     def begin(self, asked_s: float) -> None:
         """A look begins with the images from the time `asked_s` [s] on."""
         self._watch, self._watching, self._asked_s = None, True, asked_s
 
     def take(self, t_s: float, depth: Image, camera: Intrinsics | None, q: Array | None) -> Followed:
-        """What a small image tells that was exposed at `t_s` [s]: depth [m], its camera, and the arm's joints [rad] if known."""
+        """Process a small image exposed at `t_s` [s]: depth [m], its camera, and the arm's joints [rad] if known."""
         followed = NOTHING
         if camera is not None and camera.shape == depth.shape:
             self._look(t_s, depth, camera, q)
@@ -51,12 +51,12 @@ class Follower:
 
     @property
     def average(self) -> WallAverage | None:
-        """What the images since the latest look show in the mean; None before it, and where the patient has moved since."""
+        """Mean of the images since the latest scan; None before it, and after the patient has moved."""
         return None if self._tracker is None or self._tracker.moved else self._tracker.average
 
     @property
     def watched(self) -> bool:
-        """Whether the wall was watched for long enough, or is not shown at all."""
+        """True if the wall was observed for long enough, or is not in view."""
         return self._watch is None or self._watch.over()
 
     def end(self) -> tuple[SeenWall, Array, Array] | None:
@@ -82,7 +82,7 @@ class Follower:
     def _look(self, t_s: float, depth: Image, camera: Intrinsics, q: Array | None) -> None:
         if self._watching and t_s >= self._asked_s:
             if self._watch is None or not self._watch.camera.same(camera):
-                self._watch = Watch(camera, self._X_WA, self._exam)  # a camera that is another one is watched anew
+                self._watch = Watch(camera, self._X_WA, self._exam)  # a different camera restarts the observation
             self._watch.add(t_s, depth, self._arm, q)
 
     def _follow(self, t_s: float, depth: Image, q: Array | None) -> Followed:
@@ -93,7 +93,7 @@ class Follower:
         return self._tracker.follow(t_s, z[wall.pixel] - drift, self._hidden(q, wall.r_W, wall.depth))
 
     def _hidden(self, q: Array | None, r_W: Array, depth: Array) -> NDArray[np.bool_]:
-        """Which points at depths [m] along rays, shape (n,) and (n, 3), the arm may hide at joint positions [rad], if known."""
+        """Return the mask of points at depths [m] along rays, (n,) and (n, 3), that the arm may hide at joint positions [rad]."""
         assert self._tracker is not None
         if q is None:
             return np.zeros(len(depth), np.bool_)

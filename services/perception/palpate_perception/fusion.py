@@ -35,7 +35,7 @@ class FusedDepth:
     sigma: Image
     """Standard deviation of that mean [m], NaN likewise."""
     frames: int
-    """How many frames went into it."""
+    """Number of fused frames."""
 
 
 class DepthFusion:
@@ -54,7 +54,7 @@ class DepthFusion:
 
     @property
     def frames(self) -> int:
-        """How many frames are in."""
+        """Number of frames so far."""
         return len(self._frames)
 
     def level(self, displacements: Array, per_metre: Image) -> None:

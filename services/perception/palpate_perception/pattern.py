@@ -29,7 +29,7 @@ def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def supported(p: Array, xy: Array, spacing: float) -> NDArray[np.bool_]:
-    """Whether a point of the cloud `p` (in A, shape (n, 3)) lies in the cell of each target, shape (m,).
+    """Return the mask of targets, shape (m,), whose cell contains a point of the cloud `p` (in A, shape (n, 3)).
 
     `xy`: targets in A [m], shape (m, 2); their cells are squares of the side `spacing` [m].
     """

@@ -65,7 +65,7 @@ class PerceivedMesh:
 
 @dataclass(frozen=True, slots=True)
 class Perceived:
-    """All that a burst of frames tells."""
+    """Result of a burst of frames."""
 
     cloud: Cloud
     mesh: PerceivedMesh | None
@@ -77,7 +77,7 @@ class Perceived:
     coverage: float
     """Part of the region of interest that was seen."""
     message: str
-    """What is wrong, in words; empty when all is well."""
+    """Description of the failure; empty if there is none."""
     field: HeightField | None = None
     """The surface over x and y of A; None when too little was seen."""
 
@@ -139,7 +139,7 @@ class Pipeline:
         return Perceived(points, self._mesh(field, p_A, mode, shift), targets, sigma, fused.frames, coverage, message, field)
 
     def _reasons(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> str:
-        """Why the region's other cells were not seen."""
+        """Describe why cells of the region have no points."""
         xy, _ = visibility.cells(self._exam)
         missing = np.column_stack((xy[~seen], visibility.quadric(p_A, xy[~seen])))
         X_CA = inverse(camera.X_WC) @ self._X_WA
@@ -181,7 +181,7 @@ def _in_A(field: HeightField, xy: Array) -> tuple[Array, Array]:
 
 
 def _remarks(guessed: int, nodes: int, motion: float) -> str:
-    """What to know about good targets; empty when all is well."""
+    """Return remarks about valid targets; empty if there are none."""
     remarks = []
     if guessed:
         remarks.append(f"{guessed} of {nodes} targets lie in small gaps and are interpolated")

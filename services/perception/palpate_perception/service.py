@@ -28,9 +28,9 @@ from palpate_perception.watch import LONGEST_S
 
 IMAGE: Final = "camera/depth/image_raw"
 CORRECTED_EVERY_NS: Final = 5 * NS
-"""So often the surface is corrected by the images since."""
+"""Period of surface corrections [ns]."""
 PATIENCE_NS: Final = 1 * NS
-"""How long after the expected end of a burst perception waits for missing frames."""
+"""Wait for missing frames after the expected end of a burst [ns]."""
 
 
 class PerceptionService(Service):
@@ -51,18 +51,18 @@ class PerceptionService(Service):
         self._bursts = 0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Tells of each small image how the wall moves; starts a look on a trigger, and publishes its answer once all is in."""
+        """Publish the wall's motion for each small image; start a scan on a trigger, and publish its surface when complete."""
         for trigger in inbox.new("planning/camera_trigger"):
             asked = nanoseconds(trigger.header.stamp)
             self._burst = _Burst(asked, int(trigger.frames), t + int(trigger.frames) * self._period + PATIENCE_NS)
             self._follower.begin(asked / NS)
             self._bursts += 1
-        told = [self._follow(image, inbox) for image in inbox.new("camera/follow/depth")]
-        outbox: dict[str, Message | list[Message]] = {"perception/motion": told} if told else {}
+        motions = [self._follow(image, inbox) for image in inbox.new("camera/follow/depth")]
+        outbox: dict[str, Message | list[Message]] = {"perception/motion": motions} if motions else {}
         return outbox | self._correction(t) | self._answer(t, inbox)
 
     def _follow(self, image: Message, inbox: Inbox) -> Message:
-        """What a small image tells."""
+        """Return the motion message of a small image."""
         stamp, status = nanoseconds(image.header.stamp), inbox.latest("robot/status")
         camera = messages.intrinsics(inbox, "camera/follow/camera_info", image)
         try:
@@ -87,7 +87,7 @@ class PerceptionService(Service):
         return {"perception/correction": messages.correction(t, outward.height(x, y))}
 
     def _answer(self, t: int, inbox: Inbox) -> dict[str, Message | list[Message]]:
-        """What the look that is under way shows; nothing until it is over."""
+        """Return the messages of the current scan; empty until it is complete."""
         images = list(inbox.new(IMAGE))
         burst = self._burst
         if burst is None:
@@ -120,7 +120,7 @@ class PerceptionService(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """What the last burst showed, and how the wall moved."""
+        """Return the result of the last burst, and statistics of the wall's motion."""
         followed: dict[str, Any] = {"bursts": self._bursts, "followed": self._follower.counts}
         if self._last is None:
             return followed
@@ -168,7 +168,7 @@ class _Burst:
         self.stamps_s: list[float] = []
         """When the fused frames were exposed [s]."""
         self.wrong = ""
-        """Why its frames cannot be used; empty while they can."""
+        """Description of the defect of its frames; empty if they are valid."""
 
 
 def create(scenario: Scenario) -> Service:
@@ -177,7 +177,7 @@ def create(scenario: Scenario) -> Service:
 
 
 def _disagreement(frame: Message, camera: Intrinsics) -> str:
-    """Why the intrinsics cannot be those of a frame; empty when they can."""
+    """Describe why the intrinsics do not fit a frame; empty if they do."""
     height, width = camera.shape
     if (frame.height, frame.width) == (height, width):
         return ""

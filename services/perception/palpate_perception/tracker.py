@@ -1,19 +1,19 @@
-"""Follows the wall from one small depth image to the next.
+"""Tracks the wall from one small depth image to the next.
 
-Of each image the outward displacements of the wall's pixels, y = (z - z_ref) / g, are explained by the breath and by how a body
-moves that lies on a table, shifts along it by s_x, s_y and turns about its long axis by theta:
+The outward displacements of the wall's pixels, y = (z - z_ref) / g, are explained by breathing and by the motion of a body on a
+table, a shift s_x, s_y and a turn theta about its long axis:
 
     y_i = m_i d + n_i . (s_x, s_y, 0) + theta n_i . (e_y x p_i) + noise
 
-First d alone, robustly, for the breath filter; then what is left, over some images, by all four with a prior of each.
+d is estimated alone, robustly, for the breath filter; then the residual, over some images, by all four with a prior of each.
 
-Neighbouring pixels err together for seconds, so that d errs by more than their number tells, and no filter of breaths takes that
-off. How much it is, is told by patches P of the wall that are wider than such errors, by how d changes when one is left out (a
-jackknife, Efron and Stein 1981): with w the weights
+Errors of neighbouring pixels are correlated for seconds, so the error of d is larger than the number of pixels suggests, and no
+filter of breaths removes it. Its size is estimated from patches P of the wall wider than such errors, by the change of d without
+each of them (a jackknife, Efron and Stein 1981): with w the weights
 
     var d = sum_P (d - d_P)^2,   d - d_P = sum_{i in P} w_i m_i (y_i - m_i d) / sum_{i not in P} w_i m_i^2,
 
-of which half is what the images erred by from which the wall was learnt.
+half of which is the error of the images that the wall model was fitted to.
 """
 
 from __future__ import annotations
@@ -32,51 +32,51 @@ from palpate_perception.registration import PRIOR, reasons
 from palpate_perception.wall import SeenWall
 
 FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
-"""How long after an exposure the displacement is forecast for [s]."""
+"""Forecast times after an exposure [s]."""
 PATCH_M: Final = 0.11
-"""Neighbours err together over less than this: 25 pixels of a poor camera, 5 cm on the wall (docs/errors.md)."""
+"""Size of a patch [m], larger than the correlation length of pixel errors: 25 pixels of a poor camera, 5 cm (docs/errors.md)."""
 SHARED_M: Final = 1.5e-4
-"""What an image's displacement errs by with its neighbours, before images have told it ..."""
+"""Initial SD of the displacement error shared by neighbouring pixels [m]."""
 SHARED_S: Final = 20.0
-"""... and for so long an image counts for that."""
+"""Time constant of its running estimate [s]."""
 REACH_M: Final = 0.06
-"""What is farther from where the wall is expected is something else."""
+"""Largest distance of a wall pixel from the expected wall [m]."""
 TUKEY: Final = 5.0
 """Tukey's biweight, in standard deviations of a pixel."""
 LEAST_SHARE: Final = 0.015
-"""With less of the wall in view, by what it tells of the displacement, it is lost."""
+"""Least share of the wall's weight in view; below it the wall is lost."""
 SURPRISE: Final = 5.0
-"""A displacement so many standard deviations from what the filter expects is none of its breaths ..."""
+"""Innovation, in standard deviations, from which a displacement is not a normal breath."""
 SURPRISE_M: Final = 2.5e-3
-"""... if it is as far off as this, too."""
+"""Least innovation of such a displacement [m]."""
 DEEP: Final = 2.2
-"""A breath so many times as deep as usual is a deep one."""
+"""Depth of a deep breath, as a multiple of the usual depth."""
 CALM_S: Final = 0.6
-"""So long after the last surprise the wall is as expected again."""
+"""Time after the last surprise until the wall is quiet again [s]."""
 KEPT: Final = 0.7
 """Part of what was left over that counts on at the next image. Over the six images that count so, white noise falls to what
 neighbours and successive images share, which does not fall: their mean is about as certain as one image's white noise says."""
 MOVED_M: Final = 0.002
-"""A region that moved by more than this, root mean square over its corners, a rise of them all apart, has been moved ..."""
+"""Least patient motion [m]: root mean square over the region's corners, without a common rise."""
 MOVED_SQUARED: Final = 14.0
-"""... if its motion's squared Mahalanobis distance from none is so many times the usual one ...
+"""Motion is detected when its squared Mahalanobis distance exceeds this multiple of the running mean.
 
-In three images in a row: of 35 persons who breathe quietly 8.5 at most in 89 minutes, of 10 seen by poor equipment 8.9 in 25;
-of 60 shifts of 10 mm 73 or more, of one along a body that is much the same along its length 23 (tuning seeds)."""
+Largest value in three consecutive images (tuning seeds): 8.5 for 35 persons who breathe quietly (89 min), 8.9 for 10 with poor
+equipment (25 min); at least 73 for 60 shifts of 10 mm, 23 for one along a body of uniform height."""
 USUAL_S: Final = 20.0
-"""... which is its mean over so long, 1 at least: what pixels err by together is not in the covariance, and makes it more ..."""
+"""Time constant of the running mean [s] (floor 1): shared pixel errors, which are not in the covariance, raise it."""
 UNUSUAL: Final = 3.0
-"""... and more than so many times the usual does not count for more: it may be a motion that has begun."""
+"""Samples of the running mean are clipped at this multiple, so that a starting motion does not raise it."""
 DRIFT_S: Final = 8.0
-"""What comes more slowly than this is no motion of the patient, but the camera's drift: bodies shift at once."""
+"""Slower changes are camera drift, not patient motion [s]."""
 GAP_S: Final = 0.2
 """An image does not speak for more time than this, however long nothing was seen before it: the patient may have moved then."""
 MOVED_IMAGES: Final = 3
-"""... if so many images in a row say so."""
+"""Number of consecutive images that must exceed the threshold."""
 
 
 class State(Enum):
-    """What the wall does; SurfaceMotion.msg explains the names."""
+    """State of the wall; SurfaceMotion.msg explains the names."""
 
     QUIET = auto()
     SPOILED = auto()
@@ -86,7 +86,7 @@ class State(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """What one image tells."""
+    """Result of one image."""
 
     state: State
     displacement: float
@@ -100,7 +100,7 @@ class Followed:
 
 
 NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 0.1, np.zeros(3))
-"""What is told before a wall is known."""
+"""Result before a wall is known."""
 
 
 class Tracker:
@@ -110,7 +110,7 @@ class Tracker:
         """A wall displaced by `d` [m] at times `t_s` [s], shape (n,) each; `corners` of the region in A, shape (m, 3)."""
         self.wall = wall
         self.average = WallAverage(wall, len(t_s))
-        """What the images of a quiet wall show in the mean."""
+        """Mean of the images of a quiet wall."""
         self._filter = BreathFilter(t_s, d)
         middle = corners.mean(axis=0)
         self._reasons = reasons(wall.lifts, wall.n_A, wall.p_A - middle)
@@ -131,7 +131,7 @@ class Tracker:
 
     @property
     def moved(self) -> bool:
-        """Whether the patient lies elsewhere than where the wall was learnt."""
+        """True if the patient has moved since the wall model was fitted."""
         return self._moved
 
     def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> Followed:
@@ -142,10 +142,10 @@ class Tracker:
         y = np.where(use, y, 0.0)
         weight = np.where(use, self._certainty, 0.0)
         if float(weight @ self.wall.lifts**2) < LEAST_SHARE * self._whole:
-            return self._told(State.MOVED if self._moved else State.LOST, expected)
+            return self._result(State.MOVED if self._moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
         if not weight.any():
-            return self._told(State.MOVED if self._moved else State.LOST, expected)
+            return self._result(State.MOVED if self._moved else State.LOST, expected)
         still = y - self.wall.lifts * d
         elapsed = min(t_s - self._last_s, GAP_S)
         self._weigh_error(elapsed, still, weight)
@@ -161,13 +161,13 @@ class Tracker:
             self._filter.update(d, noise)
         self._filter.remember(d)
         if self._moved:
-            return self._told(State.MOVED, d)
+            return self._result(State.MOVED, d)
         quiet = t_s >= self._calm_s
         if quiet:
             self.average.add(still, weight > 0)
-        return self._told(State.QUIET if quiet else State.SPOILED, float(self._filter.forecast(np.zeros(1))[0]))
+        return self._result(State.QUIET if quiet else State.SPOILED, float(self._filter.forecast(np.zeros(1))[0]))
 
-    def _told(self, state: State, d: float) -> Followed:
+    def _result(self, state: State, d: float) -> Followed:
         shift = np.append((self._motion - self._drift)[1:3], 0.0) if state is State.MOVED else np.zeros(3)
         sigma = float(np.hypot(self._filter.sigma, np.sqrt(self._shared)))
         return Followed(state, float(d), self._filter.forecast(FORECAST_S), sigma, shift)
@@ -185,7 +185,7 @@ class Tracker:
         return d, robust
 
     def _weigh_error(self, elapsed_s: float, left: Array, weight: Array) -> None:
-        """Counts what an image, `elapsed_s` [s] after the last, leaves over [m], shape (n,), for what pixels err by together."""
+        """Update the shared pixel error by the residual [m], shape (n,), of an image `elapsed_s` [s] after the last."""
         variance = jackknife(left, weight, self.wall.lifts, self._patch)
         if variance is not None:
             self._shared += (1 - np.exp(-elapsed_s / SHARED_S)) * (0.5 * variance - self._shared)
@@ -205,7 +205,7 @@ class Tracker:
 
     @property
     def _motion(self) -> Array:
-        """What is left of d, s_x, s_y and theta, shape (4,)."""
+        """Return the residual d, s_x, s_y and theta, shape (4,)."""
         return np.asarray(np.linalg.solve(self._precision + self._prior, self._pull))
 
     @property
@@ -217,7 +217,7 @@ class Tracker:
 
     @property
     def moved_by(self) -> float:
-        """How far the region has moved [m], root mean square over its corners, without a rise that they share."""
+        """Motion of the region [m], root mean square over its corners, without a common rise."""
         _, s_x, s_y, theta = self._motion - self._drift
         moved = np.array((s_x, s_y, 0.0)) + np.cross((0.0, theta, 0.0), self._corners)
         moved[:, 2] -= moved[:, 2].mean()
@@ -225,14 +225,14 @@ class Tracker:
 
 
 def jackknife(left: Array, weight: Array, lifts: Array, patch: NDArray[np.intp]) -> float | None:
-    """The variance [m^2] of d by patches, from what it leaves over [m], weights, the mode and the patch of each pixel, (n,) each.
+    """Return the variance [m^2] of d by patches, from residual [m], weight, mode and patch of each pixel, (n,) each.
 
-    None where one patch tells more than all others together, so that nothing is known of what they share.
+    None if one patch has more weight than all others together, since the shared error is then unknown.
     """
-    told, pull = np.bincount(patch, weight * lifts**2), np.bincount(patch, weight * lifts * left)
-    if not told.any() or told.max() > 0.5 * told.sum():
+    total, pull = np.bincount(patch, weight * lifts**2), np.bincount(patch, weight * lifts * left)
+    if not total.any() or total.max() > 0.5 * total.sum():
         return None
-    return float(np.sum((pull / (told.sum() - told)) ** 2))
+    return float(np.sum((pull / (total.sum() - total)) ** 2))
 
 
 def _patches(p_A: Array) -> NDArray[np.intp]:

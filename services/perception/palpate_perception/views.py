@@ -1,4 +1,4 @@
-"""What perception takes for granted of a view: how the camera stands and what of it may be abdomen."""
+"""Camera view: intrinsics and pose."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TABLE_CLEARANCE_M: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """What camera_info and tf_static say."""
+    """Intrinsics and pose from camera_info and tf_static."""
 
     K: Array
     """Shape (3, 3), in pixels."""
@@ -27,5 +27,5 @@ class Intrinsics:
     """Height and width of the full image."""
 
     def same(self, other: Intrinsics) -> bool:
-        """Whether the other is of the same image from the same place."""
+        """True if the other has the same intrinsics and pose."""
         return self.shape == other.shape and np.array_equal(self.K, other.K) and np.array_equal(self.X_WC, other.X_WC)

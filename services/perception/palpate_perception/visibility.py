@@ -1,4 +1,4 @@
-"""How much of the region of interest the camera saw, and in words why not more."""
+"""Coverage of the region of interest by the camera, and reasons for gaps."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from palpate_perception.cloud import project
 CELL_M: Final = 0.01
 """Edge of the cells in which coverage is counted: five pixels of a Kinect at 1.1 m."""
 CLEARANCE_M: Final = 0.025
-"""What is nearer than the expected surface by more hides it; what is farther by more is not the abdomen."""
+"""Points nearer than the expected surface by more hide it; points farther by more are not the abdomen [m]."""
 
 
 CREST_M: Final = 0.03
-"""The abdomen is no higher than this in A, whose origin is the umbilicus: what stands higher is something else."""
+"""Largest height of the abdomen in A, whose origin is the umbilicus [m]."""
 
 
 def cells(exam: Exam) -> tuple[Array, tuple[int, int]]:
@@ -32,7 +32,7 @@ def cells(exam: Exam) -> tuple[Array, tuple[int, int]]:
 
 
 def seen(p_A: Array, exam: Exam) -> NDArray[np.bool_]:
-    """Which cells hold a point of the cloud, shape (nx * ny,)."""
+    """Return the mask of cells with a point of the cloud, shape (nx * ny,)."""
     _, (nx, ny) = cells(exam)
     low = np.array(exam.centre_m) - np.array(exam.region_m) / 2
     cell = np.floor((p_A[:, :2] - low) / np.array(exam.region_m) * (nx, ny)).astype(np.intp)
@@ -42,9 +42,9 @@ def seen(p_A: Array, exam: Exam) -> NDArray[np.bool_]:
 
 
 def quadric(p_A: Array, xy: Array) -> Array:
-    """Height [m] at `xy`, shape (m, 2), of the quadric through a cloud: a rough guess where nothing was seen.
+    """Return the height [m] at `xy`, shape (m, 2), of a quadric through a cloud: an estimate for gaps.
 
-    The umbilicus' height, 0, when the cloud is too small to tell.
+    The umbilicus' height, 0, if the cloud is too small.
     """
     if len(p_A) < 100:
         return np.zeros(len(xy))
@@ -68,9 +68,9 @@ def explain(
     origin: tuple[int, int],
     image: tuple[int, int],
 ) -> str:
-    """Why cells were not seen, in words, most frequent first; empty when none is missing.
+    """Describe why cells have no points, most frequent reason first; empty if none is missing.
 
-    `missing`: points expected there, in A, shape (m, 3); `total`: cells in all; `depth`: the fused window [m], whose
+    `missing`: expected points, in A, shape (m, 3); `total`: cells in all; `depth`: the fused window [m], whose
     first pixel is `origin` of an image of shape `image`.
     """
     if len(missing) == 0:

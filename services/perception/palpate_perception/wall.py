@@ -1,4 +1,4 @@
-"""What a look of a few breaths tells of the wall: where it is at the end of expiration, and how far each part of it is lifted.
+"""Wall model from a scan of a few breaths: surface at the end of expiration, and breathing amplitude of each part.
 
 A small depth image z(t) of the wall is, at pixel i with viewing ray r_i (unit z) and outward normal n_i,
 
@@ -28,21 +28,21 @@ from palpate_perception.fusion import Image
 from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
 
 MARGIN_M: Final = 0.12
-"""The wall is followed at least this much wider than the region: what lies there tells a shift from a breath ..."""
+"""Margin of the tracked area around the region [m]; it distinguishes a shift from a breath."""
 HALF_M: Final = 0.22
-"""... and at least so far to each side of its middle."""
+"""Least half width of the tracked area [m]."""
 CUTOFF_M: Final = 0.06
 """Shorter waves of the wall are not seen by pixels 14 mm apart."""
 DEGREE: Final = 4
 """Total degree of the mode's polynomial."""
 UNKNOWN_M: Final = 2e-3
-"""Noise of a pixel about which the frames tell nothing."""
+"""Noise of a pixel without an estimate [m]."""
 VALID: Final = 0.7
 """A pixel that was seen in fewer of the frames is left out."""
 STEEP: Final = 0.35
 """A pixel whose ray meets the wall at a smaller cosine is left out: a little error of its place is a large one of depth."""
 EDGE: Final = 2.5
-"""A pixel with so many times the usual noise lies at an edge, and is left out."""
+"""Noise, as a multiple of the usual, from which a pixel is at an edge and left out."""
 STILL_M: Final = 3e-4
 """A wall that moves by a smaller standard deviation is still: then every part of it is expected to move alike."""
 EXPIRED: Final = 0.05
@@ -56,12 +56,12 @@ class UnseenWallError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class BreathingMode:
-    """How far breathing lifts each place, relative to where in the region it lifts most: a polynomial in x and y of A."""
+    """Breathing amplitude of each place, relative to the largest in the region: a polynomial in x and y of A."""
 
     low: Array
-    """The rectangle in A [m] that it was fitted over: least x and y, shape (2,) ..."""
+    """Lower corner of the fitted rectangle in A [m], shape (2,)."""
     high: Array
-    """... and largest."""
+    """Upper corner [m], shape (2,)."""
     coefficients: Array
     """Coefficients of the products of Legendre polynomials that `basis` gives."""
 
@@ -110,7 +110,7 @@ def to_small(x: Array, axis: int, K: Array, K_small: Array) -> Array:
 
 
 def watched(exam: Exam) -> RegionBox:
-    """Where the wall is followed, in A."""
+    """Return the tracked area, in A."""
     return RegionBox.of(exam, max(MARGIN_M, HALF_M - min(exam.region_m) / 2), HEIGHT_M)
 
 

@@ -19,7 +19,7 @@ from palpate_perception.wall import SeenWall
 LONGEST_S: Final = 10.0
 """A watch lasts no longer."""
 STILL_S: Final = 5.0
-"""A wall that has not moved for so long is still."""
+"""Time without motion after which a wall is still [s]."""
 STILL_M: Final = 0.001
 """Between its 5th and 95th percentile the mean depth of a still wall differs by less."""
 BREATHS: Final = 2
@@ -48,7 +48,7 @@ class Watch:
         self._images.append(seen)
 
     def over(self) -> bool:
-        """Whether enough was seen: two breaths, a wall that is still, or all that there is time for."""
+        """True after two breaths, with a still wall, or at the time limit."""
         lasted = self._times[-1] - self._times[0] if self._times else 0.0
         if lasted < STILL_S:
             return False
@@ -72,7 +72,7 @@ class Watch:
 
 
 def rises(height: Array, low: float, high: float) -> int:
-    """How often a height goes from the lower third between `low` and `high` to the upper one."""
+    """Return how often a height rises from the lower third between `low` and `high` to the upper one."""
     part = (height - low) / (high - low)
     ends = part[(part < 1 / 3) | (part > 2 / 3)] > 0.5
     return int(np.count_nonzero(ends[1:] & ~ends[:-1]))

@@ -1,4 +1,4 @@
-"""Expected information: how much one more press is going to tell about where a lump is, and whether there is one.
+"""Expected information gain of one more press about the place and the existence of a lump.
 
 It is the mutual information of the hypothesis h and the next observation y,
 
@@ -20,7 +20,7 @@ _BIN = 0.25
 """Hypotheses whose mean observation differs by less than this part of the standard deviation count as one Gaussian."""
 _NODES = 41
 _REACH = 4.0
-"""The grid reaches so many standard deviations beyond the mixture."""
+"""Margin of the grid beyond the mixture, in standard deviations."""
 _RARE = 2e-5
 """Hypotheses less probable than this count as no lump."""
 _SAME = 0.02

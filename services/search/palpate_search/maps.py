@@ -1,4 +1,4 @@
-"""What is known, as maps over the places: what a learned policy sees."""
+"""The posterior as maps over the places: the input of a learned policy."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""What presses say of a lump: is there one, and where. A sequential Bayesian test under the assessment's own model.
+"""Posterior of a lump given the presses: a sequential Bayesian test under the model of the assessment.
 
-The logarithm of the force that the standard press would feel is a Gaussian field z with errors (`palpate_assessment.model`). A
+The logarithm of the force of the standard press is a Gaussian field z with errors (`palpate_assessment.model`). A
 hypothesis h is a round lump of some place and radius; under it z has the bump b_h in addition, times an unknown log-contrast e.
-With S the covariance of all else, and e ~ N(m, s^2), what the data y say for it, against no lump, is
+With S the covariance of everything else, and e ~ N(m, s^2), the evidence of the data y for it, against no lump, is
 
     log B_h = -1/2 log(1 + s^2 p) + 1/2 (m / s^2 + c)^2 / (1 / s^2 + p) - 1/2 m^2 / s^2,    p = b' S^-1 b,  c = b' S^-1 y
 
-How rough the belly is and how wrong depths are is not known: S has a few amplitudes, each model weighed by its evidence. One more
+Natural variation and depth errors have unknown size: S has a few amplitudes, each model weighted by its evidence. One more
 press adds a row to each Cholesky factor, so that an update takes about a millisecond.
 """
 
@@ -32,20 +32,20 @@ RADII_M: Final = (0.014, 0.022, 0.030)
 EDGE_M: Final = 0.013
 """Standard deviation of the edge with which a press feels a lump: it presses a dent some centimetres wide."""
 OUTSIDE: Final = 0.2
-"""How much less probable a lump is that reaches out of the region: the region is chosen to hold what is sought."""
+"""Prior factor of a lump that extends beyond the region."""
 LUMP_PROBABILITY: Final = 0.5
-"""That there is one, before anything is felt, ..."""
+"""Prior probability of a lump."""
 ANOTHER: Final = 0.2
-"""... and that there is another beside those found."""
+"""Prior probability of another lump besides those found."""
 CONTRAST: Final = (float(np.log(2.0)), 0.25)
 """Prior mean and standard deviation of a lump's log-contrast."""
 NATURAL_SD: Final = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)
-"""Amplitudes of the fields of natural variation, the strips last (`palpate_assessment.model.natural`), ..."""
+"""Amplitudes of the fields of natural variation, the strips last (`palpate_assessment.model.natural`)."""
 BONE_SD: Final = 0.27
-"""... of bone, ..."""
+"""Amplitude of bone."""
 SURFACE_SHARE, STROKE_SHARE = 0.45, 0.75
-"""... of what neighbouring presses' depths get wrong alike, and each by itself, of the uncertainty that is told; by maximum
-likelihood over healthy tuning patients, by an earlier form of `palpate.search.prior`: docs/search.md says what it prints now."""
+"""Depth error shared by neighbouring presses and of each press, as shares of the reported uncertainty; maximum likelihood over
+healthy tuning patients (docs/search.md)."""
 ROUGH: Final = (0.75, 1.3)
 """Natural variation, of its usual amplitude."""
 WRONG: Final = (0.75, 1.3)
@@ -55,9 +55,9 @@ USUAL_N, LEVEL_SD = 2.2, 1.0
 NEAR_M: Final = 0.020
 """Hypotheses within this distance speak of one lump."""
 FOUND: Final = 0.95
-"""A lump that is so probable is there; ..."""
+"""Probability from which a lump counts as found."""
 PLACED_M: Final = 0.006
-"""... its place is known with this root mean square."""
+"""Largest root mean square error of the place of a found lump [m]."""
 
 
 class Posterior:
@@ -69,9 +69,7 @@ class Posterior:
         accepted: Sequence[Bump] = (),
         models: Sequence[tuple[float, float]] = tuple(product(ROUGH, WRONG)),
     ) -> None:
-        """`accepted`: lumps that count as found; others are sought beside them. `models`: natural variation and errors of depth
-        of each, of their usual amplitudes.
-        """
+        """`accepted`: lumps that count as found. `models`: scale of natural variation and of depth errors of each model."""
         self.task = task
         self.accepted = tuple(accepted)
         self.presses: list[Press] = []
@@ -81,7 +79,7 @@ class Posterior:
         self.centres: Array = np.tile(places, (len(RADII_M), 1))
         """Centres of the hypotheses' lumps [m], shape (h, 2)."""
         self.open: NDArray[np.bool_] = np.ones(len(places), dtype=bool)
-        """Which places may be pressed, shape (p,): all but those that the arm could not take."""
+        """Mask of the places within reach, shape (p,)."""
         self.radii: Array = np.repeat(RADII_M, len(places))
         """Their radii [m], shape (h,)."""
         self.shapes: Array = self._shapes(places)
@@ -128,12 +126,12 @@ class Posterior:
 
     @property
     def asked(self) -> int:
-        """How many presses were asked for and are over."""
+        """Number of requested presses that are completed."""
         return len(self.presses) + self.vain
 
     @property
     def here(self) -> Array | None:
-        """Where the indenter is, shape (2,) [m]; None before the first press."""
+        """Position of the indenter, shape (2,) [m]; None before the first press."""
         return self.presses[-1].xy if self.presses else None
 
     @property
@@ -154,8 +152,8 @@ class Posterior:
     @property
     def noise_m(self) -> float:
         """Error of the next press's depth under it, standard deviation [m]: that of the latest one."""
-        told = self.presses[-1].depth_uncertainty if self.presses else self.task.depth_uncertainty
-        return float(self._models[self.likeliest][1] * told)
+        reported = self.presses[-1].depth_uncertainty if self.presses else self.task.depth_uncertainty
+        return float(self._models[self.likeliest][1] * reported)
 
     def contrast(self) -> tuple[Array, Array]:
         """Posterior mean and variance of the log-contrast under each hypothesis, shape (h,) each, by the likeliest model."""
@@ -174,7 +172,7 @@ class Posterior:
         return mean, np.maximum(variance - (seen**2).sum(axis=0), 1e-6)
 
     def unexplained(self) -> Array:
-        """What a bump would add to the mean at each place for a log-contrast of one, shape (p, h), by the likeliest model."""
+        """Contribution of a bump of log-contrast one to the mean at each place, shape (p, h), by the likeliest model."""
         k, n = self.likeliest, len(self.presses)
         return np.asarray(self.shapes - self._field[k, :n].T @ self._bumps[k, :n])
 
@@ -228,7 +226,7 @@ class Posterior:
         return other
 
     def left(self, spent_s: float) -> Budget:
-        """What is left of the budget."""
+        """Return the remaining budget."""
         whole = self.task.budget
         return Budget(whole.presses - len(self.presses), whole.seconds - spent_s)
 
@@ -258,7 +256,7 @@ class Posterior:
         return np.asarray(0.5 * erfc((r - self.radii) / (np.sqrt(2) * EDGE_M)))
 
     def _likely(self) -> Array:
-        """How probable each hypothesis is beside the accepted lumps, before anything is felt, shape (h,), not normalised."""
+        """Return the prior of each hypothesis besides the accepted lumps, shape (h,), not normalised."""
         out = np.abs(self.centres - self.task.centre) + self.radii[:, None] > 0.5 * np.array(self.task.size) + 1e-9
         likely = np.where(out.any(axis=1), OUTSIDE, 1.0)
         for bump in self.accepted:

@@ -1,4 +1,4 @@
-"""What a search knows of an examination: the region, the presses so far, and what is left of its budget."""
+"""Region, presses and remaining budget of a search."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from palpate_models.scenario.schema import ExamInput
 PLACES_M = 0.010
 """Distance of the places that are weighed."""
 BORDER_M = 0.010
-"""Presses keep so far from the edge of the region, in which the arm's reach and the skin are known."""
+"""Margin of presses from the edge of the region [m]."""
 SHALLOWEST_M = 0.002
 """A depth below this counts as this: it may be measured as none."""
 SHALLOWER = 0.6
-"""The shallowest press that is worth it, and ..."""
+"""Shallowest press, as a share of the usual depth."""
 DEEPER = 1.4
-"""... the deepest, of the usual one."""
+"""Deepest press, as a share of the usual depth."""
 TRAVEL_MPS = 0.12
 """Mean speed of a hop from one place to the next."""
 PRESS_S = 3.2
-"""What a press takes besides the hop: rest and tare in the air, descent, settling, hold and lift."""
+"""Duration of a press without the hop [s]: rest and tare in the air, descent, settling, hold and lift."""
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ class Press:
     noise_n: float = 0.02
     """Standard error of the force [N]."""
     limited: bool = False
-    """Whether depth yielded to the force limit."""
+    """True if the force limit reduced the depth."""
     depth_uncertainty: float = 0.001
-    """Standard deviation of the depth, as the examination tells it [m]."""
+    """Standard deviation of the depth, as reported [m]."""
     stroke: int = 0
     """Number of the descent in which it was felt."""
 
     @property
     def xy(self) -> Array:
-        """Where, shape (2,) [m]."""
+        """Place, shape (2,) [m]."""
         return np.array((self.x, self.y))
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What is left."""
+    """Remaining presses and seconds."""
 
     presses: int
     seconds: float
@@ -65,7 +65,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Task:
-    """What is searched, and how it may be pressed."""
+    """Region of a search, and limits of its presses."""
 
     centre: tuple[float, float]
     """Centre of the region, in the abdomen frame [m]."""
@@ -123,6 +123,6 @@ class Task:
 
 
 def seconds(begin: Array | None, end: Array) -> Array:
-    """What it takes to press at `end` (2,), or at each of several (k, 2), coming from `begin` [s]: shape () or (k,)."""
+    """Return the duration [s] of a press at `end` (2,), or at each of several (k, 2), from `begin`: shape () or (k,)."""
     hop = np.linalg.norm(end - (end if begin is None else begin), axis=-1)
     return np.asarray(PRESS_S + hop / TRAVEL_MPS)

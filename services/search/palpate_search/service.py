@@ -28,14 +28,14 @@ LEAST_UNCERTAINTY_M: Final = 0.0002
 ELSEWHERE_M: Final = 0.005
 """A place is out of the arm's reach if no press came nearer to it than this."""
 AROUND: Final = 6
-"""So many presses outline a lump that was found."""
+"""Number of presses that outline a found lump."""
 ROUNDED_M: Final = 1e-9
 FEWEST: Final = 12
-"""So many presses at least: with fewer the assessment says nothing."""
+"""Least number of presses: the assessment needs them."""
 
 
 class SearchService(Service):
-    """Asks for one press after the other. It begins when the arm first palpates, and goes on when the press before is over."""
+    """Requests one press after another, from the first palpation on, each after the previous one is completed."""
 
     role: ClassVar[str] = "search"
 
@@ -49,7 +49,7 @@ class SearchService(Service):
         self._number = 0
         """Number of the latest request."""
         self._asked: Array | None = None
-        """Where it asked for a press [m], shape (2,)."""
+        """Requested place [m], shape (2,)."""
         self._outline: list[Array] = []
         """Places about the lump found last that are still to be pressed."""
         self._felt: list[Press] = []
@@ -84,7 +84,7 @@ class SearchService(Service):
         return {"exam/request": self._request(t)}
 
     def finish(self) -> Mapping[str, Any]:
-        """How much was asked for, what was found, and why it ended."""
+        """Return the numbers of requests and findings, and the reason of the end."""
         return {
             "requests": self._number,
             "presses": len(self._posterior.presses),
@@ -115,7 +115,7 @@ class SearchService(Service):
         )
 
     def _over(self) -> str:
-        """Why the search is over; empty while it is not."""
+        """Return the reason why the search is over; empty while it continues."""
         posterior, left = self._posterior, self._posterior.left(self._spent_s)
         if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= FEWEST:
             return f"a lump that was not found has a probability of {100 * posterior.lump:.1f} %"
@@ -137,9 +137,9 @@ def checked(place: Array, depth: float, task: Task) -> tuple[Array, float]:
 
 
 def outline(lump: Bump, posterior: Posterior) -> list[Array]:
-    """Presses that tell the assessment how far a lump reaches: its middle and places about it, [m], shape (2,) each.
+    """Return presses that outline a lump for the assessment: its middle and places around it, [m], shape (2,) each.
 
-    Those out of the region, or where it was pressed already, are left out.
+    Places outside the region, or already pressed, are left out.
     """
     angles = 2 * np.pi * np.arange(AROUND) / AROUND
     about = np.array((lump.x, lump.y)) + lump.radius * np.column_stack((np.cos(angles), np.sin(angles)))

@@ -17,12 +17,12 @@ from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, Press, Task, seconds
 
 DECIDED = (0.05, 0.0)
-"""Where the learned policy presses next after four presses."""
+"""Next place of the learned policy after four presses."""
 TASK = Task(centre=(0.03, -0.02), size=(0.12, 0.10), budget=Budget(24, 600.0))
 
 
 def presses(name: str, count: int, task: Task = TASK) -> list[tuple[float, float, float]]:
-    """Where a policy presses a wall with a stiff place."""
+    """Return the presses of a policy on a wall with a stiff place."""
     posterior, next_press = Posterior(task), policy(name)
     for k in range(count):
         (x, y), depth = next_press(posterior, posterior.left(3.0 * k))

@@ -86,11 +86,11 @@ def test_a_lump_is_located_and_its_absence_becomes_sure() -> None:
     at, probability = there.at
     assert probability > 0.95
     assert np.linalg.norm(at - place) < 0.006
-    nobody = given(felt(places, None))
-    assert nobody.lump < 0.1 < Posterior(TASK).lump
+    healthy = given(felt(places, None))
+    assert healthy.lump < 0.1 < Posterior(TASK).lump
 
 
-def test_beside_an_accepted_lump_others_are_sought() -> None:
+def test_others_are_sought_besides_an_accepted_lump() -> None:
     other = Bump(-0.03, 0.02, 0.014, EDGE_M)
     places = TASK.places
     both = [

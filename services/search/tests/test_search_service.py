@@ -51,7 +51,7 @@ def test_it_keeps_to_the_budget_of_time() -> None:
 
 
 @pytest.mark.parametrize("phase", [ExamState.PHASE_HELD, ExamState.PHASE_ASSESS])
-def test_it_asks_for_nothing_while_nobody_palpates(phase: int) -> None:
+def test_no_request_before_palpation(phase: int) -> None:
     scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search"))
     rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
     play.phase = phase

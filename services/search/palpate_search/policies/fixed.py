@@ -30,7 +30,7 @@ def random(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
 
 
 def latin_hypercube(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """McKay, Beckman and Conover 1979: so many strata along x and along y as the budget has presses, each met once."""
+    """McKay, Beckman and Conover 1979: as many strata along x and y as the budget has presses, each used once."""
     task = posterior.task
     sampler = qmc.LatinHypercube(d=2, rng=np.random.Generator(np.random.PCG64(task.seed)))
     share = sampler.random(task.budget.presses)[posterior.asked % task.budget.presses]

@@ -1,4 +1,4 @@
-"""Ours: the press that tells most a second about where a lump is, and whether there is one."""
+"""The default policy: the press with the most information per second about place and existence of a lump."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, seconds
 
 _PROMISING: Final = 12
-"""So many places are weighed for a deeper press, too, ..."""
+"""Number of places for which a deeper press is evaluated too."""
 _SAFE: Final = 0.8
-"""... where it is to stay below this part of the force limit, ..."""
+"""Largest predicted force of a deeper press, as a share of the force limit."""
 _KNOWN: Final = 1.0
-"""... if the variance of the log-force there is less than this."""
+"""Largest variance of the log-force for a deeper press."""
 
 
 def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
@@ -35,12 +35,12 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     def rate(some: NDArray[np.intp], depth: float) -> Array:
         """Information a second of presses at some of the places, shape (k,)."""
         noise = (exponent / depth * posterior.noise_m) ** 2 + (spread * np.log(depth / press.DEPTH_M)) ** 2 + WHITE_SD**2
-        told = information(unexplained[some], contrast, contrast_variance, probability, variance[some] + noise)
-        return np.asarray(told / duration[some])
+        gain = information(unexplained[some], contrast, contrast_variance, probability, variance[some] + noise)
+        return np.asarray(gain / duration[some])
 
     rates = np.where(posterior.open, rate(np.arange(len(task.places)), task.depth), 0.0)
     best, depth = int(np.argmax(rates)), task.depth
-    if rates[best] <= 0:  # nothing tells more than anything else: the level is not known before the first press
+    if rates[best] <= 0:  # no press has more information than another: the level is unknown before the first one
         best = int(np.argmin(np.where(posterior.open, np.linalg.norm(task.places - np.array(task.centre), axis=1), np.inf)))
         return task.places[best], task.depth
     greatest = rates[best]

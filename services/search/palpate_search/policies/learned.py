@@ -36,7 +36,7 @@ def convolved(layers: Array, kernel: Array, bias: Array) -> Array:
 
 
 def scores(posterior: Posterior) -> Array:
-    """How good a press of the usual, and of the greatest depth is at each place, shape (2, p): logits."""
+    """Return logits of a press of usual and of greatest depth at each place, shape (2, p)."""
     layers = maps(posterior)
     *hidden, last = _weights()
     for kernel, bias in hidden:

@@ -1,4 +1,4 @@
-"""What a depth camera gets wrong besides white noise: what the mean of many frames keeps.
+"""Systematic errors of a depth camera, which remain in the mean of many frames.
 
     error(u, v, t) = offset + field(u, v) + a (1 - exp(-t / T)) + wander(u, v, t) + skin, where skin is seen
 
@@ -60,7 +60,7 @@ def field(drawn: DrawnCamera, shape: tuple[int, int]) -> Array:
 
 
 def lost(patches: Array, shape: tuple[int, int]) -> Mask:
-    """Which pixels of an image of that shape lie in one of the patches (`DrawnCamera.lost`)."""
+    """Return the mask of pixels in one of the patches without depth (`DrawnCamera.lost`)."""
     v, u = np.indices(shape)
     mask = np.zeros(shape, bool)
     for right, down, radius in patches:

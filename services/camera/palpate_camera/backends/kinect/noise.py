@@ -51,7 +51,7 @@ def loss_probability(theta: Vector) -> Vector:
 
 @dataclass(slots=True)
 class _Statistics:
-    """What the noise needs to know of a view, at the pixels that hit something (n of them)."""
+    """Inputs of the noise model at the n pixels that hit a surface."""
 
     view: View
     pixel: NDArray[np.intp]

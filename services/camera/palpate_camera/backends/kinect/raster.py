@@ -1,4 +1,4 @@
-"""What each pixel's ray meets of a triangle mesh: rasterisation in homogeneous coordinates (Olano and Greer 1997).
+"""Intersection of each pixel's ray with a triangle mesh: rasterisation in homogeneous coordinates (Olano and Greer 1997).
 
 A ray r = ((u - cx)/fx, (v - cy)/fy, 1) meets the plane of a triangle a, b, c (in C) at the inverse depth
 

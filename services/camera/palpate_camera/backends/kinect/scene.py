@@ -1,4 +1,4 @@
-"""What the camera would see without noise: ray casting of triangle meshes in layers, each cast only when it changed.
+"""Depth view without noise: ray casting of triangle meshes in layers, each cast only when it changed.
 
 A view is kept as inverse depth w = 1/z, which is linear in the pixel coordinates on a plane: at an offset (du, dv) [px]
 from a pixel, the plane seen in it is at w + gu du + gv dv. So a view with w, gu, gv can be looked up between its
@@ -84,7 +84,7 @@ class Scene:
         self._merged: View | None = None
 
     def put(self, name: str, mesh: Mesh, tolerance_m: float = 1e-5) -> None:
-        """Sets a layer's mesh. It is cast anew only if a vertex is further than `tolerance_m` from where it was cast."""
+        """Set a layer's mesh. It is cast again only if a vertex moved by more than `tolerance_m` since the last cast."""
         old = self._layers.get(name)
         if old is not None and _same(old[0], mesh, tolerance_m):
             return

@@ -26,11 +26,11 @@ from palpate_models.scenario.load import plant_input
 from palpate_models.scenario.schema import PlantInput, Scenario
 
 ROBOT_TOLERANCE_M: Final = 1e-4
-"""The arm's picture is kept while it trembles by less: it only hides, nobody measures it."""
+"""The arm is rendered again only after a larger motion [m]: it occludes, and is not measured."""
 
 
 class CameraService(Service):
-    """Renders what physics says is there, from the true pose, and tells the others the calibrated pose."""
+    """Renders the true scene from the true camera pose, and publishes the calibrated pose."""
 
     role: ClassVar[str] = "camera"
 
@@ -78,7 +78,7 @@ class CameraService(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """How much was photographed."""
+        """Return the number of frames."""
         return {"bursts": self._bursts, "frames": self._taken}
 
 
@@ -115,7 +115,7 @@ def surface_mesh(message: Message) -> Mesh:
     vertices = np.asarray(message.vertices, np.float64).reshape(-1, 3)
     return Mesh(
         vertices, np.array(message.triangles, np.uint32).reshape(-1, 3)
-    )  # a copy: numba compiles anew for read-only arrays
+    )  # a copy: numba compiles a second version for read-only arrays
 
 
 def link_poses(message: Message) -> dict[str, Array]:

@@ -1,9 +1,9 @@
-"""The camera as a service that plays a recording: a trigger gets the recorded frames in their order, one a tick.
+"""The camera as a service that plays a recording: a trigger returns the recorded frames in order, one per tick.
 
-Small images come in their order too, one a tick all the time; a recording without any has those of its whole ones.
+Small images are played in order, one per tick, without a trigger; a recording without small images uses its full-size ones.
 
-The recording is a tape without an end: a new burst goes on where the last one stopped, and after the last frame comes the first.
-Every message is stamped anew, with the tick that it is sent at. The pose of the camera is the recording's too (`tf_static`).
+The recording is an endless loop: a burst continues where the last one stopped, and the first frame follows the last. Each message
+is stamped with the tick at which it is sent. The camera pose is that of the recording (`tf_static`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ReplayedCamera(Service):
                 raise RecordingError(f"{recording.path}: has no message of {topic}; a camera can be replayed only from all of "
                                      f"{IMAGE}, {INFO}, {POSE}")  # fmt: skip
         self._pose = self._message(poses[0])
-        for message in poses[1:]:  # each sender of a system tells its own
+        for message in poses[1:]:  # each sender of a system publishes its own
             self._pose.transforms.extend(self._message(message).transforms)
         self._frames = _pairs(by_topic[IMAGE], by_topic[INFO])
         if not self._frames:
@@ -76,7 +76,7 @@ class ReplayedCamera(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """How many frames were shown, and how many different ones there are."""
+        """Return the number of frames played, and of different ones."""
         return {"recording": str(self._path), "frames": self._shown, "frames_recorded": len(self._frames)}
 
     def _next_small(self, t: int) -> dict[str, Message]:

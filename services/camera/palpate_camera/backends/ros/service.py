@@ -25,7 +25,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import RosCamera, Scenario
 
 POSE_WAIT_S = 20.0
-"""How long the camera's pose is waited for before the run."""
+"""Time limit for the camera pose before the run."""
 OLDEST_NS = 300_000_000
 """An image that seems older than this has a stamp of another clock."""
 
@@ -34,7 +34,7 @@ class CameraPort(ABC):
     """The ROS side, as the bridge sees it."""
 
     rectified: bool = False
-    """Whether its images are rectified: then `camera_info`'s P holds for them, else its K and distortion."""
+    """True if images are rectified: they use `camera_info`'s P, otherwise its K and distortion."""
 
     @abstractmethod
     def images(self) -> list[Any]:
@@ -138,12 +138,12 @@ class RosCameraService(Service):
         return outbox
 
     def _exposed(self, t: int, stamp: int) -> int:
-        """When an image of ROS time `stamp` was exposed, in the time of the run, now `t` [ns]; `t` where that cannot be told."""
+        """Return the exposure [ns] of an image of ROS time `stamp` in the time of the run (now `t`); `t` if it is unknown."""
         age = self._now() - stamp
         return max(t - age, 0) if 0 <= age <= OLDEST_NS else t
 
     def finish(self) -> Mapping[str, Any]:
-        """How much was passed on or repeated, and why something was not passed on."""
+        """Return the numbers of forwarded, repeated and rejected messages, with reasons."""
         return {**self._facts, "problem": self._problem}
 
 
