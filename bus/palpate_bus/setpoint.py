@@ -1,4 +1,4 @@
-"""The set-point of the impedance controller: one class from planning, which makes it, to the law, which follows it."""
+"""Set-point of the impedance controller, as created by planning and followed by the control law."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TOPIC = "planning/setpoint"
 
 
 class ControlMode(IntEnum):
-    """What a set-point asks for; values of `palpation_msgs/ImpedanceSetpoint`."""
+    """Modes of `palpation_msgs/ImpedanceSetpoint`."""
 
     CARTESIAN = 0
     JOINT = 1
@@ -24,13 +24,13 @@ class ControlMode(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Setpoint:
-    """What the arm is to do at one moment, and how it goes on: control extrapolates by `V_WD` and `qd`.
+    """Desired motion of the arm at one time. Control extrapolates it with `V_WD` and `qd`.
 
-    D is the desired frame of the indenter, W is world. The contract's row of `planning/setpoint` says which values are allowed.
+    D is the desired frame of the indenter, W is world. The contract's row of `planning/setpoint` limits the values.
     """
 
     stamp: int
-    """Time at which pose and joint position hold [ns]."""
+    """Time of pose and joint position [ns]."""
     mode: ControlMode
     R_WD: Array
     """Desired rotation of the indenter, shape (3, 3)."""
@@ -49,10 +49,10 @@ class Setpoint:
     qd: Array
     """Velocity of `q` [rad/s], shape (7,)."""
     joint_stiffness: Array
-    """JOINT: of the joints; CARTESIAN: of the null-space posture [N m/rad], shape (7,)."""
+    """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
 
     def message(self) -> ImpedanceSetpoint:
-        """`palpation_msgs/ImpedanceSetpoint`, valid for as long as the contract says."""
+        """Return the `ImpedanceSetpoint`, valid until the contract's expiry."""
         return ImpedanceSetpoint(
             header=header(self.stamp, "world"),
             mode=int(self.mode),
@@ -69,7 +69,7 @@ class Setpoint:
 
     @classmethod
     def from_message(cls, message: ImpedanceSetpoint) -> Setpoint:
-        """The set-point in a message. Raises ValueError that names the field, its value and what is allowed."""
+        """Return the set-point in a message. Raises ValueError that names the field, its value and what is allowed."""
         for wrong in _checker()(message):
             raise ValueError(f"{TOPIC}: {wrong.field} = {wrong.got}: must be {wrong.expected}")
         if message.mode not in tuple(ControlMode):

@@ -1,4 +1,4 @@
-"""The contract: every role and every topic of the bus, and whether messages keep to it."""
+"""The contract: every role and topic of the bus, and checks of messages against it."""
 
 from palpate_bus.contract.rows import (
     MS,

@@ -1,7 +1,7 @@
-"""Whether a message is what its row of the contract says: class, stamp, frame, ranges, and finite numbers throughout.
+"""Checks messages against their row of the contract: class, stamp, frame, ranges, finite numbers.
 
-`Checker` is quick enough for every message of a live run; `violations` says the same in sentences, for tests. A value that is out
-of range but would be plausible in a neighbouring unit (degrees for radians, millimetres for metres) is named as that.
+`Checker` is fast enough for every message of a live run; `violations` returns the same as text, for tests. A value that is out of
+range but plausible in a related unit (degrees for radians, millimetres for metres) is reported as a unit error.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from palpate_bus.messages.stamps import nanoseconds
 
 
 class ViolationKind(StrEnum):
-    """What can be wrong on a topic."""
+    """Kinds of violations of a topic's row."""
 
     TYPE = "type hash"
     SENDER = "sender"
@@ -40,7 +40,7 @@ class ViolationKind(StrEnum):
 
 @dataclass(frozen=True)
 class MessageViolation:
-    """What is wrong with one message, by its topic's row."""
+    """A violation by one message of its topic's row."""
 
     kind: ViolationKind
     field: str
@@ -52,18 +52,18 @@ class MessageViolation:
 
 
 _FEW = 16
-"""Up to this many numbers it is quicker to look at each in Python than to call numpy."""
+"""Up to this size a loop in Python is faster than numpy."""
 _CONFUSED: dict[str, tuple[tuple[str, float], ...]] = {
     "rad": (("deg", np.pi / 180),),
     "rad/s": (("deg/s", np.pi / 180),),
     "m": (("mm", 1e-3),),
     "m/s": (("mm/s", 1e-3),),
 }
-"""Units that are mistaken for ours, with the factor that converts them."""
+"""Units that are often confused with the key, with their conversion factor."""
 
 
 class Checker:
-    """The check of one topic's messages."""
+    """Checks the messages of one topic."""
 
     def __init__(self, topic: Topic) -> None:
         self._frame = topic.frame
@@ -84,10 +84,7 @@ class Checker:
         self._finite = [(leaf.path, _Reader([leaf])) for leaf in rest]
 
     def __call__(self, message: Message, t: int | None = None) -> list[MessageViolation]:
-        """What is wrong with a message; empty when nothing is.
-
-        `t` is the time [ns] that its headers must carry; None leaves the stamp unchecked.
-        """
+        """Return the violations of a message. `t`: expected stamp of its headers [ns]; None: not checked."""
         if message.__class__ is not self._type:
             got = getattr(message, "__msgtype__", message.__class__.__name__)
             return [MessageViolation(ViolationKind.TYPE, "", self._type.__msgtype__, got)]
@@ -115,14 +112,14 @@ class Checker:
         return found
 
     def stamp(self, message: Message) -> int | None:
-        """The time [ns] in the message's header, or in that of its first transform; None where there is none."""
+        """Return the stamp [ns] of the message's header or of its first transform; None without a header."""
         for header in self._headers(message):
             return nanoseconds(header.stamp)
         return None
 
 
 def violations(topic: Topic, message: Message, t: int | None = None) -> list[str]:
-    """What is wrong with a message by its topic's row, a sentence each; empty when nothing is. `t` as for `Checker`."""
+    """Return the violations of a message as text. `t` as for `Checker`."""
     return [f"{topic.name}: {violation}" for violation in Checker(topic)(message, t)]
 
 
@@ -152,19 +149,19 @@ def _headers_of_transforms(message: Message) -> list[Any]:
 
 @dataclass(frozen=True)
 class LeafField:
-    """A field of base type, at any depth of a message type."""
+    """A field of a base type, at any depth of a message type."""
 
     path: str
     base: str
-    """Its type, or that of its items: `float64`, `string`."""
+    """Type of the field or of its items: `float64`, `string`."""
     array: bool
-    """Whether it is an array itself."""
+    """The field is an array."""
     repeated: bool
-    """Whether a sequence of messages is on the way to it."""
+    """The path contains a sequence of messages."""
 
 
 def leaves(type_name: str, path: str = "") -> list[LeafField]:
-    """The fields of base type at and under `path` in a message type: `wrench.force` gives its x, y and z.
+    """Return the fields of base type at and below `path` in a message type: `wrench.force` gives x, y and z.
 
     Raises CodecError if the type has no such field.
     """
@@ -189,7 +186,7 @@ def _leaves(type_name: str, path: str = "", repeated: bool = False) -> Iterator[
 
 
 def numbers(message: Message, path: str) -> np.ndarray[Any, Any]:
-    """All numbers at and under a field of a message, flat, shape (n,)."""
+    """Return all numbers at and below a field of a message, shape (n,)."""
     found: list[np.ndarray[Any, Any]] = []
     _collect(message, path.split("."), found)
     return np.concatenate(found) if found else np.zeros(0)
@@ -209,7 +206,7 @@ def _collect(value: Any, path: list[str], found: list[np.ndarray[Any, Any]]) -> 
 
 
 class _Reader:
-    """Reads leaves out of messages: scalars and arrays directly, those within sequences of messages by looking at each."""
+    """Reads fields of base type: scalars and arrays directly, fields in sequences of messages one by one."""
 
     def __init__(self, chosen: list[LeafField]) -> None:
         self._paths = [leaf.path for leaf in chosen]
@@ -220,7 +217,7 @@ class _Reader:
         self._nested = [leaf.path for leaf in chosen if leaf.repeated]
 
     def within(self, message: Message, least: float, most: float) -> bool:
-        """Whether all are in the closed range; NaN is not."""
+        """True if all numbers are in the closed range; NaN is outside."""
         if self._scalars is not None:
             values = self._scalars(message)
             for value in (values,) if self._single else values:
@@ -235,7 +232,7 @@ class _Reader:
         return True
 
     def finite(self, message: Message) -> bool:
-        """Whether all are finite."""
+        """True if all numbers are finite."""
         if self._scalars is not None:
             values = self._scalars(message)
             if not (isfinite(values) if self._single else all(map(isfinite, values))):
@@ -246,7 +243,7 @@ class _Reader:
         return True
 
     def values(self, message: Message) -> np.ndarray[Any, Any]:
-        """All numbers, flat."""
+        """Return all numbers, shape (n,)."""
         return np.concatenate([numbers(message, path) for path in self._paths])
 
     def _each_array(self, message: Message) -> Iterator[np.ndarray[Any, Any]]:

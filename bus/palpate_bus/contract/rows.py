@@ -1,6 +1,6 @@
-"""The contract as typed rows: what every role and topic is, read once from `contract.yaml` and checked.
+"""The contract as typed, validated rows, read from `contract.yaml`.
 
-`contract()` is the contract; `Contract.inputs(role)` and `Contract.outputs(role)` are what the runtime wires.
+The runtime connects services by `Contract.inputs(role)` and `Contract.outputs(role)`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MS = 1_000_000
 
 
 class Edge(StrEnum):
-    """How a reader depends on a topic's producer. See the head of contract.yaml."""
+    """Dependence of a reader on a topic's producer; see the head of contract.yaml."""
 
     SAME_TICK = "same_tick"
     PREVIOUS = "previous"
@@ -31,12 +31,12 @@ class Edge(StrEnum):
 
     @property
     def blocking(self) -> bool:
-        """Whether the reader waits for the producer's tick in lockstep."""
+        """True if the reader waits for the producer's tick in lockstep."""
         return self in (Edge.SAME_TICK, Edge.PREVIOUS)
 
 
 class Visibility(StrEnum):
-    """Who may know a topic's content."""
+    """Roles that may read a topic; see the head of contract.yaml."""
 
     PUBLIC = "public"
     SIM = "sim"
@@ -48,14 +48,14 @@ class _Row(BaseModel):
 
 
 class Role(_Row):
-    """A role that a service plays. Its period is in whole milliseconds of simulated time."""
+    """A role, implemented by a service. Its period is in whole milliseconds of simulated time."""
 
     name: str
     period_ms: Annotated[int, Field(ge=1)]
     critical: bool = False
     observer: bool = False
     optional: bool = False
-    """Whether it takes part in some runs alone."""
+    """Absent from runs that do not use it."""
     doc: str
 
     @property
@@ -65,7 +65,7 @@ class Role(_Row):
 
 
 class Qos(_Row):
-    """A stance on delivery, by zenoh's terms, with its reason."""
+    """A class of delivery, in zenoh's terms, with its reason."""
 
     name: str
     priority: str
@@ -96,11 +96,11 @@ class Topic(_Row):
     max_age_ms: int | None = None
     expiry_ms: int | None = None
     record_ms: int = 0
-    """With --record normal the recorder keeps one message in this time; 0: every one."""
+    """With --record normal the recorder keeps one message in this time; 0: every message."""
     open: bool = False
-    """Whether others than the producer may send on it too."""
+    """Senders other than the producer are allowed."""
     tagged: bool = False
-    """Whether its messages carry a tag, where a run has a key."""
+    """In runs with a key, its messages carry an authentication tag."""
     doc: str
 
     @property
@@ -120,7 +120,7 @@ class Topic(_Row):
 
     @property
     def periodic(self) -> bool:
-        """Whether the topic carries exactly one message on each of its ticks, and so is its own advance."""
+        """True if the topic carries exactly one message on each of its ticks, so that it needs no Advance messages."""
         return not (self.event or self.latched)
 
     @property
@@ -137,7 +137,7 @@ def _given(row: Topic | Internal, field: str) -> int:
 
 
 class Internal(_Row):
-    """A message of the runtime itself."""
+    """A message of the runtime."""
 
     name: str
     type: str
@@ -145,14 +145,14 @@ class Internal(_Row):
     readers: str
     period_ms: int | None = None
     deadline_ms: int | None = None
-    """Its sender is lost when none has come for so long, in wall-clock runs."""
+    """In wall-clock mode the sender is lost after this time without a message."""
     tagged: bool = False
-    """Whether its messages carry a tag, where a run has a key."""
+    """In runs with a key, its messages carry an authentication tag."""
     doc: str
 
     @property
     def period(self) -> int:
-        """Time [ns] from one message to the next. Raises ValueError if the contract gives none."""
+        """Time between messages [ns]. Raises ValueError if the contract gives none."""
         return _given(self, "period_ms") * MS
 
     @property
@@ -168,7 +168,7 @@ _MAY_KNOW: dict[Visibility, frozenset[str]] = {
 
 
 class Contract(_Row):
-    """All rows, checked: roles exist, periods fit, no cycle of same_tick edges, secrets reach only those who may know them."""
+    """All rows. Validates roles, periods, visibility, and that same_tick edges have no cycle."""
 
     roles: dict[str, Role]
     qos: dict[str, Qos]
@@ -186,7 +186,7 @@ class Contract(_Row):
                 raise ValueError(f"topic {topic.name}: no QoS class {topic.qos!r}; classes are {sorted(self.qos)}")
             if not topic.latched and topic.period_ms % self.roles[topic.producer].period_ms:
                 raise ValueError(
-                    f"topic {topic.name}: period {topic.period_ms} ms is no multiple of the period of "
+                    f"topic {topic.name}: period {topic.period_ms} ms is not a multiple of the period of "
                     f"{topic.producer}, {self.roles[topic.producer].period_ms} ms"
                 )
             allowed = _MAY_KNOW.get(topic.visibility)
@@ -198,22 +198,22 @@ class Contract(_Row):
         return self
 
     def outputs(self, role: str) -> tuple[Topic, ...]:
-        """Topics that a role produces, in contract order."""
+        """Return the topics that a role produces, in contract order."""
         return tuple(topic for topic in self.topics.values() if topic.producer == role)
 
     def inputs(self, role: str) -> tuple[tuple[Topic, Edge], ...]:
-        """Topics that a role reads, with the kind of edge, in contract order."""
+        """Return the topics that a role reads, with the kind of edge, in contract order."""
         return tuple((topic, topic.readers[role]) for topic in self.topics.values() if role in topic.readers)
 
     def tagged(self, name: str) -> bool:
-        """Whether messages of this name, a topic's or the runtime's own, carry a tag where a run has a key."""
+        """True if messages of this topic, or of this name of the runtime, carry a tag in runs with a key."""
         row = self.topics.get(name) or self.internal.get(name) or self.internal.get(f"{name.rpartition('/')[0]}/<role>")
         return row is not None and row.tagged
 
     def step_order(self, roles: tuple[str, ...]) -> tuple[str, ...]:
-        """The roles in an order in which each runs after the producers of its same_tick inputs.
+        """Return the roles ordered so that each steps after the producers of its same_tick inputs.
 
-        Raises ValueError naming the members of a cycle of same_tick edges.
+        Raises ValueError that names the members of a cycle.
         """
         before = {
             role: {t.producer for t, edge in self.inputs(role) if edge is Edge.SAME_TICK and t.producer in roles}
@@ -231,7 +231,7 @@ class Contract(_Row):
 
 
 def parse(text: str) -> Contract:
-    """A contract from YAML text. Raises ValueError (pydantic's ValidationError) that names the row and field."""
+    """Return the contract in a YAML text. Raises ValueError (pydantic's ValidationError) that names the row and field."""
     raw = yaml.safe_load(text)
     for section in ("roles", "qos", "topics", "internal"):
         raw[section] = {name: {"name": name, **row} for name, row in raw[section].items()}
@@ -239,15 +239,14 @@ def parse(text: str) -> Contract:
 
 
 def with_periods(text: str, periods: Mapping[str, int]) -> str:
-    """A contract's text with other periods of roles: `periods` gives them by role [ms]. For experiments.
+    """Return a contract's text with changed periods of roles [ms], for experiments.
 
-    A role's periodic topics that would come more often than it steps come at each of its steps. Raises ValueError that names a
-    role that there is not.
+    Periods of the role's topics are rounded up to multiples of the new period. Raises ValueError for an unknown role.
     """
     document = yaml.safe_load(text)
     for role, period_ms in periods.items():
         if role not in document["roles"]:
-            raise ValueError(f"PALPATE_PERIODS: there is no role {role!r}; roles are {', '.join(document['roles'])}")
+            raise ValueError(f"PALPATE_PERIODS: unknown role {role!r}; roles are {', '.join(document['roles'])}")
         document["roles"][role]["period_ms"] = period_ms
         for topic in document["topics"].values():
             if topic["producer"] == role and "period_ms" in topic:
@@ -256,15 +255,12 @@ def with_periods(text: str, periods: Mapping[str, int]) -> str:
 
 
 def without(text: str, absent: Collection[str]) -> str:
-    """A contract's text without some optional roles, what they send, and what they would read.
-
-    Raises ValueError that names a role that is not optional.
-    """
+    """Return the contract text without some optional roles and their topics. Raises ValueError if one is not optional."""
     document = yaml.safe_load(text)
     for role in absent:
         if not document["roles"].get(role, {}).get("optional"):
             optional = [name for name, row in document["roles"].items() if row.get("optional")]
-            raise ValueError(f"PALPATE_ABSENT: {role!r} is no optional role; those are {', '.join(optional)}")
+            raise ValueError(f"PALPATE_ABSENT: {role!r} is not an optional role; these are {', '.join(optional)}")
         del document["roles"][role]
         document["topics"] = {name: topic for name, topic in document["topics"].items() if topic["producer"] != role}
         for topic in document["topics"].values():
@@ -274,7 +270,7 @@ def without(text: str, absent: Collection[str]) -> str:
 
 @cache
 def contract() -> Contract:
-    """The contract of this installation; PALPATE_PERIODS may set other periods, PALPATE_ABSENT leave optional roles out."""
+    """Return the contract of this installation, with the changes of PALPATE_PERIODS and PALPATE_ABSENT."""
     text = resources.files("palpate_bus.contract").joinpath("contract.yaml").read_text(encoding="utf-8")
     settings = Settings.read()
     text = with_periods(text, settings.periods) if settings.periods else text

@@ -1,7 +1,7 @@
 """Message classes: `from palpate_bus.messages import JointState`.
 
-They are made from .msg files when this module is imported; `__init__.pyi`, which `stubs.py` writes, tells type checkers their
-fields. `names.py` lists them.
+They are created from .msg files when this module is imported. `names.py` lists them; `__init__.pyi`, written by `stubs.py`,
+declares their fields for type checkers.
 """
 
 from palpate_bus.messages.names import TYPE_NAMES

@@ -1,6 +1,6 @@
-"""ROS 2 messages to and from little-endian CDR with its four-byte encapsulation header.
+"""Encodes and decodes ROS 2 messages as little-endian CDR with its four-byte encapsulation header.
 
-The types of the 1 kHz topics have codecs of their own (`struct_codecs`); rosbags does the rest. The bytes are the same.
+Types of the 1 kHz topics have faster codecs (`struct_codecs`) with identical bytes; rosbags handles the others.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ __all__ = [
 
 _LITTLE_ENDIAN = ENCAPSULATION[:2]
 Message = Any
-"""A message of any class. Where the class is known, `palpate_bus.messages` has it with its fields."""
+"""A message of any class. Typed classes are in `palpate_bus.messages`."""
 
 
 def encode(message: Message, name: str) -> bytes:
-    """A message as little-endian CDR. Raises CodecError if a field does not fit its type."""
+    """Return a message as little-endian CDR. Raises CodecError if a field does not fit its type."""
     return encoder(name)(message)
 
 
 def decode(payload: bytes | memoryview, name: str) -> Message:
-    """The message in CDR bytes. Arrays may be read-only views of `payload`. Raises CodecError on anything malformed."""
+    """Return the message in CDR bytes. Arrays may be read-only views of `payload`. Raises CodecError for malformed bytes."""
     return decoder(name)(payload)
 
 
 @cache
 def encoder(name: str) -> Callable[[Message], bytes]:
-    """`encode` for one type, for hot paths."""
+    """Return `encode` for one type, for hot paths."""
     message_type(name)
-    own = STRUCT_CODECS.get(name)
-    encode_message = own.encode if own else _rosbags_encoder(name)
+    fast = STRUCT_CODECS.get(name)
+    encode_message = fast.encode if fast else _rosbags_encoder(name)
 
     def encode(message: Message) -> bytes:
         try:
@@ -75,15 +75,15 @@ def encoder(name: str) -> Callable[[Message], bytes]:
 
 @cache
 def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
-    """`decode` for one type, for hot paths."""
+    """Return `decode` for one type, for hot paths."""
     message_type(name)
-    own = STRUCT_CODECS.get(name)
+    fast = STRUCT_CODECS.get(name)
 
     def decode(payload: bytes | memoryview) -> Message:
         try:
-            if own is None or payload[:2] != _LITTLE_ENDIAN:  # rosbags reads big-endian messages too
+            if fast is None or payload[:2] != _LITTLE_ENDIAN:  # rosbags reads big-endian messages too
                 return store.deserialize_cdr(memoryview(payload), name)
-            message, end = own.decode(bytes(payload))
+            message, end = fast.decode(bytes(payload))
             if not 0 <= len(payload) - end < 4:  # some encoders pad the end to a multiple of four
                 raise ValueError(f"the message ends at {end}")
         except Exception as error:
@@ -95,9 +95,9 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
 
 @cache
 def decodes_to_itself(name: str) -> bool:
-    """Whether a message of this type comes back equal when it is encoded and decoded: it has no arrays and no float32.
+    """True if encoding and decoding returns an equal message: the type has no arrays and no float32.
 
-    An array may have another type or layout than its field, and its owner may go on writing into it.
+    An array may differ in type or layout from its field, and its owner may write to it later.
     """
     for _, (kind, detail) in store.get_msgdef(name).fields:
         item_kind, item = detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
@@ -119,7 +119,7 @@ def _rosbags_encoder(name: str) -> Callable[[Message], bytes]:
 
 
 def _with_fitted_arrays(message: Message, name: str, path: str = "") -> Message:
-    """The message with arrays of the types and layouts that its fields have: rosbags takes an array's bytes as they are."""
+    """Return the message with arrays in the types and layouts of its fields: rosbags copies an array's bytes unchanged."""
     changed: dict[str, Any] = {}
     for field, dtype, length in _array_fields(name):
         value = getattr(message, field)
@@ -139,7 +139,7 @@ def _with_fitted_arrays(message: Message, name: str, path: str = "") -> Message:
 
 @cache
 def _array_fields(name: str) -> tuple[tuple[str, np.dtype[Any], int | None], ...]:
-    """Name, type and length (None: any) of each array of numbers in a message type, nested messages left out."""
+    """Return name, type and length (None: any) of each array of numbers in a message type, without nested messages."""
     found = []
     for field, (kind, detail) in store.get_msgdef(name).fields:
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
@@ -151,7 +151,7 @@ def _array_fields(name: str) -> tuple[tuple[str, np.dtype[Any], int | None], ...
 
 @cache
 def _fields_with_arrays(name: str) -> tuple[tuple[str, str, bool], ...]:
-    """Name, message type and whether it is a sequence of each field of a message type whose messages hold arrays of numbers."""
+    """Return (name, type, is a sequence) of each nested message field whose type has arrays of numbers."""
     found = []
     for field, (kind, detail) in store.get_msgdef(name).fields:
         repeated = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)

@@ -1,4 +1,4 @@
-"""Which message classes `palpate_bus.messages` has, by their packages in ROS. No two of them share a short name."""
+"""Message classes of `palpate_bus.messages` by ROS package. Short names are unique."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ PACKAGES: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 
 TYPE_NAMES: dict[str, str] = {name: f"{package}/msg/{name}" for package, names in PACKAGES.items() for name in names}
-"""The full type name of each class: `TYPE_NAMES["JointState"]` is `sensor_msgs/msg/JointState`."""
+"""Full type name of each class: `TYPE_NAMES["JointState"]` is `sensor_msgs/msg/JointState`."""

@@ -1,7 +1,7 @@
-"""Writes `__init__.pyi`, which tells type checkers the fields of the message classes.
+"""Writes `__init__.pyi`, which declares the fields of the message classes for type checkers.
 
 python -m palpate_bus.messages.stubs --write     after a change of a .msg file or of names.py
-python -m palpate_bus.messages.stubs --check     exits with 1 if the file is not what --write would write; a test runs it
+python -m palpate_bus.messages.stubs --check     exits with 1 if the file is out of date; a test runs it
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SHORT_NAMES = {name: short for short, name in TYPE_NAMES.items()}
 
 
 def stub() -> str:
-    """The text of `__init__.pyi`: a dataclass for each message class. Raises KeyError if one contains a type without a class."""
+    """Return the text of `__init__.pyi`: a dataclass per message class. Raises KeyError for a nested type without a class."""
     return "\n\n".join([_HEAD.rstrip(), *(_class_lines(short, name) for short, name in TYPE_NAMES.items())]) + "\n"
 
 
@@ -47,7 +47,7 @@ def _class_lines(short: str, name: str) -> str:
 
 
 def _type_of(description: Any) -> str:
-    """The Python type of a field that rosbags describes so."""
+    """Return the Python type of a field from its rosbags description."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return _SHORT_NAMES[detail]
@@ -61,7 +61,7 @@ def _type_of(description: Any) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command line; returns the exit code."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m palpate_bus.messages.stubs")
     choice = parser.add_mutually_exclusive_group(required=True)
     choice.add_argument("--write", action="store_true")

@@ -1,7 +1,4 @@
-"""The message types that the project knows: the interfaces of ROS 2 Jazzy and of `palpation_msgs`, as `rosbags` reads them.
-
-A message type is named as in ROS (`sensor_msgs/msg/JointState`).
-"""
+"""Message types of ROS 2 Jazzy and `palpation_msgs`, read by rosbags. Names are ROS names (`sensor_msgs/msg/JointState`)."""
 
 from __future__ import annotations
 
@@ -14,18 +11,18 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 
 class CodecError(ValueError):
-    """Bytes that are not a message of the expected type, a message that does not fit its type, or a type that is unknown."""
+    """Bytes that do not hold the expected type, a message that does not fit its type, or an unknown type."""
 
 
 def _interface_package() -> Path:
-    """The folder of the ROS 2 interface package `palpation_msgs`, in a wheel or in a checkout."""
+    """Return the folder of the ROS 2 package `palpation_msgs`, in a wheel or a checkout."""
     package = Path(__file__).resolve().parents[1]
     packaged = package / "palpation_msgs"
     return packaged if packaged.is_dir() else package.parent / "palpation_msgs"
 
 
 def palpation_definitions() -> dict[str, str]:
-    """The .msg text of every message of `palpation_msgs`, by type name."""
+    """Return the .msg text of every message of `palpation_msgs`, by type name."""
     return {
         f"palpation_msgs/msg/{path.stem}": path.read_text(encoding="utf-8")
         for path in sorted((_interface_package() / "msg").glob("*.msg"))
@@ -42,28 +39,25 @@ def _load_store() -> Any:
 
 
 store: Any = _load_store()
-"""The rosbags typestore: ROS 2 Jazzy's interfaces and ours."""
+"""The rosbags typestore of ROS 2 Jazzy and `palpation_msgs`."""
 
 
 @cache
 def message_type(name: str) -> Any:
-    """The dataclass of a message type that is only known at run time; otherwise import it from `palpate_bus.messages`.
-
-    Raises CodecError if neither ROS 2 Jazzy nor `palpation_msgs` has it.
-    """
+    """Return the dataclass of a message type by its name. Raises CodecError for an unknown type."""
     try:
         return store.types[name]
     except KeyError:
-        raise CodecError(f"no such message type: {name!r} (ROS 2 Jazzy and palpation_msgs are known)") from None
+        raise CodecError(f"no such message type: {name!r}; neither ROS 2 Jazzy nor palpation_msgs has it") from None
 
 
 def definition(name: str) -> str:
-    """The .msg text of a message type, followed by those of the types within it, as recordings keep them."""
+    """Return the .msg text of a message type, followed by those of its nested types, as in recordings."""
     return str(store.generate_msgdef(name, ros_version=2)[0])
 
 
 def interface_files(name: str) -> dict[str, str]:
-    """The .msg files that a client of ROS 2 needs for a message type: text by path (`sensor_msgs/msg/JointState.msg`)."""
+    """Return the .msg files that a ROS 2 client needs for a message type: text by path (`sensor_msgs/msg/JointState.msg`)."""
     first, *others = (part.strip() for part in definition(name).split("=" * 80))
     files = {f"{name}.msg": first + "\n"}
     for part in others:
@@ -75,11 +69,11 @@ def interface_files(name: str) -> dict[str, str]:
 
 @cache
 def type_hash(name: str) -> str:
-    """The RIHS01 hash of a message type, `RIHS01_<64 hex digits>`, which rmw_zenoh puts into the key."""
+    """Return the RIHS01 hash of a message type, `RIHS01_<64 hex digits>`, which is part of rmw_zenoh's key."""
     message_type(name)
     return str(store.hash_rihs01(name))
 
 
 def array_dtype(base: str) -> np.dtype[Any]:
-    """The type of an array of a ROS base type: ROS's char is an unsigned byte."""
+    """Return the array type of a ROS base type. ROS's char is an unsigned byte."""
     return np.dtype("uint8" if base == "char" else base)
